@@ -1,0 +1,76 @@
+"""Clear apertures of surfaces, in the surface's own x, y."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Disk of ``radius`` about ``centre`` (metres), with an optional concentric hole of radius ``inner``."""
+
+    radius: float
+    centre: tuple[float, float] = (0.0, 0.0)
+    inner: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if not 0.0 <= self.inner < self.radius:
+            raise ValueError(f"a circular aperture needs 0 <= inner < radius, found {self.inner} and {self.radius}")
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside; NumPy or Dr.Jit arrays."""
+        dx, dy = x - self.centre[0], y - self.centre[1]
+        r2 = dx * dx + dy * dy
+        inside = r2 <= self.radius**2
+        return inside & (r2 >= self.inner**2) if self.inner else inside
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, x_max, y_min, y_max, metres."""
+        (cx, cy), r = self.centre, self.radius
+        return cx - r, cx + r, cy - r, cy + r
+
+    def outline(self, points: int = 96) -> np.ndarray:
+        """Closed outline, shape (points, 2), metres."""
+        t = np.linspace(0.0, 2.0 * np.pi, points)
+        return np.stack([self.centre[0] + self.radius * np.cos(t), self.centre[1] + self.radius * np.sin(t)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Rectangle of half-widths ``half_x``, ``half_y`` about ``centre`` (metres)."""
+
+    half_x: float
+    half_y: float
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if not (self.half_x > 0.0 and self.half_y > 0.0):
+            raise ValueError(f"a rectangular aperture needs positive half-widths, found {self.half_x} and {self.half_y}")
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside; NumPy or Dr.Jit arrays."""
+        return (abs(x - self.centre[0]) <= self.half_x) & (abs(y - self.centre[1]) <= self.half_y)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, x_max, y_min, y_max, metres."""
+        (cx, cy) = self.centre
+        return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    def outline(self, points: int = 96) -> np.ndarray:
+        """Closed outline, shape (n, 2), metres."""
+        x0, x1, y0, y1 = self.bounds
+        n = max(points // 4, 1)
+        s = np.linspace(0.0, 1.0, n, endpoint=False)
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        sides = [corners[i] + s[:, None] * (corners[i + 1] - corners[i]) for i in range(4)]
+        return np.concatenate([*sides, corners[:1]])
+
+
+Aperture = Circle | Rectangle

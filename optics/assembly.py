@@ -1,0 +1,75 @@
+"""An assembly: the rigid-body tree with the optical elements on it, and named sequences of elements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from optics.element import Element
+from optics.pose import Pose
+from optics.tree import PlacedBodies, RigidTree, State
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Optical elements on a tree of rigid bodies; immutable, "with" methods return a changed copy.
+
+    Attributes:
+        tree: where everything stands.
+        elements: name -> element.
+        sequences: name -> element names in the order in which light meets them (an element may come twice).
+    """
+
+    tree: RigidTree
+    elements: Mapping[str, Element]
+    sequences: Mapping[str, tuple[str, ...]]
+
+    def __post_init__(self) -> None:
+        """Freeze and check that every name exists."""
+        paths = set(self.tree.paths)
+        for name, element in self.elements.items():
+            if name != element.name:
+                raise ValueError(f"element {element.name!r} is filed under {name!r}")
+            if element.body not in paths:
+                raise ValueError(f"element {name!r} stands on unknown body {element.body!r}")
+        for sequence, names in self.sequences.items():
+            for name in names:
+                if name not in self.elements:
+                    raise ValueError(f"sequence {sequence!r} names unknown element {name!r}")
+        object.__setattr__(self, "elements", MappingProxyType(dict(self.elements)))
+        object.__setattr__(self, "sequences", MappingProxyType({k: tuple(v) for k, v in self.sequences.items()}))
+
+    def sequence(self, name: str) -> tuple[Element, ...]:
+        """The elements of a named sequence.
+
+        Raises:
+            KeyError: unknown sequence.
+        """
+        return tuple(self.elements[n] for n in self.sequences[name])
+
+    def with_element(self, element: Element) -> Assembly:
+        """A copy in which the element of that name is replaced or added."""
+        return replace(self, elements={**self.elements, element.name: element})
+
+    def with_sequence(self, name: str, names: Sequence[str]) -> Assembly:
+        """A copy with one more sequence."""
+        return replace(self, sequences={**self.sequences, name: tuple(names)})
+
+    def place(
+        self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
+    ) -> PlacedBodies:
+        """World poses of all bodies for each state; see ``RigidTree.place``."""
+        return self.tree.place(states, step)
+
+    def nominal_pose(self, body: str) -> Pose:
+        """World pose of a body in the unperturbed assembly."""
+        return self.place().pose(body)
+
+
+def points_to_world(placed: PlacedBodies, body: str, points: np.ndarray) -> np.ndarray:
+    """Map points (P, 3) fixed in a body's frame to the world for each state: (S, P, 3), metres."""
+    i = placed.index[body]
+    return np.asarray(np.einsum("sij,pj->spi", placed.rotation[:, i], points) + placed.translation[:, i, None])

@@ -1,0 +1,47 @@
+"""An optical element: a surface on a body, what light does there, and its clear aperture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from optics.aperture import Aperture
+from optics.surface import Surface
+
+
+class Interaction(Enum):
+    """What happens to a ray at a surface."""
+
+    REFLECT = "reflect"
+    REFRACT = "refract"
+    PASS = "pass"  # noqa: S105 - a plane that is only crossed: stop, detector, reference plane
+
+
+@dataclass(frozen=True)
+class Element:
+    """One surface in the assembly.
+
+    Attributes:
+        name: unique name, e.g. ``forward/M1``.
+        body: path of the rigid body that carries it; the surface's frame is the body's frame.
+        surface: its shape.
+        interaction: reflect, refract or pass.
+        aperture: clear aperture in the surface's x, y; None is unlimited.
+        index_after: refractive index on the side the light goes to, for REFRACT (the index before is that of the
+            element before it).
+    """
+
+    name: str
+    body: str
+    surface: Surface
+    interaction: Interaction
+    aperture: Aperture | None = None
+    index_after: float = 1.0
+
+    def with_aperture(self, aperture: Aperture | None) -> Element:
+        """The same element with another aperture."""
+        return replace(self, aperture=aperture)
+
+    def with_surface(self, surface: Surface) -> Element:
+        """The same element with another surface."""
+        return replace(self, surface=surface)

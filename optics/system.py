@@ -1,0 +1,251 @@
+"""Numbers of a sequence of elements for a batch of systems, ready for the trace.
+
+A *system* is one sequence in one perturbed state. Sequences of the same structure (same kinds of surface in the same
+order) can be batched together: the two cameras of an instrument, left and right channels, hundreds of states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optics import zernike
+from optics.aperture import Circle
+from optics.assembly import Assembly
+from optics.backend import Backend
+from optics.element import Element, Interaction
+from optics.figure import GridFigure, ZernikeFigure
+from optics.tree import COMPLEX_STEP, Motion, PlacedBodies, State
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What decides the code of the kernel (as against the numbers that it works on), for one element."""
+
+    interaction: Interaction
+    plane: bool
+    even: int
+    figure_order: int  # radial order of the Zernike figure, -1 for none
+    grid: bool
+    aperture: str  # "", "circle", "ring" or "rectangle"
+
+
+@dataclass(frozen=True, eq=False)
+class SystemBatch:
+    """Numbers of B systems: element by element, name -> array of shape (B,).
+
+    ``R00..R22``, ``T0..T2`` take the ray from the frame of the element before (the world for the first) into the
+    frame of this element; ``W...``/``P...`` are the element's world pose.
+
+    Attributes:
+        structure: per element.
+        values: per element, parameter name -> (B,) float64.
+        tangents: the same for the derivative that was asked for, or None.
+        grids: per element, spline tables (grid figures are not perturbed), flattened with their size.
+        count: B.
+        states: number of states S; systems are ordered sequence by sequence, B = sequences * S.
+    """
+
+    structure: tuple[Structure, ...]
+    values: tuple[Mapping[str, np.ndarray], ...]
+    tangents: tuple[Mapping[str, np.ndarray], ...] | None
+    grids: tuple[np.ndarray | None, ...]
+    count: int
+    states: int
+
+    def upload(self, backend: Backend) -> UploadedSystems:
+        """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients."""
+        import drjit as dr
+
+        uploaded = []
+        for i, values in enumerate(self.values):
+            arrays = {}
+            for name, value in values.items():
+                array = backend.opaque(value)
+                if self.tangents is not None:
+                    tangent = self.tangents[i].get(name)
+                    if tangent is not None:
+                        dr.enable_grad(array)
+                        dr.set_grad(array, backend.opaque(tangent))
+                arrays[name] = array
+            uploaded.append(arrays)
+        grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
+        return UploadedSystems(self.structure, tuple(uploaded), grids, self.count, self.tangents is not None)
+
+    def slices(self, size: int) -> Iterator[tuple[slice, SystemBatch]]:
+        """Consecutive pieces of at most ``size`` systems, to bound memory."""
+        for start in range(0, self.count, size):
+            piece = slice(start, min(start + size, self.count))
+            yield piece, self.take(np.arange(piece.start, piece.stop))
+
+    def take(self, systems: np.ndarray) -> SystemBatch:
+        """The systems of the given indices."""
+        tangents = None if self.tangents is None else tuple({k: v[systems] for k, v in t.items()} for t in self.tangents)
+        values = tuple({k: v[systems] for k, v in e.items()} for e in self.values)
+        return SystemBatch(self.structure, values, tangents, self.grids, len(systems), len(systems))
+
+
+@dataclass(frozen=True, eq=False)
+class UploadedSystems:
+    """A ``SystemBatch`` in the memory of a backend (Dr.Jit arrays)."""
+
+    structure: tuple[Structure, ...]
+    values: tuple[Mapping[str, Any], ...]
+    grids: tuple[Any, ...]
+    count: int
+    differentiable: bool
+
+
+def assemble(
+    assembly: Assembly,
+    sequences: Sequence[str | Sequence[str]],
+    states: Sequence[State] = ({},),
+    step: Sequence[tuple[str, str, int]] | None = None,
+    placed: PlacedBodies | None = None,
+) -> SystemBatch:
+    """Work out the numbers of every sequence in every state.
+
+    Args:
+        assembly: the instrument.
+        sequences: names of sequences, or element-name tuples, all of the same structure.
+        states: S perturbed states.
+        step: optional derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale``.
+        placed: the bodies of these states, when already placed.
+
+    Returns:
+        A batch of len(sequences) * S systems, sequence by sequence.
+
+    Raises:
+        ValueError: the sequences differ in structure.
+    """
+    placed = assembly.place(states, step) if placed is None else placed
+    chains = [
+        tuple(assembly.elements[n] for n in (assembly.sequences[s] if isinstance(s, str) else s)) for s in sequences
+    ]
+    lengths = {len(chain) for chain in chains}
+    if len(lengths) != 1:
+        raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
+    structures = [_structures([chain[i] for chain in chains], states) for i in range(len(chains[0]))]
+    per_chain = [[_numbers(chain, i, structures[i], states, placed) for i in range(len(chain))] for chain in chains]
+    values = []
+    tangents = []
+    for i in range(len(chains[0])):
+        joined = {k: np.concatenate([numbers[i][k] for numbers in per_chain]) for k in per_chain[0][i]}
+        values.append({k: np.ascontiguousarray(v.real) for k, v in joined.items()})
+        tangents.append({k: v.imag / COMPLEX_STEP for k, v in joined.items() if np.iscomplexobj(v)})
+    grids = tuple(_grid(chains[0][i]) for i in range(len(chains[0])))
+    return SystemBatch(
+        tuple(structures), tuple(values), tuple(tangents) if step is not None else None, grids, len(chains) * len(states), len(states)
+    )
+
+
+def _structures(elements: Sequence[Element], states: Sequence[State]) -> Structure:
+    """Common structure of the i-th elements of all chains."""
+    kinds = {
+        (e.interaction, e.surface.is_plane, len(e.surface.even), isinstance(e.surface.figure, GridFigure), _aperture_kind(e))
+        for e in elements
+    }
+    if len(kinds) != 1:
+        raise ValueError(f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}")
+    interaction, is_plane, even, grid, aperture = kinds.pop()
+    order = -1
+    for e in elements:
+        if isinstance(e.surface.figure, ZernikeFigure):
+            order = max(order, zernike.order_of(e.surface.figure.terms))
+        for state in states:
+            motion = state.get(e.body)
+            if motion is not None and motion.figure:
+                order = max(order, zernike.order_of(motion.figure))
+    return Structure(interaction, is_plane, even, order, grid, aperture)
+
+
+def _aperture_kind(element: Element) -> str:
+    if element.aperture is None:
+        return ""
+    if isinstance(element.aperture, Circle):
+        return "ring" if element.aperture.inner else "circle"
+    return "rectangle"
+
+
+def _grid(element: Element) -> np.ndarray | None:
+    figure = element.surface.figure
+    return figure.spline.ravel() if isinstance(figure, GridFigure) else None
+
+
+def _numbers(
+    chain: Sequence[Element], i: int, structure: Structure, states: Sequence[State], placed: PlacedBodies
+) -> dict[str, np.ndarray]:
+    """Parameters of element i of a chain, each of shape (S,), complex when a derivative is carried."""
+    element = chain[i]
+    count = len(states)
+    body = placed.index[element.body]
+    rotation, translation = placed.rotation[:, body], placed.translation[:, body]
+    if i == 0:
+        relative = np.swapaxes(rotation, -1, -2)
+        offset = -np.einsum("sij,si->sj", rotation, translation)
+    else:
+        before = placed.index[chain[i - 1].body]
+        relative = np.einsum("ski,skj->sij", rotation, placed.rotation[:, before])
+        offset = np.einsum("ski,sk->si", rotation, placed.translation[:, before] - translation)
+    out: dict[str, np.ndarray] = {}
+    for a in range(3):
+        out[f"T{a}"] = offset[:, a]
+        out[f"P{a}"] = translation[:, a]
+        for b in range(3):
+            out[f"R{a}{b}"] = relative[:, a, b]
+            out[f"W{a}{b}"] = rotation[:, a, b]
+    scale = placed.scale[:, body]
+    surface = element.surface
+    if not structure.plane:
+        out["c"] = surface.curvature / scale
+        out["k"] = np.full(count, surface.conic)
+        for n, a in enumerate(surface.even):
+            out[f"A{n}"] = a / scale ** (2 * n + 3)
+    if structure.figure_order >= 0:
+        out.update(_figure_numbers(element, structure.figure_order, states))
+    if isinstance(surface.figure, GridFigure):
+        x0, _, y0, _ = surface.figure.bounds
+        dx, dy = surface.figure.spacing
+        rows, columns = surface.figure.values.shape
+        for name, value in (("gx0", x0), ("gy0", y0), ("gix", 1 / dx), ("giy", 1 / dy), ("gnx", columns), ("gny", rows)):
+            out[name] = np.full(count, float(value))
+    out["n"] = np.full(count, chain[i - 1].index_after if i else 1.0)
+    out["n_after"] = np.full(count, element.index_after)
+    aperture = element.aperture
+    if aperture is not None:
+        out["ax"] = np.full(count, aperture.centre[0])
+        out["ay"] = np.full(count, aperture.centre[1])
+        if isinstance(aperture, Circle):
+            out["ar2"] = np.full(count, aperture.radius**2)
+            out["ai2"] = np.full(count, aperture.inner**2)
+        else:
+            out["ahx"] = np.full(count, aperture.half_x)
+            out["ahy"] = np.full(count, aperture.half_y)
+    return out
+
+
+def _figure_numbers(element: Element, order: int, states: Sequence[State]) -> dict[str, np.ndarray]:
+    """Monomial coefficients of the Zernike figure of each state, named F0, F1, ...; centre fx, fy."""
+    figure = element.surface.figure
+    if isinstance(figure, ZernikeFigure):
+        radius, centre, base = figure.radius, figure.centre, dict(figure.terms)
+    elif isinstance(element.aperture, Circle):
+        radius, centre, base = element.aperture.radius, element.aperture.centre, {}
+    elif element.aperture is not None:
+        radius, centre, base = float(np.hypot(element.aperture.half_x, element.aperture.half_y)), element.aperture.centre, {}
+    else:
+        raise ValueError(f"element {element.name!r} needs an aperture to carry a figure: it sets the disk")
+    table = np.empty((len(states), zernike.triangle_size(order)))
+    nothing = Motion()
+    for s, state in enumerate(states):
+        terms = dict(base)
+        for j, amplitude in state.get(element.body, nothing).figure.items():
+            terms[j] = terms.get(j, 0.0) + amplitude
+        table[s] = zernike.monomials(terms, order, radius)
+    out = {f"F{m}": table[:, m] for m in range(table.shape[1])}
+    out["fx"] = np.full(len(states), centre[0])
+    out["fy"] = np.full(len(states), centre[1])
+    return out

@@ -1,0 +1,301 @@
+"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optics.backend import Backend
+from optics.element import Interaction
+from optics.figure_kernel import grid_figure, polynomial_figure
+from optics.system import Structure, SystemBatch, UploadedSystems
+from optics.zernike import triangle_size
+
+NEWTON_STEPS = 3
+"""Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope below
+1e-3, so that each step gains at least six digits; three reach rounding. A ray that has not converged is marked invalid."""
+
+CONVERGED = 1e-12
+"""Largest distance to the surface of a valid hit, metres."""
+
+
+class BeamMissedError(RuntimeError):
+    """No ray of a bundle gets through a sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still alive.
+
+    Width B * N for B systems (system by system), or N to send the same N rays through each.
+    """
+
+    position: Any
+    direction: Any
+    path: Any
+    valid: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """Rays at the last element of a sequence.
+
+    Attributes:
+        local: rays in the last element's own frame, after the interaction.
+        world: the same rays in the world frame (position and direction), None unless asked for.
+        hits: element index -> local position on that element, for those asked to be kept.
+        count: B systems.
+    """
+
+    local: Rays
+    world: Rays | None
+    hits: Mapping[int, Any]
+    count: int
+
+    def numpy(self, rays: Rays | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position (B, N, 3), direction (B, N, 3), path (B, N), valid (B, N) of ``local`` (default) or ``world``."""
+        rays = self.local if rays is None else rays
+        return (
+            _rows(rays.position, self.count),
+            _rows(rays.direction, self.count),
+            rays.path.numpy().reshape(self.count, -1),
+            rays.valid.numpy().reshape(self.count, -1),
+        )
+
+    def hit(self, element: int) -> np.ndarray:
+        """Local positions (B, N, 3) on an element that was kept, metres."""
+        return _rows(self.hits[element], self.count)
+
+
+def _rows(vector: Any, count: int) -> np.ndarray:
+    return np.stack([c.numpy() for c in vector], axis=-1).reshape(count, -1, 3)
+
+
+def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, path: np.ndarray | None = None) -> Rays:
+    """Upload rays given by arrays of shape (..., 3), metres and unit vectors."""
+    import drjit as dr
+
+    position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
+    direction = np.asarray(direction, dtype=np.float64).reshape(-1, 3)
+    position, direction = np.broadcast_arrays(position, direction)
+    n = len(position)
+    start = backend.opaque(np.zeros(n) if path is None else np.asarray(path, dtype=np.float64).ravel())
+    return Rays(backend.vector(position), backend.vector(direction), start, dr.full(backend.Bool, True, n))
+
+
+def trace(
+    backend: Backend,
+    systems: SystemBatch | UploadedSystems,
+    rays: Rays,
+    keep: Collection[int] = (),
+    world: bool = False,
+    evaluate: bool = True,
+) -> Traced:
+    """Send rays, given in the world frame, through each system.
+
+    Args:
+        backend: where to compute.
+        systems: B systems.
+        rays: B * N rays (system by system) or N rays that every system gets.
+        keep: indices of elements whose hit points are wanted.
+        world: also return the final rays in the world frame.
+        evaluate: launch the kernel now (False leaves a graph to build on).
+
+    Returns:
+        The rays at the last element. Rays that miss a surface or an aperture, or are totally reflected at a refracting
+        surface, are marked invalid; their numbers stay finite but mean nothing.
+    """
+    import drjit as dr
+
+    uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
+    rays, lookup = _spread(backend, rays, uploaded.count)
+    p, d, path, valid = rays.position, rays.direction, rays.path, rays.valid
+    hits: dict[int, Any] = {}
+    differentiable = uploaded.differentiable or dr.grad_enabled(p) or dr.grad_enabled(d)
+    for i, structure in enumerate(uploaded.structure):
+        g = {name: lookup(array) for name, array in uploaded.values[i].items() if name[0] not in "WP"}
+        p, d = _into_frame(backend, p, d, g)
+        t, ok = _distance(backend, p, d, g, structure, uploaded.grids[i], differentiable)
+        p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
+        path = dr.fma(g["n"], t, path)
+        valid = valid & ok & _inside(p, g, structure)
+        if structure.interaction is not Interaction.PASS:
+            d, ok = _redirect(backend, p, d, g, structure, uploaded.grids[i])
+            valid = valid & ok
+        if i in keep:
+            hits[i] = p
+    local = Rays(p, d, path, valid)
+    outside = None
+    if world:
+        g = {name: lookup(array) for name, array in uploaded.values[-1].items() if name[0] in "WP"}
+        outside = Rays(
+            backend.Vector3(*(g[f"W{a}0"] * p.x + g[f"W{a}1"] * p.y + g[f"W{a}2"] * p.z + g[f"P{a}"] for a in range(3))),
+            backend.Vector3(*(g[f"W{a}0"] * d.x + g[f"W{a}1"] * d.y + g[f"W{a}2"] * d.z for a in range(3))),
+            path,
+            valid,
+        )
+    if evaluate:
+        dr.eval(p, d, path, valid, list(hits.values()), [] if outside is None else [outside.position, outside.direction])
+    return Traced(local, outside, hits, uploaded.count)
+
+
+def require_some(valid: np.ndarray, what: str) -> None:
+    """Raise BeamMissedError when some system of ``valid`` (B, N) has no valid ray at all."""
+    alive = valid.reshape(len(valid), -1).any(axis=1)
+    if not alive.all():
+        raise BeamMissedError(
+            f"no ray gets through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the beam "
+            "off a mirror or an aperture"
+        )
+
+
+def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
+    """Bring rays to full width and make the function that looks a system's number up for each ray."""
+    import drjit as dr
+
+    if count == 1:
+        return rays, lambda array: array
+    width = dr.width(rays.position)
+    if width % count or width < count:
+        shared = width
+        index = dr.arange(backend.UInt, count * shared)
+        ray = index % dr.opaque(backend.UInt, shared)
+        rays = Rays(
+            dr.gather(backend.Vector3, rays.position, ray),
+            dr.gather(backend.Vector3, rays.direction, ray),
+            dr.gather(backend.Float, rays.path, ray),
+            dr.gather(backend.Bool, rays.valid, ray),
+        )
+    else:
+        shared = width // count
+        index = dr.arange(backend.UInt, width)
+    system = index // dr.opaque(backend.UInt, shared)
+    return rays, lambda array: dr.gather(backend.Float, array, system)
+
+
+def _into_frame(backend: Backend, p: Any, d: Any, g: Mapping[str, Any]) -> tuple[Any, Any]:
+    position = backend.Vector3(
+        *(g[f"R{a}0"] * p.x + g[f"R{a}1"] * p.y + g[f"R{a}2"] * p.z + g[f"T{a}"] for a in range(3))
+    )
+    direction = backend.Vector3(*(g[f"R{a}0"] * d.x + g[f"R{a}1"] * d.y + g[f"R{a}2"] * d.z for a in range(3)))
+    return position, direction
+
+
+def _distance(
+    backend: Backend, p: Any, d: Any, g: Mapping[str, Any], structure: Structure, grid: Any, differentiable: bool
+) -> tuple[Any, Any]:
+    """Path from p along d to the surface (may be negative) and whether it exists."""
+    import drjit as dr
+
+    figured = structure.figure_order >= 0 or structure.grid
+    if structure.plane:
+        t = -p.z / d.z
+        ok = dr.abs(d.z) > 1e-12
+        if not figured:
+            return t, ok
+    else:
+        c, q = g["c"], 1.0 + g["k"]
+        a = c * (d.x * d.x + d.y * d.y + q * d.z * d.z)
+        b = c * (p.x * d.x + p.y * d.y + q * p.z * d.z) - d.z
+        e = c * (p.x * p.x + p.y * p.y + q * p.z * p.z) - 2.0 * p.z
+        discriminant = b * b - a * e
+        ok = discriminant >= 0.0
+        root = dr.sqrt(dr.select(ok, discriminant, 1.0))
+        # of the two crossings the one on the vertex sheet: the denominator keeps the sign of d.z and never cancels there
+        t = e / (dr.copysign(root, d.z) - b)
+        if not structure.even and not figured:
+            return t, ok
+    numbers = g
+    origin, direction = p, d
+    if differentiable:
+        # solve without derivatives; one attached step from the solution carries the exact derivative (implicit functions)
+        numbers = {name: dr.detach(value) for name, value in g.items()}
+        origin, direction, t = dr.detach(p), dr.detach(d), dr.detach(t)
+    for _ in range(NEWTON_STEPS):
+        t, _, _ = _newton_step(origin, direction, t, numbers, structure, grid)
+    if differentiable:
+        t, _, _ = _newton_step(p, d, t, g, structure, grid)
+    x, y = origin.x + t * direction.x, origin.y + t * direction.y
+    height, _, _, domain = _sag(x, y, numbers, structure, grid)
+    return t, ok & domain & (dr.abs(origin.z + t * direction.z - height) < CONVERGED)
+
+
+def _newton_step(p: Any, d: Any, t: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any]:
+    height, sx, sy, _ = _sag(p.x + t * d.x, p.y + t * d.y, g, structure, grid)
+    residual = p.z + t * d.z - height
+    return t - residual / (d.z - sx * d.x - sy * d.y), sx, sy
+
+
+def _sag(x: Any, y: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any, Any]:
+    """Height, slopes dz/dx and dz/dy, and whether x, y is in the surface's domain."""
+    import drjit as dr
+
+    height: Any = 0.0 * x
+    sx: Any = 0.0 * x
+    sy: Any = 0.0 * x
+    domain: Any = x == x
+    if not structure.plane:
+        c = g["c"]
+        r2 = x * x + y * y
+        inner = 1.0 - (1.0 + g["k"]) * c * c * r2
+        domain = inner > 0.0
+        root = dr.sqrt(dr.select(domain, inner, 1.0))
+        height = c * r2 / (1.0 + root)
+        radial = c / root  # (dz/dr)/r of the conic
+        if structure.even:
+            # dz/d(r^2) of sum A_n r^(2n+4) by Horner, from the highest term down
+            polynomial: Any = 0.0
+            slope: Any = 0.0
+            for n in range(structure.even - 1, -1, -1):
+                polynomial = dr.fma(polynomial, r2, g[f"A{n}"]) if n < structure.even - 1 else g[f"A{n}"]
+                term = float(n + 2) * g[f"A{n}"]
+                slope = dr.fma(slope, r2, term) if n < structure.even - 1 else term
+            height = dr.fma(polynomial, r2 * r2, height)
+            radial = dr.fma(2.0 * slope, r2, radial)
+        sx, sy = radial * x, radial * y
+    if structure.figure_order >= 0:
+        coefficients = [g[f"F{m}"] for m in range(triangle_size(structure.figure_order))]
+        h, hx, hy = polynomial_figure(x - g["fx"], y - g["fy"], coefficients, structure.figure_order)
+        height, sx, sy = height + h, sx + hx, sy + hy
+    if structure.grid:
+        h, hx, hy = grid_figure(x, y, g, grid)
+        height, sx, sy = height + h, sx + hx, sy + hy
+    return height, sx, sy, domain
+
+
+def _inside(p: Any, g: Mapping[str, Any], structure: Structure) -> Any:
+    import drjit as dr
+
+    if structure.aperture in ("circle", "ring"):
+        x, y = p.x - g["ax"], p.y - g["ay"]
+        r2 = x * x + y * y
+        inside = r2 <= g["ar2"]
+        return inside & (r2 >= g["ai2"]) if structure.aperture == "ring" else inside
+    if structure.aperture == "rectangle":
+        return (dr.abs(p.x - g["ax"]) <= g["ahx"]) & (dr.abs(p.y - g["ay"]) <= g["ahy"])
+    return True
+
+
+def _redirect(
+    backend: Backend, p: Any, d: Any, g: Mapping[str, Any], structure: Structure, grid: Any
+) -> tuple[Any, Any]:
+    """Direction after reflection or refraction (Snell), and whether it exists."""
+    import drjit as dr
+
+    _, sx, sy, _ = _sag(p.x, p.y, g, structure, grid)
+    square = 1.0 + sx * sx + sy * sy  # of the normal (-sx, -sy, 1) before normalising
+    along = d.z - sx * d.x - sy * d.y
+    if structure.interaction is Interaction.REFLECT:
+        f = 2.0 * along / square
+        return backend.Vector3(d.x + f * sx, d.y + f * sy, d.z - f), True
+    norm = dr.rsqrt(square)
+    cosine = along * norm
+    ratio = g["n"] / g["n_after"]
+    sine2 = ratio * ratio * (1.0 - cosine * cosine)
+    ok = sine2 <= 1.0
+    after = dr.copysign(dr.sqrt(dr.select(ok, 1.0 - sine2, 0.0)), cosine)
+    f = (after - ratio * cosine) * norm
+    return backend.Vector3(ratio * d.x - f * sx, ratio * d.y - f * sy, ratio * d.z + f), ok

@@ -1,0 +1,120 @@
+"""Zernike circle polynomials in Noll's order, unit rms over the disk, as Cartesian polynomials."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import comb, factorial, sqrt
+from typing import Any
+
+import numpy as np
+
+MAX_NOLL = 66
+"""Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
+
+
+def noll_to_nm(index: int) -> tuple[int, int]:
+    """Radial order n and signed azimuthal order m of a Noll index (1 = piston, 2 = x tilt, 3 = y tilt, 4 = defocus).
+
+    m > 0 are cosine terms (even j), m < 0 sine terms (odd j) (Noll, JOSA 66, 207, 1976).
+    """
+    if not 1 <= index <= MAX_NOLL:
+        raise ValueError(f"Noll index {index} is outside 1..{MAX_NOLL}")
+    n = 0
+    first = 1
+    while first + n + 1 <= index:
+        first += n + 1
+        n += 1
+    offset = index - first
+    m = 2 * ((offset + 1) // 2) if n % 2 == 0 else 2 * (offset // 2) + 1
+    return n, (m if index % 2 == 0 else -m) if m else 0
+
+
+@lru_cache(maxsize=None)
+def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
+    """Terms (a, b, c) of Z_j(x, y) = sum c x^a y^b on the unit disk."""
+    n, signed = noll_to_nm(index)
+    m = abs(signed)
+    norm = sqrt(n + 1) * (sqrt(2) if m else 1.0)
+    # r^m cos(m t) and r^m sin(m t) are the real and imaginary parts of (x + iy)^m
+    azimuthal: dict[tuple[int, int], float] = {}
+    for k in range(m + 1):
+        if (k % 2 == 0) == (signed >= 0):
+            sign = (-1) ** (k // 2)
+            azimuthal[(m - k, k)] = sign * comb(m, k)
+    total: dict[tuple[int, int], float] = {}
+    for s in range((n - m) // 2 + 1):
+        radial = (-1) ** s * factorial(n - s)
+        radial /= factorial(s) * factorial((n + m) // 2 - s) * factorial((n - m) // 2 - s)
+        power = (n - m) // 2 - s  # of (x^2 + y^2)
+        for k in range(power + 1):
+            for (a, b), c in azimuthal.items():
+                key = (a + 2 * (power - k), b + 2 * k)
+                total[key] = total.get(key, 0.0) + norm * radial * comb(power, k) * c
+    return tuple((a, b, c) for (a, b), c in sorted(total.items()) if c != 0.0)
+
+
+def zernike(index: int, x: Any, y: Any) -> np.ndarray:
+    """Value of Z_j at unit-disk coordinates x, y (same shape)."""
+    x, y = np.asarray(x), np.asarray(y)
+    return np.asarray(sum(c * x**a * y**b for a, b, c in cartesian_terms(index)))
+
+
+def basis(last: int, x: Any, y: Any) -> np.ndarray:
+    """Z_1..Z_last at points (N,) as columns, shape (N, last)."""
+    return np.stack([zernike(j, x, y) * np.ones_like(x) for j in range(1, last + 1)], axis=-1)
+
+
+def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
+    """Derivatives of Z_1..Z_last along x (axis 0) or y (axis 1) at points (N,), shape (N, last)."""
+    columns = []
+    for j in range(1, last + 1):
+        column = np.zeros_like(x)
+        for a, b, c in cartesian_terms(j):
+            if axis == 0 and a > 0:
+                column = column + c * a * x ** (a - 1) * y**b
+            elif axis == 1 and b > 0:
+                column = column + c * b * x**a * y ** (b - 1)
+        columns.append(column)
+    return np.stack(columns, axis=-1)
+
+
+def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> np.ndarray:
+    """Weighted least-squares coefficients of Z_1..Z_last.
+
+    Args:
+        last: highest Noll index.
+        x, y: unit-disk coordinates, shape (N,).
+        values: shape (..., N), e.g. optical path differences in metres.
+        weights: quadrature weights, shape (N,).
+
+    Returns:
+        Shape (..., last), unit of ``values`` (each coefficient is an rms).
+    """
+    root = np.sqrt(np.ones_like(x) if weights is None else weights)
+    solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (np.asarray(values) * root).T, rcond=None)
+    return np.asarray(solution.T)
+
+
+def triangle_size(order: int) -> int:
+    """Number of monomials x^a y^b with a + b <= order."""
+    return (order + 1) * (order + 2) // 2
+
+
+def triangle_index(a: int, b: int) -> int:
+    """Place of x^a y^b in the list ordered by total degree."""
+    d = a + b
+    return d * (d + 1) // 2 + b
+
+
+def monomials(coefficients: dict[int, float], order: int, radius: float) -> np.ndarray:
+    """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape (triangle_size(order),)."""
+    out = np.zeros(triangle_size(order))
+    for j, amplitude in coefficients.items():
+        for a, b, c in cartesian_terms(j):
+            out[triangle_index(a, b)] += amplitude * c / radius ** (a + b)
+    return out
+
+
+def order_of(indices: Any) -> int:
+    """Highest radial order among Noll indices, -1 for none."""
+    return max((noll_to_nm(j)[0] for j in indices), default=-1)
