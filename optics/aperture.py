@@ -51,7 +51,9 @@ class Rectangle:
     def __post_init__(self) -> None:
         """Check the sizes."""
         if not (self.half_x > 0.0 and self.half_y > 0.0):
-            raise ValueError(f"a rectangular aperture needs positive half-widths, found {self.half_x} and {self.half_y}")
+            raise ValueError(
+                f"a rectangular aperture needs positive half-widths, found {self.half_x} and {self.half_y}"
+            )
 
     def contains(self, x: Any, y: Any) -> Any:
         """Mask of points inside; NumPy or Dr.Jit arrays."""

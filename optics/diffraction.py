@@ -7,9 +7,10 @@ and of eikonal L (the optical path to the wave's plane through P0). The field on
 
     U(x, y) = 1/lambda * sum_j w_j a_j exp(i k (L_j + u_j x + v_j y)),
 
-with w_j the pupil element. Because exp(ik(ux + vy)) factors, U on a grid of R x C pixels is the product of an (R x N) and an
-(N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express 15, 15935
-(2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image integrates to P.
+with w_j the pupil element. Because exp(ik(ux + vy)) factors, U on a grid of R x C pixels is the product of an (R x N)
+and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express
+15, 15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image
+integrates to P.
 """
 
 from __future__ import annotations
@@ -39,9 +40,7 @@ class PupilField:
 
     def __getitem__(self, piece: slice) -> PupilField:
         """Some of the images."""
-        return PupilField(
-            self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength
-        )
+        return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
 
 def image(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -78,6 +77,7 @@ def huygens(
     amplitude: np.ndarray,
     wavelength: float,
     pixels: np.ndarray,
+    normal: np.ndarray | None = None,
     chunk: int = 256,
 ) -> np.ndarray:
     """Irradiance by Huygens' sum of spherical wavelets from points on the exit wavefront; slow, the check of ``image``.
@@ -89,6 +89,8 @@ def huygens(
         amplitude: (N,) area element times field amplitude at the points (m^2 * field).
         wavelength: metres.
         pixels: (M, 3) points where the irradiance is wanted.
+        normal: (3,) unit normal of the detector: each wavelet counts with the root of the cosine of its incidence, so that
+            the result is power per detector area, as in ``image``; None: square to the light.
         chunk: pixels done at once, to bound memory.
 
     Returns:
@@ -100,6 +102,8 @@ def huygens(
         arm = pixels[start : start + chunk, None, :] - points[None]
         distance = np.linalg.norm(arm, axis=-1)
         obliquity = np.einsum("mnx,nx->mn", arm, direction) / distance
+        if normal is not None:
+            obliquity = obliquity * np.sqrt(np.abs(arm @ normal) / distance)
         phase = k * ((path - path[0]) + (distance - distance[:, :1]))
         field = np.sum(amplitude * obliquity / distance * np.exp(1j * phase), axis=1) / wavelength
         out[start : start + chunk] = np.abs(field) ** 2

@@ -14,7 +14,7 @@ class Interaction(Enum):
 
     REFLECT = "reflect"
     REFRACT = "refract"
-    PASS = "pass"  # noqa: S105 - a plane that is only crossed: stop, detector, reference plane
+    PASS = "pass"
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,11 @@ def grid_figure(x: Any, y: Any, g: Mapping[str, Any], table: Any) -> tuple[Any, 
 def _weights(f: Any) -> tuple[list[Any], list[Any]]:
     """Cubic B-spline weights of samples -1, 0, 1, 2 at fraction f, and their derivatives."""
     e = 1.0 - f
-    values = [e * e * e / 6.0, 2.0 / 3.0 - f * f * (2.0 - f) / 2.0, 2.0 / 3.0 - e * e * (2.0 - e) / 2.0, f * f * f / 6.0]
+    values = [
+        e * e * e / 6.0,
+        2.0 / 3.0 - f * f * (2.0 - f) / 2.0,
+        2.0 / 3.0 - e * e * (2.0 - e) / 2.0,
+        f * f * f / 6.0,
+    ]
     slopes = [-0.5 * e * e, f * (1.5 * f - 2.0), -e * (1.5 * e - 2.0), 0.5 * f * f]
     return values, slopes

@@ -31,7 +31,8 @@ def chief_directions(
         points: image points, world, (B, M, 3).
         guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
         transverse: direction near which the first transverse axis is taken, (3,).
-        start, jacobian: solution of a near state to start from (see ``aim``).
+        start: aim parameters of a near state to start from (see ``aim``).
+        jacobian: their Jacobian.
 
     Returns:
         Object-space directions toward the scene, world, (B, M, 3); aim parameters and their Jacobian.
@@ -71,7 +72,8 @@ def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> 
     """Compare perturbed states with the nominal one.
 
     Args:
-        sight: object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M odd, the
+        sight: object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M
+        odd, the
             middle point is the line's centre.
         position: coordinate of the points along camera Y on the focal plane, (M,), metres.
         camera: columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.

@@ -18,9 +18,9 @@ MAX_REACH = 6
 class PixelResponse:
     """Filter that turns irradiance at pixel centres into the mean over the pixel, convolved with a disk source.
 
-    A diffraction image holds no frequency above its optical cut-off. Below it, the transfer function of pixel and disk is
-    matched by a small symmetric kernel, so that no oversampling is needed; above half the sampling frequency it is
-    not possible and the fit says so.
+    A diffraction image holds no frequency above its optical cut-off. Below it, the transfer function of pixel and
+    disk is matched by a small symmetric kernel, so that no oversampling is needed; above half the sampling frequency
+    it is not possible and the fit says so.
 
     Attributes:
         kernel: (2 reach + 1, 2 reach + 1).
@@ -47,7 +47,9 @@ class PixelResponse:
         """
         limit = cutoff * pitch  # cycles per pixel
         if limit > 0.45:
-            raise ValueError(f"irradiance with {limit:.2f} cycles per pixel is not sampled by its pixels; oversample it")
+            raise ValueError(
+                f"irradiance with {limit:.2f} cycles per pixel is not sampled by its pixels; oversample it"
+            )
         f = np.linspace(-limit, limit, 41)
         fx, fy = (a.ravel() for a in np.meshgrid(f, f))
         inside = np.hypot(fx, fy) <= limit

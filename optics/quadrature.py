@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 
@@ -27,7 +27,7 @@ class PupilNodes:
         return len(self.x)
 
 
-@lru_cache(maxsize=None)
+@cache
 def disk(rings: int, arms: int | None = None, inner: float = 0.0) -> PupilNodes:
     """Gauss quadrature over the unit disk (annulus): Gauss-Legendre in r^2, equal arms in azimuth.
 
@@ -49,7 +49,7 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0) -> PupilNodes:
     return _frozen((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel(), weight.ravel())
 
 
-@lru_cache(maxsize=None)
+@cache
 def square(points: int) -> PupilNodes:
     """Gauss-Legendre product quadrature over [-1, 1]^2 with points x points nodes."""
     s, w = np.polynomial.legendre.leggauss(points)

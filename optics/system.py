@@ -83,7 +83,9 @@ class SystemBatch:
 
     def take(self, systems: np.ndarray) -> SystemBatch:
         """The systems of the given indices."""
-        tangents = None if self.tangents is None else tuple({k: v[systems] for k, v in t.items()} for t in self.tangents)
+        tangents = (
+            None if self.tangents is None else tuple({k: v[systems] for k, v in t.items()} for t in self.tangents)
+        )
         values = tuple({k: v[systems] for k, v in e.items()} for e in self.values)
         return SystemBatch(self.structure, values, tangents, self.grids, len(systems), len(systems))
 
@@ -138,18 +140,31 @@ def assemble(
         tangents.append({k: v.imag / COMPLEX_STEP for k, v in joined.items() if np.iscomplexobj(v)})
     grids = tuple(_grid(chains[0][i]) for i in range(len(chains[0])))
     return SystemBatch(
-        tuple(structures), tuple(values), tuple(tangents) if step is not None else None, grids, len(chains) * len(states), len(states)
+        tuple(structures),
+        tuple(values),
+        tuple(tangents) if step is not None else None,
+        grids,
+        len(chains) * len(states),
+        len(states),
     )
 
 
 def _structures(elements: Sequence[Element], states: Sequence[State]) -> Structure:
     """Common structure of the i-th elements of all chains."""
     kinds = {
-        (e.interaction, e.surface.is_plane, len(e.surface.even), isinstance(e.surface.figure, GridFigure), _aperture_kind(e))
+        (
+            e.interaction,
+            e.surface.is_plane,
+            len(e.surface.even),
+            isinstance(e.surface.figure, GridFigure),
+            _aperture_kind(e),
+        )
         for e in elements
     }
     if len(kinds) != 1:
-        raise ValueError(f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}")
+        raise ValueError(
+            f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}"
+        )
     interaction, is_plane, even, grid, aperture = kinds.pop()
     order = -1
     for e in elements:
@@ -202,16 +217,16 @@ def _numbers(
     if not structure.plane:
         out["c"] = surface.curvature / scale
         out["k"] = np.full(count, surface.conic)
-        for n, a in enumerate(surface.even):
-            out[f"A{n}"] = a / scale ** (2 * n + 3)
+        for n, term in enumerate(surface.even):
+            out[f"A{n}"] = term / scale ** (2 * n + 3)
     if structure.figure_order >= 0:
         out.update(_figure_numbers(element, structure.figure_order, states))
     if isinstance(surface.figure, GridFigure):
         x0, _, y0, _ = surface.figure.bounds
         dx, dy = surface.figure.spacing
         rows, columns = surface.figure.values.shape
-        for name, value in (("gx0", x0), ("gy0", y0), ("gix", 1 / dx), ("giy", 1 / dy), ("gnx", columns), ("gny", rows)):
-            out[name] = np.full(count, float(value))
+        grid = {"gx0": x0, "gy0": y0, "gix": 1.0 / dx, "giy": 1.0 / dy, "gnx": float(columns), "gny": float(rows)}
+        out.update({name: np.full(count, value) for name, value in grid.items()})
     out["n"] = np.full(count, chain[i - 1].index_after if i else 1.0)
     out["n_after"] = np.full(count, element.index_after)
     aperture = element.aperture
@@ -235,7 +250,11 @@ def _figure_numbers(element: Element, order: int, states: Sequence[State]) -> di
     elif isinstance(element.aperture, Circle):
         radius, centre, base = element.aperture.radius, element.aperture.centre, {}
     elif element.aperture is not None:
-        radius, centre, base = float(np.hypot(element.aperture.half_x, element.aperture.half_y)), element.aperture.centre, {}
+        radius, centre, base = (
+            float(np.hypot(element.aperture.half_x, element.aperture.half_y)),
+            element.aperture.centre,
+            {},
+        )
     else:
         raise ValueError(f"element {element.name!r} needs an aperture to carry a figure: it sets the disk")
     table = np.empty((len(states), zernike.triangle_size(order)))

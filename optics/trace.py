@@ -15,8 +15,9 @@ from optics.system import Structure, SystemBatch, UploadedSystems
 from optics.zernike import triangle_size
 
 NEWTON_STEPS = 3
-"""Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope below
-1e-3, so that each step gains at least six digits; three reach rounding. A ray that has not converged is marked invalid."""
+"""Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope
+below 1e-3, so that each step gains at least six digits; three reach rounding. A ray that has not converged is marked
+invalid."""
 
 CONVERGED = 1e-12
 """Largest distance to the surface of a valid hit, metres."""
@@ -132,23 +133,27 @@ def trace(
     if world:
         g = {name: lookup(array) for name, array in uploaded.values[-1].items() if name[0] in "WP"}
         outside = Rays(
-            backend.Vector3(*(g[f"W{a}0"] * p.x + g[f"W{a}1"] * p.y + g[f"W{a}2"] * p.z + g[f"P{a}"] for a in range(3))),
+            backend.Vector3(
+                *(g[f"W{a}0"] * p.x + g[f"W{a}1"] * p.y + g[f"W{a}2"] * p.z + g[f"P{a}"] for a in range(3))
+            ),
             backend.Vector3(*(g[f"W{a}0"] * d.x + g[f"W{a}1"] * d.y + g[f"W{a}2"] * d.z for a in range(3))),
             path,
             valid,
         )
     if evaluate:
-        dr.eval(p, d, path, valid, list(hits.values()), [] if outside is None else [outside.position, outside.direction])
+        dr.eval(
+            p, d, path, valid, list(hits.values()), [] if outside is None else [outside.position, outside.direction]
+        )
     return Traced(local, outside, hits, uploaded.count)
 
 
 def require_some(valid: np.ndarray, what: str) -> None:
     """Raise BeamMissedError when some system of ``valid`` (B, N) has no valid ray at all."""
-    alive = valid.reshape(len(valid), -1).any(axis=1)
+    alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
     if not alive.all():
         raise BeamMissedError(
-            f"no ray gets through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the beam "
-            "off a mirror or an aperture"
+            f"no ray gets through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the "
+            "beam off a mirror or an aperture"
         )
 
 
@@ -177,10 +182,14 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _into_frame(backend: Backend, p: Any, d: Any, g: Mapping[str, Any]) -> tuple[Any, Any]:
+    import drjit as dr
+
     position = backend.Vector3(
-        *(g[f"R{a}0"] * p.x + g[f"R{a}1"] * p.y + g[f"R{a}2"] * p.z + g[f"T{a}"] for a in range(3))
+        *(dr.fma(g[f"R{a}0"], p.x, dr.fma(g[f"R{a}1"], p.y, dr.fma(g[f"R{a}2"], p.z, g[f"T{a}"]))) for a in range(3))
     )
-    direction = backend.Vector3(*(g[f"R{a}0"] * d.x + g[f"R{a}1"] * d.y + g[f"R{a}2"] * d.z for a in range(3)))
+    direction = backend.Vector3(
+        *(dr.fma(g[f"R{a}0"], d.x, dr.fma(g[f"R{a}1"], d.y, g[f"R{a}2"] * d.z)) for a in range(3))
+    )
     return position, direction
 
 
@@ -190,80 +199,98 @@ def _distance(
     """Path from p along d to the surface (may be negative) and whether it exists."""
     import drjit as dr
 
-    figured = structure.figure_order >= 0 or structure.grid
+    bent = structure.even or structure.figure_order >= 0 or structure.grid
     if structure.plane:
         t = -p.z / d.z
         ok = dr.abs(d.z) > 1e-12
-        if not figured:
+        if not bent:
             return t, ok
     else:
         c, q = g["c"], 1.0 + g["k"]
-        a = c * (d.x * d.x + d.y * d.y + q * d.z * d.z)
-        b = c * (p.x * d.x + p.y * d.y + q * p.z * d.z) - d.z
-        e = c * (p.x * p.x + p.y * p.y + q * p.z * p.z) - 2.0 * p.z
+        a = c * dr.fma(d.x, d.x, dr.fma(d.y, d.y, q * d.z * d.z))
+        b = c * dr.fma(p.x, d.x, dr.fma(p.y, d.y, q * p.z * d.z)) - d.z
+        e = c * dr.fma(p.x, p.x, dr.fma(p.y, p.y, q * p.z * p.z)) - 2.0 * p.z
         discriminant = b * b - a * e
         ok = discriminant >= 0.0
         root = dr.sqrt(dr.select(ok, discriminant, 1.0))
-        # of the two crossings the one on the vertex sheet: the denominator keeps the sign of d.z and never cancels there
+        # of the two crossings the one on the vertex sheet: the denominator keeps the sign of d.z and never cancels
+        # there
         t = e / (dr.copysign(root, d.z) - b)
-        if not structure.even and not figured:
-            return t, ok
+        if not bent:
+            return t, ok & (q * c * dr.fma(t, d.z, p.z) < 1.0)
     numbers = g
     origin, direction = p, d
     if differentiable:
-        # solve without derivatives; one attached step from the solution carries the exact derivative (implicit functions)
+        # solve without derivatives; one attached step from the solution carries the exact derivative (implicit
+        # functions)
         numbers = {name: dr.detach(value) for name, value in g.items()}
         origin, direction, t = dr.detach(p), dr.detach(d), dr.detach(t)
     for _ in range(NEWTON_STEPS):
-        t, _, _ = _newton_step(origin, direction, t, numbers, structure, grid)
+        t = _newton_step(origin, direction, t, numbers, structure, grid)
     if differentiable:
-        t, _, _ = _newton_step(p, d, t, g, structure, grid)
-    x, y = origin.x + t * direction.x, origin.y + t * direction.y
-    height, _, _, domain = _sag(x, y, numbers, structure, grid)
-    return t, ok & domain & (dr.abs(origin.z + t * direction.z - height) < CONVERGED)
+        t = _newton_step(p, d, t, g, structure, grid)
+    level, _, _, nz = _level(*_along(origin, direction, t), numbers, structure, grid)
+    # level / nz is the height above the surface to first order
+    return t, ok & (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
 
 
-def _newton_step(p: Any, d: Any, t: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any]:
-    height, sx, sy, _ = _sag(p.x + t * d.x, p.y + t * d.y, g, structure, grid)
-    residual = p.z + t * d.z - height
-    return t - residual / (d.z - sx * d.x - sy * d.y), sx, sy
-
-
-def _sag(x: Any, y: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any, Any]:
-    """Height, slopes dz/dx and dz/dy, and whether x, y is in the surface's domain."""
+def _along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
     import drjit as dr
 
-    height: Any = 0.0 * x
-    sx: Any = 0.0 * x
-    sy: Any = 0.0 * x
-    domain: Any = x == x
-    if not structure.plane:
-        c = g["c"]
-        r2 = x * x + y * y
-        inner = 1.0 - (1.0 + g["k"]) * c * c * r2
-        domain = inner > 0.0
-        root = dr.sqrt(dr.select(domain, inner, 1.0))
-        height = c * r2 / (1.0 + root)
-        radial = c / root  # (dz/dr)/r of the conic
-        if structure.even:
-            # dz/d(r^2) of sum A_n r^(2n+4) by Horner, from the highest term down
-            polynomial: Any = 0.0
-            slope: Any = 0.0
-            for n in range(structure.even - 1, -1, -1):
-                polynomial = dr.fma(polynomial, r2, g[f"A{n}"]) if n < structure.even - 1 else g[f"A{n}"]
-                term = float(n + 2) * g[f"A{n}"]
-                slope = dr.fma(slope, r2, term) if n < structure.even - 1 else term
-            height = dr.fma(polynomial, r2 * r2, height)
-            radial = dr.fma(2.0 * slope, r2, radial)
-        sx, sy = radial * x, radial * y
+    return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
+
+
+def _newton_step(p: Any, d: Any, t: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> Any:
+    import drjit as dr
+
+    level, nx, ny, nz = _level(*_along(p, d, t), g, structure, grid)
+    return t - level / dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
+
+
+def _level(x: Any, y: Any, z: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any, Any]:
+    """Level function of the surface and its gradient.
+
+    With h the aspheric terms and the figure and w = z - h(x, y), the surface is where
+
+        G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
+
+    the conic's own equation in w: no square root and no division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
+    positive on the sheet of the vertex.
+    """
+    import drjit as dr
+
+    height: Any = None
+    sx: Any = None
+    sy: Any = None
+    r2 = dr.fma(x, x, y * y)
+    if structure.even:
+        # h and dh/d(r^2) of sum A_n r^(2n+4) by Horner, from the highest term down
+        last = structure.even - 1
+        polynomial: Any = g[f"A{last}"]
+        slope: Any = float(last + 2) * g[f"A{last}"]
+        for n in range(last - 1, -1, -1):
+            polynomial = dr.fma(polynomial, r2, g[f"A{n}"])
+            slope = dr.fma(slope, r2, float(n + 2) * g[f"A{n}"])
+        radial = 2.0 * slope * r2
+        height, sx, sy = polynomial * r2 * r2, radial * x, radial * y
     if structure.figure_order >= 0:
         coefficients = [g[f"F{m}"] for m in range(triangle_size(structure.figure_order))]
-        h, hx, hy = polynomial_figure(x - g["fx"], y - g["fy"], coefficients, structure.figure_order)
-        height, sx, sy = height + h, sx + hx, sy + hy
+        added = polynomial_figure(x - g["fx"], y - g["fy"], coefficients, structure.figure_order)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
     if structure.grid:
-        h, hx, hy = grid_figure(x, y, g, grid)
-        height, sx, sy = height + h, sx + hx, sy + hy
-    return height, sx, sy, domain
+        added = grid_figure(x, y, g, grid)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
+    w = z if height is None else z - height
+    if structure.plane:
+        return w, (0.0 * x if sx is None else -sx), (0.0 * x if sy is None else -sy), 1.0 + 0.0 * x
+    c = g["c"]
+    qw = (1.0 + g["k"]) * w
+    level = dr.fma(-0.5 * c, dr.fma(qw, w, r2), w)
+    nz = dr.fma(-c, qw, 1.0)
+    nx, ny = -c * x, -c * y
+    if sx is not None:
+        nx, ny = dr.fma(-nz, sx, nx), dr.fma(-nz, sy, ny)
+    return level, nx, ny, nz
 
 
 def _inside(p: Any, g: Mapping[str, Any], structure: Structure) -> Any:
@@ -285,12 +312,12 @@ def _redirect(
     """Direction after reflection or refraction (Snell), and whether it exists."""
     import drjit as dr
 
-    _, sx, sy, _ = _sag(p.x, p.y, g, structure, grid)
-    square = 1.0 + sx * sx + sy * sy  # of the normal (-sx, -sy, 1) before normalising
-    along = d.z - sx * d.x - sy * d.y
+    _, nx, ny, nz = _level(p.x, p.y, p.z, g, structure, grid)
+    square = dr.fma(nx, nx, dr.fma(ny, ny, nz * nz))
+    along = dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
     if structure.interaction is Interaction.REFLECT:
-        f = 2.0 * along / square
-        return backend.Vector3(d.x + f * sx, d.y + f * sy, d.z - f), True
+        f = -2.0 * along / square
+        return backend.Vector3(dr.fma(f, nx, d.x), dr.fma(f, ny, d.y), dr.fma(f, nz, d.z)), True
     norm = dr.rsqrt(square)
     cosine = along * norm
     ratio = g["n"] / g["n_after"]
@@ -298,4 +325,4 @@ def _redirect(
     ok = sine2 <= 1.0
     after = dr.copysign(dr.sqrt(dr.select(ok, 1.0 - sine2, 0.0)), cosine)
     f = (after - ratio * cosine) * norm
-    return backend.Vector3(ratio * d.x - f * sx, ratio * d.y - f * sy, ratio * d.z + f), ok
+    return backend.Vector3(dr.fma(f, nx, ratio * d.x), dr.fma(f, ny, ratio * d.y), dr.fma(f, nz, ratio * d.z)), ok

@@ -34,7 +34,10 @@ class Body:
 
     def __post_init__(self) -> None:
         """Freeze the pivots."""
-        pivots = {ORIGIN: (0.0, 0.0, 0.0), **{k: (float(v[0]), float(v[1]), float(v[2])) for k, v in self.pivots.items()}}
+        pivots = {
+            ORIGIN: (0.0, 0.0, 0.0),
+            **{k: (float(v[0]), float(v[1]), float(v[2])) for k, v in self.pivots.items()},
+        }
         object.__setattr__(self, "pivots", MappingProxyType(pivots))
 
     @property
@@ -115,7 +118,9 @@ class RigidTree:
         """All body paths, parents first."""
         return tuple(body.path for body in self.bodies)
 
-    def place(self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None) -> PlacedBodies:
+    def place(
+        self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
+    ) -> PlacedBodies:
         """World poses for each state.
 
         Args:

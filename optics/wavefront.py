@@ -68,7 +68,9 @@ class WavefrontFit:
     residual_rms: np.ndarray
 
 
-def fit_wavefront(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int = 28) -> WavefrontFit:
+def fit_wavefront(
+    x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int = 28
+) -> WavefrontFit:
     """Fit Z1..Z_last to path differences at pupil coordinates x, y (unit disk) with quadrature weights.
 
     Piston and tilt are removed from ``rms`` (they move the image, they do not blur it); defocus is kept.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from math import comb, factorial, sqrt
 from typing import Any
 
@@ -29,7 +29,7 @@ def noll_to_nm(index: int) -> tuple[int, int]:
     return n, (m if index % 2 == 0 else -m) if m else 0
 
 
-@lru_cache(maxsize=None)
+@cache
 def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
     """Terms (a, b, c) of Z_j(x, y) = sum c x^a y^b on the unit disk."""
     n, signed = noll_to_nm(index)
@@ -83,7 +83,8 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
 
     Args:
         last: highest Noll index.
-        x, y: unit-disk coordinates, shape (N,).
+        x: unit-disk coordinates, shape (N,).
+        y: likewise.
         values: shape (..., N), e.g. optical path differences in metres.
         weights: quadrature weights, shape (N,).
 
@@ -107,7 +108,9 @@ def triangle_index(a: int, b: int) -> int:
 
 
 def monomials(coefficients: dict[int, float], order: int, radius: float) -> np.ndarray:
-    """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape (triangle_size(order),)."""
+    """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape
+    (triangle_size(order),).
+    """
     out = np.zeros(triangle_size(order))
     for j, amplitude in coefficients.items():
         for a, b, c in cartesian_terms(j):

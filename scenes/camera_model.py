@@ -74,7 +74,9 @@ class CameraModel:
 
 
 def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
-    """Direction in which light of field (x, y) travels, prescription frame; y counts from the biased centre, radians."""
+    """Direction in which light of field (x, y) travels, prescription frame; y counts from the biased centre,
+    radians.
+    """
     vector = np.array([np.tan(x), np.tan(spec.field_bias + y), 1.0])
     return np.asarray(vector / np.linalg.norm(vector))
 
@@ -107,9 +109,7 @@ def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
     Raises:
         AimError: the prescription does not bring the centre's chief ray through the stop.
     """
-    surfaces = {
-        name: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for name, m in spec.mirrors.items()
-    }
+    surfaces = {name: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for name, m in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)
     bare = _bare(spec, surfaces, {})
@@ -137,7 +137,14 @@ def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     focal_length = float(chief.focal_length[0])
     return CameraModel(
-        spec, surfaces, apertures, camera_frame, focal_plane, chief, image_direction, image_centre - focal_length * image_direction
+        spec,
+        surfaces,
+        apertures,
+        camera_frame,
+        focal_plane,
+        chief,
+        image_direction,
+        image_centre - focal_length * image_direction,
     )
 
 
@@ -153,7 +160,8 @@ def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[
     bodies = [Body(name, Pose(np.eye(3), np.array([0.0, 0.0, m.z]))) for name, m in spec.mirrors.items()]
     bodies.append(Body(IMAGE, Pose(np.eye(3), np.array([0.0, 0.0, spec.image.z]))))
     elements = {
-        name: Element(name, name, surface, Interaction.REFLECT, apertures.get(name)) for name, surface in surfaces.items()
+        name: Element(name, name, surface, Interaction.REFLECT, apertures.get(name))
+        for name, surface in surfaces.items()
     }
     elements[IMAGE] = Element(IMAGE, IMAGE, plane(), Interaction.PASS)
     return Assembly(RigidTree(tuple(bodies)), elements, {"imaging": (*spec.mirrors, IMAGE)})
@@ -162,10 +170,14 @@ def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[
 def _apertures(
     spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, stop_radius: float
 ) -> dict[str, Aperture]:
-    """Clear apertures: the stop, and for the other mirrors the box around the beams of the whole field plus the margin."""
+    """Clear apertures: the stop, and for the other mirrors the box around the beams of the whole field plus the
+    margin.
+    """
     angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
     rim = stop_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    fields = [(x, y) for x in np.linspace(-spec.field.x, spec.field.x, 5) for y in np.linspace(-spec.field.y, spec.field.y, 3)]
+    fields = [
+        (x, y) for x in np.linspace(-spec.field.x, spec.field.x, 5) for y in np.linspace(-spec.field.y, spec.field.y, 3)
+    ]
     directions = np.array([field_direction(spec, x, y) for x, y in fields])
     launch = collimated(backend, to_stop, directions, rim)
     rays = make_rays(backend, launch.reshape(-1, 3), np.repeat(directions, _RIM_POINTS, axis=0))

@@ -1,4 +1,6 @@
-"""From an instrument's YAML to the optical assembly: cameras in the base, monitor channels, the central prism's faces."""
+"""From an instrument's YAML to the optical assembly: cameras in the base, monitor channels, the central prism's
+faces.
+"""
 
 from __future__ import annotations
 
@@ -188,9 +190,10 @@ def _return_faces(
 ) -> list[Pose]:
     """Poses, in the prescription frame, of the faces that send each pinhole's beam to the middle of its area CCD.
 
-    The face stands at the given distance along the line of sight, where the pinhole's chief ray passes, displaced by the
-    sub-aperture's offset in the pupil. Its normal halves the angle between the outgoing beam and the beam that would
-    come from the CCD's middle, both taken through the face's centre, so that pupil aberration does not shift the spot.
+    The face stands at the given distance along the line of sight, where the pinhole's chief ray passes, displaced by
+    the sub-aperture's offset in the pupil. Its normal halves the angle between the outgoing beam and the beam that
+    would come from the CCD's middle, both taken through the face's centre, so that pupil aberration does not shift
+    the spot.
     """
     frame = model.camera_frame
     distance = spec.monitor.return_face.distance
@@ -234,7 +237,9 @@ def _camera_elements(
     out = {}
     for mirror in model.mirrors:
         key = f"{name}/{mirror}"
-        out[key] = Element(key, f"{root}/{mirror}", model.surfaces[mirror], Interaction.REFLECT, model.apertures[mirror])
+        out[key] = Element(
+            key, f"{root}/{mirror}", model.surfaces[mirror], Interaction.REFLECT, model.apertures[mirror]
+        )
     key = f"{name}/focal_plane"
     out[key] = Element(key, f"{root}/focal_plane", plane(), Interaction.PASS)
     for channel in channels:

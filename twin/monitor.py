@@ -1,8 +1,9 @@
 """The monitor's light path: from every pinhole through the camera to the return face and back to the area CCD.
 
-The beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state, so
-that its edge is exact; at the CCD each ray is a plane wave, and the matrix Fourier transform gives the image on the CCD's own
-pixels (``optics.diffraction``). The face is taken as evenly lit, the pinhole as an incoherent disk imaged at unit scale.
+The beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state,
+so that its edge is exact; at the CCD each ray is a plane wave, and the matrix Fourier transform gives the image on the
+CCD's own pixels (``optics.diffraction``). The face is taken as evenly lit, the pinhole as an incoherent disk imaged
+at unit scale.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ from optics.trace import Rays, make_rays, require_some, trace
 from optics.tree import COMPLEX_STEP, PlacedBodies, State
 from optics.wavefront import eikonal
 from scenes.instrument_model import BASE, Channel, Instrument
+from twin.motions import ElementaryMotion, pivot_states
 
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
 
 AIM_TOLERANCE = 1e-9
-"""Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the radius."""
+"""Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
+radius."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +87,11 @@ class MonitorPath:
         basis = zernike.basis(MAP_TERMS, x, y)
         root = np.sqrt(self.nodes.weight)
         solve = np.linalg.pinv(basis * root[:, None]) * root
-        return basis @ solve, zernike.gradient_basis(MAP_TERMS, x, y, 0) @ solve, zernike.gradient_basis(MAP_TERMS, x, y, 1) @ solve
+        return (
+            basis @ solve,
+            zernike.gradient_basis(MAP_TERMS, x, y, 0) @ solve,
+            zernike.gradient_basis(MAP_TERMS, x, y, 1) @ solve,
+        )
 
     def _aim(self, placed: PlacedBodies, states: Sequence[State], start: Aimed | None) -> Aimed:
         """Aim rays from each pinhole at the nodes of its return face."""
@@ -99,7 +106,9 @@ class MonitorPath:
         guess = np.concatenate(direction)[:, None].real
         axes = transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape))
         fan = RayFan(origin, guess, axes)
-        outgoing = assemble(self.instrument.assembly, [f"{c.key}/outgoing" for c in self.channels], states, placed=placed)
+        outgoing = assemble(
+            self.instrument.assembly, [f"{c.key}/outgoing" for c in self.channels], states, placed=placed
+        )
         target = self.face_radius * np.stack([self.nodes.x, self.nodes.y], axis=-1)
         if start is None:
             # first the middle of the face, then the nodes around it
@@ -178,28 +187,32 @@ class MonitorPath:
             some = states[start : start + chunk]
             irradiance = image(self.fields(some), x, y)
             photons = light * response.apply(irradiance)
-            yield slice(start, start + len(some)), np.swapaxes(photons.reshape(len(self.channels), len(some), *photons.shape[1:]), 0, 1)
+            yield (
+                slice(start, start + len(some)),
+                np.swapaxes(photons.reshape(len(self.channels), len(some), *photons.shape[1:]), 0, 1),
+            )
 
     def axis(self, axis: int, margin: int = 0) -> np.ndarray:
         """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
         n = self.shape[axis]
         return (np.arange(-margin, n + margin) - 0.5 * (n - 1)) * self.pitch
 
-    def spot_jacobian(self, motions: Sequence[tuple[str, str, int]]) -> np.ndarray:
+    def spot_jacobian(self, motions: Sequence[ElementaryMotion]) -> np.ndarray:
         """Derivative of every spot's position by elementary motions, by forward-mode AD through the whole path.
 
         The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.
 
         Args:
-            motions: M of (body, kind, axis), kind ``rotate``, ``shift`` or ``scale``.
+            motions: M elementary motions.
 
         Returns:
             (C, 2, M): row and column, pixels per radian, metre or unit.
         """
         import drjit as dr
 
-        states: list[State] = [{} for _ in motions]
-        placed = self.instrument.assembly.place(states, motions)
+        states = pivot_states(motions)
+        steps = [motion.step for motion in motions]
+        placed = self.instrument.assembly.place(states, steps)
         step = np.concatenate([placed.translation[:, placed.index[c.reticle_body]].imag for c in self.channels])
         step = step[:, None] / COMPLEX_STEP
         nominal = self.nominal
@@ -211,13 +224,15 @@ class MonitorPath:
         def push(sequence: str, direction_step: np.ndarray) -> np.ndarray:
             """Derivative of the hit on the last element, (C*M, N, 2)."""
             systems = assemble(
-                self.instrument.assembly, [f"{ch.key}/{sequence}" for ch in self.channels], states, motions, placed
+                self.instrument.assembly, [f"{ch.key}/{sequence}" for ch in self.channels], states, steps, placed
             )
             rays = make_rays(self.backend, position, direction)
             dr.enable_grad(rays.position, rays.direction)
             dr.set_grad(rays.position, self.backend.vector(np.broadcast_to(step, direction.shape).reshape(-1, 3)))
             dr.set_grad(rays.direction, self.backend.vector(direction_step.reshape(-1, 3)))
-            out = trace(self.backend, systems, Rays(rays.position, rays.direction, rays.path, rays.valid), evaluate=False)
+            out = trace(
+                self.backend, systems, Rays(rays.position, rays.direction, rays.path, rays.valid), evaluate=False
+            )
             dr.forward_to(out.local.position)
             gradient = dr.grad(out.local.position)
             return np.stack([gradient.x.numpy(), gradient.y.numpy()], axis=-1).reshape(c * m, n, 2)

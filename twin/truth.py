@@ -11,8 +11,9 @@ from optics.assembly import points_to_world
 from optics.backend import Backend
 from optics.line_of_sight import LineChange, chief_directions, line_change
 from optics.system import assemble
-from optics.tree import Motion, State
+from optics.tree import State
 from scenes.instrument_model import BASE, Instrument
+from twin.motions import ElementaryMotion
 
 LINE_POINTS = 41
 """Points of the line CCD over which roll and principal distance are taken."""
@@ -79,31 +80,24 @@ def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State
     return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0])
 
 
-def truth_jacobian(
-    instrument: Instrument, backend: Backend, camera: str, motions: Sequence[tuple[str, Motion]]
-) -> np.ndarray:
-    """Derivative of one camera's true parameters by unit motions, by central differences of the exact trace.
+DIFFERENCE = 1e-6
+"""Half step of the central differences (rad, m or relative): truncation and rounding are both below 1e-8 of the
+result."""
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        camera: whose parameters.
-        motions: (body, small motion): the difference is taken over +- that motion and divided by its size, so give
-            motions of about 1e-6 (rad, m or relative), for which truncation and rounding are both below 1e-8.
+
+def truth_jacobian(
+    instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion]
+) -> dict[str, np.ndarray]:
+    """Derivative of the true parameters of every camera by elementary motions, by central differences of the exact
+    trace.
 
     Returns:
-        (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per the given motion.
+        Camera -> (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
     """
-    states: list[State] = [{body: motion} for body, motion in motions]
-    states += [{body: _reversed(motion)} for body, motion in motions]
-    change = trace_truth(instrument, backend, states).cameras[camera]
-    rows = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f])
-    m = len(motions)
-    return np.asarray(0.5 * (rows[:, :m] - rows[:, m:]))
-
-
-def _reversed(motion: Motion) -> Motion:
-    rx, ry, rz = motion.rotate
-    sx, sy, sz = motion.shift
-    figure = {j: -a for j, a in motion.figure.items()}
-    return Motion((-rx, -ry, -rz), (-sx, -sy, -sz), motion.pivot, -motion.scale, figure)
+    states = [m.state(DIFFERENCE) for m in motions] + [m.state(-DIFFERENCE) for m in motions]
+    truth = trace_truth(instrument, backend, states)
+    out = {}
+    for name, change in truth.cameras.items():
+        rows = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f])
+        out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * DIFFERENCE)
+    return out

@@ -1,0 +1,224 @@
+"""From spot shifts to camera parameters: the formulas of paper 001 (Wang et al., Acta Photonica Sinica 47(10) 1012001,
+2018).
+
+Axes: the column direction of an area CCD is the paper's x (flight direction), the row direction its y (along the line
+CCD). Sides: index 0 = left CCD (at the +Y end of the line, index 1 of the paper), 1 = right CCD (index 2 of the
+paper). A shift is after - before; the paper's X_L = x01 - x11 and Y_L = y01 - y11 are before - after.
+Vector of pixel coordinates: [left row, left column, right row, right column]. Vector of parameters: [d_alpha, d_beta,
+d_gamma (rad), d_f (m)].
+
+Three sets of formulas, which differ only where the paper does:
+
+- `paper_single`: eq. (2), (3), (5), (7) as printed, with the arctangent.
+- `paper_joint`: Table 1, "expression of uncertain changes", as printed. The table does not say how Y_L is signed, and
+  uses it in both d_beta and d_f; each row here takes the sign that agrees with the single-change formula beside it:
+  Y_L = y01 - y11 for d_beta, Y_L = y11 - y01 for d_f. Its d_f is then +1/2 of eq. (7), and its d_gamma equals eq. (5).
+- `derived`: what a plane-mirror return gives to first order. A shift s of the focal plane moves the spot by 2 s
+  against it, so d_alpha and d_beta are shift/(2f) without the cos^2 (which is a field-angle factor of the line of
+  sight, not of the spot); d_gamma = (X_L - X_R) delta / (2 L), half of the printed (5); d_f by (7). A field-biased
+  camera adds three calibrated numbers: its plate scale across the line f_x (d_alpha divides by it, d_gamma carries
+  f/f_x) and the gradients of principal distance and of line tilt over the field, which enter d_f by d_alpha and
+  d_gamma by d_beta. With f_x = f and no gradients the formulas are those of a distortion-free camera.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "ESTIMATORS",
+    "CameraParameters",
+    "MonitorGeometry",
+    "coefficients",
+    "derived",
+    "paper_joint",
+    "paper_single",
+    "shift_covariance",
+]
+
+Array = NDArray[np.float64]
+ARCSEC = math.pi / 180 / 3600
+ESTIMATORS = ("paper_single", "paper_joint", "derived")
+# key in recovered.json, and how many of its units make one SI unit
+_KEYS = (
+    ("d_alpha_arcsec", 1 / ARCSEC),
+    ("d_beta_arcsec", 1 / ARCSEC),
+    ("d_gamma_arcsec", 1 / ARCSEC),
+    ("d_f_um", 1e6),
+)
+
+
+@dataclass(frozen=True)
+class MonitorGeometry:
+    """What the formulas need to know of one camera's monitor. Raises ValueError, naming the field.
+
+    focal_length_m: f, m. separation_m: L, distance of the two area CCDs, m. pixel_m: delta, m.
+    field_alpha_rad, field_beta_rad: alpha and beta in the cos^2 of (2), (3) and Table 1, rad.
+    focal_length_x_m: plate scale across the line, m, where calibration finds it different from f (anamorphism);
+        default focal_length_m. Only `derived` uses it.
+    d_f_per_alpha_m: change of the principal distance per rad of d_alpha, m, from the calibrated distortion: turning
+        the line of sight brings the line to a field where the plate scale differs. Only `derived` uses it.
+    d_gamma_per_beta: likewise the turn of the imaged line per rad of d_beta. Only `derived` uses it.
+    """
+
+    focal_length_m: float
+    separation_m: float
+    pixel_m: float
+    field_alpha_rad: float = 0.0
+    field_beta_rad: float = 0.0
+    focal_length_x_m: float | None = None
+    d_f_per_alpha_m: float = 0.0
+    d_gamma_per_beta: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is None:
+                continue
+            angle = field.name.endswith("_rad")
+            if "_per_" in field.name:
+                if not math.isfinite(value):
+                    raise ValueError(f"monitor geometry: {field.name} must be finite, found {value!r}")
+                continue
+            if not math.isfinite(value) or (abs(value) >= math.pi / 2 if angle else value <= 0):
+                allowed = "within +-pi/2" if angle else "finite and > 0"
+                raise ValueError(f"monitor geometry: {field.name} must be {allowed}, found {value!r}")
+
+
+@dataclass(frozen=True, eq=False)
+class CameraParameters:
+    """Changes of one camera, scalars or arrays of one shape (...).
+
+    d_alpha_rad, d_beta_rad, d_gamma_rad: rotations of the camera about Y, X, Z. d_f_m: change of the principal
+        distance.
+    covariance: (..., 4, 4) in order d_alpha, d_beta, d_gamma (rad), d_f (m).
+    """
+
+    d_alpha_rad: Array
+    d_beta_rad: Array
+    d_gamma_rad: Array
+    d_f_m: Array
+    covariance: Array
+
+    @classmethod
+    def from_vector(cls, values: ArrayLike, covariance: ArrayLike) -> CameraParameters:
+        """From (..., 4) values [d_alpha, d_beta, d_gamma, d_f] and their (..., 4, 4) covariance."""
+        vector, spread = np.asarray(values, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+        if vector.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
+            raise ValueError(f"camera parameters: need (..., 4) and (..., 4, 4), found {vector.shape}, {spread.shape}")
+        spread = np.broadcast_to(spread, (*vector.shape, 4))
+        return cls(vector[..., 0], vector[..., 1], vector[..., 2], vector[..., 3], spread)
+
+    @property
+    def vector(self) -> Array:
+        """(..., 4): [d_alpha, d_beta, d_gamma (rad), d_f (m)]."""
+        return np.stack([self.d_alpha_rad, self.d_beta_rad, self.d_gamma_rad, self.d_f_m], axis=-1)
+
+    @property
+    def sigma(self) -> Array:
+        """(..., 4): standard deviations, in the order and units of `vector`."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def to_dict(self) -> dict[str, Any]:
+        """d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec, d_f_um and <key>_sigma: floats, or nested lists for arrays."""
+        values, sigma = self.vector, self.sigma
+        out: dict[str, Any] = {}
+        for k, (key, scale) in enumerate(_KEYS):
+            out[key] = (values[..., k] * scale).tolist()
+            out[f"{key}_sigma"] = (sigma[..., k] * scale).tolist()
+        return out
+
+
+def shift_covariance(left: ArrayLike, right: ArrayLike) -> Array:
+    """(..., 4, 4) covariance of [left row, left column, right row, right column] from two independent (..., 2, 2),
+    px^2.
+    """
+    one, two = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
+    if one.shape[-2:] != (2, 2) or two.shape != one.shape:
+        raise ValueError(f"shift covariance: need two (..., 2, 2) of one shape, found {one.shape} and {two.shape}")
+    out = np.zeros((*one.shape[:-2], 4, 4))
+    out[..., :2, :2], out[..., 2:, 2:] = one, two
+    return out
+
+
+def coefficients(name: str, geometry: MonitorGeometry) -> Array:
+    """(4, 4) matrix, parameter [d_alpha, d_beta, d_gamma, d_f] (rad, m) per pixel of shift [left row, left column,
+    right row, right column], after - before, of an estimator in ESTIMATORS. For `paper_single` it is the argument of
+    the arctangents.
+
+    Multiplied with the Jacobian (4, M) of spot shifts per motion it gives a crosstalk table.
+    """
+    if name not in ESTIMATORS:
+        raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
+    delta, f, length = geometry.pixel_m, geometry.focal_length_m, geometry.separation_m
+    paper = name != "derived"
+    f_x = f if paper or geometry.focal_length_x_m is None else geometry.focal_length_x_m
+    beta = delta * (math.cos(geometry.field_beta_rad) ** 2 if paper else 1.0) / (2 * f) / 2
+    alpha = delta * (math.cos(geometry.field_alpha_rad) ** 2 if paper else 1.0) / (2 * f_x) / 2
+    gamma = delta / length if paper else delta / (2 * length) * f / f_x
+    scale = delta * f / (length * (4 if name == "paper_joint" else 2))
+    matrix = np.array(
+        [
+            [0.0, -alpha, 0.0, -alpha],
+            [-beta, 0.0, -beta, 0.0],
+            [0.0, -gamma, 0.0, gamma],
+            [scale, 0.0, -scale, 0.0],
+        ]
+    )
+    if not paper:
+        matrix[2] += geometry.d_gamma_per_beta * matrix[1]
+        matrix[3] += geometry.d_f_per_alpha_m * matrix[0]
+    return matrix
+
+
+def paper_single(
+    before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
+) -> CameraParameters:
+    """Eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
+
+    before, after: (..., 2 sides, 2) spot positions (row, column), px. covariance: (..., 4, 4) of after - before, px^2,
+        in order
+    [left row, left column, right row, right column]; zeros where there is no noise.
+    """
+    argument, spread = _linear("paper_single", before, after, covariance, geometry)
+    values = argument.copy()
+    values[..., :3] = np.arctan(argument[..., :3])
+    slope = np.ones_like(argument)
+    slope[..., :3] = 1 / (1 + argument[..., :3] ** 2)
+    return CameraParameters.from_vector(values, slope[..., :, None] * spread * slope[..., None, :])
+
+
+def paper_joint(
+    before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
+) -> CameraParameters:
+    """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module."""
+    return CameraParameters.from_vector(*_linear("paper_joint", before, after, covariance, geometry))
+
+
+def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry) -> CameraParameters:
+    """The corrected factors (see the module's text); arguments as `paper_single`."""
+    return CameraParameters.from_vector(*_linear("derived", before, after, covariance, geometry))
+
+
+def _linear(
+    name: str, before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
+) -> tuple[Array, Array]:
+    """Linear part of an estimator, (..., 4), and its covariance (..., 4, 4)."""
+    start, end = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
+    spread = np.asarray(covariance, dtype=np.float64)
+    if start.shape[-2:] != (2, 2) or end.shape[-2:] != (2, 2) or spread.shape[-2:] != (4, 4):
+        raise ValueError(
+            "monitoring: before and after must be (..., 2 sides, 2 (row, column)) and covariance (..., 4, 4),"
+            f" found {start.shape}, {end.shape}, {spread.shape}"
+        )
+    shift = end - start
+    shift = shift.reshape(*shift.shape[:-2], 4)
+    if not (np.all(np.isfinite(shift)) and np.all(np.isfinite(spread))):
+        raise ValueError("monitoring: positions and covariance must be finite")
+    matrix = coefficients(name, geometry)
+    return shift @ matrix.T, matrix @ spread @ matrix.T

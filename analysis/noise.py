@@ -1,0 +1,104 @@
+"""Noise of a linear detector (EMVA Standard 1288, release 3.1, eq. 9-12 and 33-35), as a function of the mean grey
+value.
+
+Two kinds are kept apart because they behave differently in a before/after comparison:
+
+- temporal noise (photon shot noise, read noise, quantisation) is new in every frame, so the variance of a mean of N
+  frames is 1/N of it;
+- fixed-pattern noise (PRNU, DSNU) is the same in every frame, does not average down, and is common to all images that
+  the same pixels take.
+
+Grey values are in DN as recorded, with the black level and the dark signal still in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["NoiseModel"]
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """What a data sheet says of a detector's noise. Raises ValueError, naming the field, for impossible values.
+
+    gain_dn_per_e: system gain K, grey values per electron, > 0.
+    dark_noise_e: temporal read noise, electrons rms.
+    dark_signal_e: mean dark current times exposure, electrons; it carries shot noise and is not scaled by PRNU.
+    offset_dn: black level, grey values.
+    prnu: photo-response non-uniformity, rms fraction of the light signal.
+    dsnu_e: dark-signal non-uniformity, electrons rms.
+    saturation_dn: grey value from which the response is not linear.
+    """
+
+    gain_dn_per_e: float
+    dark_noise_e: float
+    dark_signal_e: float
+    offset_dn: float
+    prnu: float
+    dsnu_e: float
+    saturation_dn: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not math.isfinite(value) or value < 0:
+                raise ValueError(f"noise model: {field.name} must be finite and >= 0, found {value!r}")
+        if self.gain_dn_per_e == 0:
+            raise ValueError("noise model: gain_dn_per_e must be > 0")
+        if self.saturation_dn <= self.dark_level_dn:
+            raise ValueError(
+                f"noise model: saturation_dn {self.saturation_dn} must lie above the dark level {self.dark_level_dn} DN"
+            )
+
+    @property
+    def dark_level_dn(self) -> float:
+        """Mean grey value without light, DN: black level and dark signal."""
+        return self.offset_dn + self.gain_dn_per_e * self.dark_signal_e
+
+    @property
+    def dark_variance_dn2(self) -> float:
+        """The part of the temporal variance of one frame that does not depend on the signal: read noise and 1/12 DN^2.
+
+        Quantisation acts as white noise of 1/12 DN^2 only while other noise of sigma DN spreads over the steps. The
+        error goes as exp(-2 pi^2 sigma^2): some 2% of the variance at 0.5 DN, nothing at 1 DN, and below 0.24 DN (the
+        limit of EMVA 1288) quantisation is systematic and does not average down over frames.
+        """
+        return (self.gain_dn_per_e * self.dark_noise_e) ** 2 + 1.0 / 12.0
+
+    @property
+    def dsnu_variance_dn2(self) -> float:
+        """Variance of the fixed additive pattern, DN^2."""
+        return (self.gain_dn_per_e * self.dsnu_e) ** 2
+
+    def light_signal_dn(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
+        """The part of a mean grey value that light made, DN, >= 0: what PRNU scales."""
+        return np.maximum(np.subtract(mean_signal_dn, self.dark_level_dn), 0.0)
+
+    def temporal_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float, frames: int) -> Any:
+        """Variance of a mean of `frames` frames from new noise in each, DN^2; shape of mean_signal_dn.
+
+        mean_signal_dn: expected grey values as recorded, black level included. Shot noise of the light and of the dark
+            signal
+        is K (y - offset) (EMVA 1288 eq. 12: the photon transfer line).
+        """
+        if int(frames) != frames or frames < 1:
+            raise ValueError(f"noise model: frames must be an integer >= 1, found {frames!r}")
+        variance = np.subtract(mean_signal_dn, self.offset_dn)
+        variance = np.maximum(variance, 0.0)
+        variance = variance * self.gain_dn_per_e
+        variance = variance + self.dark_variance_dn2
+        return variance / frames
+
+    def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
+        """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal, DN^2.
+
+        Does not fall with the number of frames, and is the same draw in every image of the same pixels.
+        """
+        signal = self.prnu * self.light_signal_dn(mean_signal_dn)
+        return signal * signal + self.dsnu_variance_dn2

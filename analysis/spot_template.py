@@ -1,0 +1,240 @@
+"""The calibrated shape of a spot, evaluated at any sub-pixel position with its analytic gradient.
+
+The shape is given as an image (noise-free, or of high signal-to-noise) on a grid of the detector's pixel pitch, or of
+that pitch divided by an integer; each sample is the flux in one *whole pixel* centred there, so pixel integration is
+already inside and interpolation only has to shift. A diffraction-limited spot is band-limited, and the interpolation
+is a quintic B-spline (Unser, Aldroubi, Eden, IEEE Trans. Signal Process. 41, 821 (1993)): fifth order in (frequency *
+sample).
+
+For speed the spline coefficients are factored once by a singular value decomposition, C = sum_k u_k v_k^T. The spline
+is separable, so a shifted spot is sum_k (shifted u_k) (shifted v_k)^T, and a round spot needs only some ten to thirty
+terms: the two dimensional interpolation becomes a small matrix product.
+
+Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.interpolate import BSpline
+
+__all__ = ["SpotTemplate", "TemplateRangeError"]
+
+Array = NDArray[np.float64]
+_DEGREE = 5
+_TAPS = _DEGREE + 1
+
+
+class TemplateRangeError(ValueError):
+    """A spot position for which the detector would look beyond the template's grid. `indices` lists the spots."""
+
+    def __init__(self, message: str, indices: list[int]) -> None:
+        super().__init__(message)
+        self.indices = indices
+
+
+def _tap_polynomials() -> tuple[Array, Array]:
+    """Weights of the six taps as polynomials of the fraction t in [0, 1): (power, tap) for the value and for d/dt."""
+    nodes = np.linspace(0.0, 1.0, _TAPS)
+    basis = BSpline.basis_element(np.arange(_TAPS + 1) - _TAPS / 2.0)
+    taps = np.arange(_TAPS) - (_TAPS // 2 - 1)
+    values = np.nan_to_num(basis(np.clip(nodes[:, None] - taps[None, :], -3.0, 3.0)))
+    value = np.linalg.solve(np.vander(nodes, _TAPS, increasing=True), values)
+    slope = np.zeros_like(value)
+    slope[:-1] = value[1:] * np.arange(1, _TAPS)[:, None]
+    return value, slope
+
+
+_VALUE, _SLOPE = _tap_polynomials()
+
+
+@dataclass(frozen=True, eq=False)
+class SpotTemplate:
+    """One or several (T) calibrated spot shapes of unit flux. Make it with `from_image` or `stack`.
+
+    row_factors: (T, M, R), column_factors: (T, N, R): factors of the quintic spline coefficients.
+    centre: (T, 2) the spot's centre (row, column) in template samples.
+    shape: (H, W) of the detector images that it is compared with.
+    oversampling: template samples per detector pixel, integer >= 1.
+    truncation: bound on what the factorisation drops, relative to the peak.
+    """
+
+    row_factors: Array
+    column_factors: Array
+    centre: Array
+    shape: tuple[int, int]
+    oversampling: int
+    truncation: float
+
+    @classmethod
+    def from_image(
+        cls,
+        image: ArrayLike,
+        row: float,
+        column: float,
+        shape: tuple[int, int],
+        oversampling: int = 1,
+        background: float = 0.0,
+        tolerance: float = 1e-8,
+    ) -> SpotTemplate:
+        """Calibrate from one image.
+
+        image: (M, N) samples at the detector's pitch / oversampling, larger than the detector by a margin on every
+            side that covers the shifts to be measured (16 to 32 px).
+        row, column: the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
+        shape: (H, W) of the detector.
+        background: constant level to be taken off the image.
+        tolerance: what the factorisation may drop, relative to the peak. For a measured image choose its relative
+            noise.
+        Raises ValueError for an image that is not finite, not larger than the detector, or holds no flux.
+        """
+        data = np.asarray(image, dtype=np.float64)
+        if data.ndim != 2 or not np.all(np.isfinite(data)):
+            raise ValueError(f"spot template: image must be a finite (M, N) array, found shape {data.shape}")
+        if int(oversampling) != oversampling or oversampling < 1:
+            raise ValueError(f"spot template: oversampling must be an integer >= 1, found {oversampling!r}")
+        height, width = (int(n) for n in shape)
+        need = ((height - 1) * oversampling + _TAPS, (width - 1) * oversampling + _TAPS)
+        if height < 1 or width < 1 or data.shape[0] < need[0] or data.shape[1] < need[1]:
+            raise ValueError(
+                f"spot template: image {data.shape} must be at least {need} samples for a detector of"
+                f" {tuple(shape)} pixels at oversampling {oversampling};"
+                " give it a margin of 16 to 32 pixels on every side"
+            )
+        if not (0 <= row <= data.shape[0] - 1 and 0 <= column <= data.shape[1] - 1):
+            raise ValueError(f"spot template: centre ({row}, {column}) lies outside the image {data.shape}")
+        if not 0 <= tolerance < 0.1:
+            raise ValueError(f"spot template: tolerance must be in [0, 0.1), found {tolerance!r}")
+        data = data - background
+        flux = float(data.sum()) / oversampling**2
+        if not flux > 0:
+            raise ValueError(
+                f"spot template: image holds no flux after background {background} is taken off (sum {flux:g})"
+            )
+        coefficients = ndimage.spline_filter(data / flux, order=_DEGREE, mode="mirror", output=np.float64)
+        u, s, vt = np.linalg.svd(coefficients, full_matrices=False)
+        # sum of the dropped terms, each at most |s_k| max|u_k| max|v_k|: a bound on the error at any pixel, as the
+        # spline weights are positive and sum to one.
+        bound = s * np.abs(u).max(axis=0) * np.abs(vt).max(axis=1)
+        tail = np.append(np.cumsum(bound[::-1])[::-1], 0.0)
+        peak = float(np.abs(data).max()) / flux
+        rank = max(1, int(np.argmax(tail <= tolerance * peak)))
+        root = np.sqrt(s[:rank])
+        return cls(
+            row_factors=np.ascontiguousarray(u[:, :rank] * root)[None],
+            column_factors=np.ascontiguousarray(vt[:rank].T * root)[None],
+            centre=np.array([[row, column]], dtype=np.float64),
+            shape=(height, width),
+            oversampling=int(oversampling),
+            truncation=float(tail[rank] / peak),
+        )
+
+    @classmethod
+    def stack(cls, templates: Sequence[SpotTemplate]) -> SpotTemplate:
+        """Join templates of one detector shape, grid and oversampling into one that holds them all, in order."""
+        if not templates:
+            raise ValueError("spot template: nothing to stack")
+        first = templates[0]
+        for number, other in enumerate(templates):
+            same = other.shape == first.shape and other.oversampling == first.oversampling
+            if not same or other.grid != first.grid:
+                raise ValueError(
+                    f"spot template: template {number} has another shape, grid or oversampling than the first"
+                )
+        rank = max(t.row_factors.shape[2] for t in templates)
+
+        def pad(factors: Array) -> Array:
+            return np.pad(factors, ((0, 0), (0, 0), (0, rank - factors.shape[2])))
+
+        return cls(
+            row_factors=np.concatenate([pad(t.row_factors) for t in templates]),
+            column_factors=np.concatenate([pad(t.column_factors) for t in templates]),
+            centre=np.concatenate([t.centre for t in templates]),
+            shape=first.shape,
+            oversampling=first.oversampling,
+            truncation=max(t.truncation for t in templates),
+        )
+
+    @property
+    def count(self) -> int:
+        """Number T of shapes held."""
+        return int(self.centre.shape[0])
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(M, N) samples of the calibrated image."""
+        return int(self.row_factors.shape[1]), int(self.column_factors.shape[1])
+
+    def supported(self, index: int = 0) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Supported positions of shape `index`: ((row low, row high), (column low, column high)) in detector pixels."""
+        margin = _TAPS // 2 - 1
+        limits = []
+        for size, pixels, centre in zip(self.grid, self.shape, self.centre[index], strict=True):
+            high = (centre - margin) / self.oversampling
+            low = (centre + margin + 1 - (size - 1)) / self.oversampling + pixels - 1
+            limits.append((float(low), float(high)))
+        return limits[0], limits[1]
+
+    def evaluate(
+        self, row: ArrayLike, column: ArrayLike, index: NDArray[np.intp] | None = None
+    ) -> tuple[Array, Array, Array]:
+        """The spot at (row, column), with its derivatives.
+
+        row, column: (B,) positions of the spot's centre in detector pixels.
+        index: (B,) which of the T shapes; default: spot b has shape b modulo T.
+        Returns value, d value / d row, d value / d column, each (B, H, W); value is the fraction of the flux per
+        pixel. Raises TemplateRangeError, naming the spots, for positions outside `supported`.
+        """
+        rows = np.atleast_1d(np.asarray(row, dtype=np.float64))
+        columns = np.atleast_1d(np.asarray(column, dtype=np.float64))
+        which = np.arange(rows.size) % self.count if index is None else np.asarray(index)
+        if not rows.shape == columns.shape == which.shape or rows.ndim != 1:
+            raise ValueError(
+                f"spot template: row {rows.shape}, column {columns.shape}, index {which.shape} must all be (B,)"
+            )
+        self._check_range(rows, columns, which)
+        a, da = self._shift(self.row_factors, self.centre[which, 0], rows, which, self.shape[0])
+        b, db = self._shift(self.column_factors, self.centre[which, 1], columns, which, self.shape[1])
+        bt = b.transpose(0, 2, 1)
+        return a @ bt, da @ bt, a @ db.transpose(0, 2, 1)
+
+    def _shift(
+        self, factors: Array, centre: Array, position: Array, which: NDArray[np.intp], pixels: int
+    ) -> tuple[Array, Array]:
+        """Spline along one axis: (B, pixels, R) values at the detector's pixels, and derivatives for the position."""
+        start = centre - self.oversampling * position
+        base = np.floor(start).astype(np.intp)
+        powers = (start - base)[:, None] ** np.arange(_TAPS)
+        weight, slope = powers @ _VALUE, powers @ _SLOPE
+        # Spot-independent window of samples, then the six taps as strided views of it.
+        step = self.oversampling
+        span = np.arange(step * (pixels - 1) + _TAPS)
+        window = factors[which[:, None], (base - (_TAPS // 2 - 1))[:, None] + span]
+        value = np.zeros((position.size, pixels, factors.shape[2]))
+        gradient = np.zeros_like(value)
+        for tap in range(_TAPS):
+            sample = window[:, tap : tap + step * (pixels - 1) + 1 : step]
+            value += weight[:, tap, None, None] * sample
+            gradient -= (step * slope[:, tap, None, None]) * sample
+        return value, gradient
+
+    def _check_range(self, rows: Array, columns: Array, which: NDArray[np.intp]) -> None:
+        limits = np.array([self.supported(t) for t in range(self.count)])[which]
+        place = np.stack([rows, columns], axis=1)
+        # written so that NaN is outside
+        inside = np.all((place >= limits[:, :, 0]) & (place <= limits[:, :, 1]), axis=1)
+        if np.all(inside):
+            return
+        bad = np.flatnonzero(~inside)
+        first = int(bad[0])
+        raise TemplateRangeError(
+            f"spot template: spot {first} at ({place[first, 0]:.3f}, {place[first, 1]:.3f}) px is outside the supported"
+            f" rows {limits[first, 0, 0]:.2f} to {limits[first, 0, 1]:.2f} and columns {limits[first, 1, 0]:.2f} to"
+            f" {limits[first, 1, 1]:.2f} ({bad.size} such spots); calibrate with a larger margin",
+            [int(n) for n in bad],
+        )

@@ -1,0 +1,100 @@
+"""The optical prescription of a camera, as a file in scenes/cameras gives it."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from scenes.errors import Problem, names_text, nearest, shown
+from scenes.frozen_dict import FrozenDict
+from scenes.quantity import AsphereTerms, Length, PositiveLength, Quantity, Wavelength
+from scenes.spec import Name, Named, Number, Spec, Text, Whole
+from scenes.units import ANGLE, LENGTH
+
+FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]
+
+
+class MirrorSpec(Spec):
+    """A mirror of revolution about the parent axis.
+
+    Attributes:
+        z: vertex on the parent axis, metres; light enters toward +z.
+        radius: vertex radius of curvature, metres, positive if the centre of curvature lies toward +z.
+        conic: conic constant k.
+        aspheric: terms A4, A6, A8 of the sag beyond the conic's, 1/m^3, 1/m^5, 1/m^7; empty for a pure conic.
+    """
+
+    z: Length
+    radius: Length
+    conic: Number = 0.0
+    aspheric: AsphereTerms = Field(default_factory=FrozenDict)
+
+    @model_validator(mode="after")
+    def _is_curved(self) -> "MirrorSpec":
+        if self.radius == 0.0:
+            raise Problem("a radius of curvature cannot be zero", "0 m", "a length other than zero", within=("radius",))
+        return self
+
+
+class FieldSpec(Spec):
+    """Half angles of the field of view, radians: x along the line CCD, y across it, about the field bias."""
+
+    x: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+    y: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+
+
+class ImageSpec(Spec):
+    """The focal plane: z is where it crosses the parent axis, metres."""
+
+    z: Length
+
+
+class LineSpec(Spec):
+    """The line CCD, centred on the field bias: number of pixels and their pitch, metres."""
+
+    pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
+    pitch: PositiveLength
+
+
+class CameraSpec(Spec):
+    """An off-axis mirror camera.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        focal_length: nominal, metres; the trace tells the exact one.
+        entrance_pupil: diameter of the entrance pupil, metres.
+        field_bias: angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
+        field: half angles about the field bias.
+        wavelength: design wavelength, metres.
+        stop: name of the mirror that is the aperture stop.
+        mirrors: by name, in the order in which the light meets them.
+        image: focal plane.
+        line: line CCD.
+        edge_margin: by how much a mirror's clear aperture is wider than the beams that use it, metres.
+    """
+
+    name: Name
+    description: Text = ""
+    focal_length: PositiveLength
+    entrance_pupil: PositiveLength
+    field_bias: FieldAngle
+    field: FieldSpec
+    wavelength: Wavelength
+    stop: Name
+    mirrors: Annotated[Named[MirrorSpec], Field(min_length=1)]
+    image: ImageSpec
+    line: LineSpec
+    edge_margin: Annotated[float, Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
+
+    @model_validator(mode="after")
+    def _stop_is_a_mirror(self) -> "CameraSpec":
+        if self.stop not in self.mirrors:
+            names = names_text(self.mirrors)
+            raise Problem(
+                "the stop is not one of the mirrors",
+                shown(self.stop),
+                names,
+                nearest(self.stop, self.mirrors),
+                ("stop",),
+            )
+        return self

@@ -1,0 +1,37 @@
+"""An area detector by the numbers of its EMVA 1288 data sheet, as a file in scenes/detectors gives it."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from scenes.spec import Name, Number, Spec, Text, Whole
+
+
+class DetectorSpec(Spec):
+    """Plain numbers in the units of EMVA 1288; e stands for electrons and DN for digital numbers (grey values).
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        quantum_efficiency: electrons per photon at the wavelength it is used at.
+        system_gain_dn_per_e: DN per electron (K of EMVA 1288).
+        dark_noise_e: temporal noise in the dark without dark current, rms.
+        dark_current_e_per_s: mean dark current of a pixel.
+        full_well_e: saturation capacity.
+        prnu: photo response non-uniformity, relative rms.
+        dsnu_e: dark signal non-uniformity, rms.
+        bit_depth: of the analogue-to-digital converter; frames are stored as 16 bits.
+        offset_dn: grey value of no signal.
+    """
+
+    name: Name
+    description: Text = ""
+    quantum_efficiency: Annotated[Number, Field(gt=0.0, le=1.0)]
+    system_gain_dn_per_e: Annotated[Number, Field(gt=0.0, le=1e4)]
+    dark_noise_e: Annotated[Number, Field(ge=0.0, le=1e5)]
+    dark_current_e_per_s: Annotated[Number, Field(ge=0.0, le=1e9)]
+    full_well_e: Annotated[Number, Field(gt=0.0, le=1e9)]
+    prnu: Annotated[Number, Field(ge=0.0, le=0.5)]
+    dsnu_e: Annotated[Number, Field(ge=0.0, le=1e5)]
+    bit_depth: Annotated[Whole, Field(ge=1, le=16)]
+    offset_dn: Annotated[Number, Field(ge=0.0, le=65535.0)]

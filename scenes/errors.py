@@ -1,0 +1,158 @@
+"""What is wrong with an input, said so that the user can mend it: file, line, key, what was found, what is allowed,
+what was meant.
+"""
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+KeyPath = tuple[str | int, ...]
+"""Where a value stands in a YAML file: keys and list indices from the root, for instance ("perturb", "base/forward/M2",
+"shift", 2).
+"""
+
+LONGEST_SHOWN = 60
+"""A found value is cut after this many characters: enough to recognise it, and the message stays a line."""
+
+
+@dataclass(frozen=True)
+class Issue:
+    """One fault of an input.
+
+    Attributes:
+        problem: what is wrong, in a few words.
+        file: path as the user gave it; "" if the input did not come from a file.
+        line: counted from 1; None if unknown.
+        key: where in the file; empty for the file as a whole.
+        found: what stands there, None if that says nothing.
+        allowed: what may stand there.
+        suggestion: the nearest valid name.
+    """
+
+    problem: str
+    file: str = ""
+    line: int | None = None
+    key: KeyPath = ()
+    found: str | None = None
+    allowed: str | None = None
+    suggestion: str | None = None
+
+    def __str__(self) -> str:
+        place = self.file or "input"
+        if self.line is not None:
+            place += f":{self.line}"
+        if self.key:
+            place += f": {key_text(self.key)}"
+        text = f"{place}: {self.problem}"
+        if self.found is not None:
+            text += f"; found {self.found}"
+        if self.allowed is not None:
+            text += f", allowed: {self.allowed}" if self.found is not None else f"; allowed: {self.allowed}"
+        if self.suggestion is not None:
+            text += f"; did you mean {self.suggestion!r}?"
+        return text
+
+
+class InputError(Exception):
+    """An input that cannot be used: one or more issues, one a line in the message. Commands end with exit code 2 on it.
+
+    The attributes of the first issue can be read from the error itself.
+    """
+
+    def __init__(self, *issues: Issue) -> None:
+        if not issues:
+            raise ValueError("an InputError needs at least one issue")
+        super().__init__(*issues)
+        self.issues = issues
+
+    def __str__(self) -> str:
+        return "\n".join(str(issue) for issue in self.issues)
+
+    @property
+    def file(self) -> str:
+        """Path as the user gave it, "" if the input did not come from a file."""
+        return self.issues[0].file
+
+    @property
+    def line(self) -> int | None:
+        """Line counted from 1, None if unknown."""
+        return self.issues[0].line
+
+    @property
+    def key(self) -> KeyPath:
+        """Where in the file."""
+        return self.issues[0].key
+
+    @property
+    def found(self) -> str | None:
+        """What stands there."""
+        return self.issues[0].found
+
+    @property
+    def allowed(self) -> str | None:
+        """What may stand there."""
+        return self.issues[0].allowed
+
+    @property
+    def suggestion(self) -> str | None:
+        """The nearest valid name."""
+        return self.issues[0].suggestion
+
+
+class Problem(ValueError):
+    """Raised by the reader of a value, which knows what is wrong with it but not where it stands.
+
+    Attributes:
+        problem, found, allowed, suggestion: as in `Issue`.
+        within: where in the value the fault lies; empty for the value as a whole.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        found: str | None = None,
+        allowed: str | None = None,
+        suggestion: str | None = None,
+        within: KeyPath = (),
+    ) -> None:
+        super().__init__(problem, found, allowed, suggestion, within)
+        self.problem, self.found, self.allowed, self.suggestion = problem, found, allowed, suggestion
+        self.within = within
+
+    def __str__(self) -> str:
+        return self.problem
+
+
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """The one of `names` that `name` was probably meant to be, or None if none comes near. Case is ignored."""
+    folded = {candidate.casefold(): candidate for candidate in names}
+    matches = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.6)
+    return folded[matches[0]] if matches else None
+
+
+def key_text(key: KeyPath) -> str:
+    """A key path as text: `perturb.base/forward/M2.shift[2]`."""
+    text = ""
+    for part in key:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def shown(value: object) -> str:
+    """A found value as it appears in a message: on one line, not too long, and text in quotes."""
+    if isinstance(value, dict):
+        text = "a mapping" + (f" with keys {names_text(value)}" if value else " without keys")
+    elif isinstance(value, list):
+        text = f"a list of {len(value)}"
+    elif value is None:
+        return "nothing"
+    elif isinstance(value, bool):
+        return str(value).lower()
+    else:
+        text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 3] + "..."
+
+
+def names_text(names: Iterable[object]) -> str:
+    """Names as a list to read: `a, b, c`."""
+    return ", ".join(str(name) for name in names)

@@ -1,0 +1,121 @@
+"""An instrument: cameras on a common base with their autocollimation monitors, as a file in scenes/instruments gives
+it.
+"""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
+from scenes.spec import Name, Named, Number, Spec, Text, Whole
+from scenes.units import ANGLE, TIME
+
+Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
+LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
+MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
+"""Name of a file in the library (`gf7`), or path of a file of one's own, relative to the file that names it."""
+
+MOST_FRAMES = 10_000
+Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
+
+
+class MountedCameraSpec(Spec):
+    """A camera in its place on the base.
+
+    Attributes:
+        camera: which camera, by name or path.
+        look: angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+        position: of the camera's origin in the base frame, metres.
+        pupil_offset: centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
+    """
+
+    camera: Reference
+    look: LookAngle
+    position: Vector3
+    pupil_offset: Vector2
+
+
+class CentralPrismSpec(Spec):
+    """The central prism, the common reference of all cameras: its position in the base frame, metres."""
+
+    position: Vector3
+
+
+class ReticleSpec(Spec):
+    """The light source of a monitor channel: a lit pinhole in the focal plane.
+
+    Attributes:
+        pinhole: diameter, metres.
+        photons_per_frame: expected number of photons of one spot that reach the area CCD's plane during one exposure.
+    """
+
+    pinhole: PositiveLength
+    photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
+
+
+class AreaCcdSpec(Spec):
+    """The area CCD of a monitor channel.
+
+    Attributes:
+        detector: its data sheet, by name or path.
+        rows: number of pixel rows.
+        columns: number of pixel columns.
+        pitch: of the pixels, metres.
+        offset: (X, Y) from the pinhole to the centre of the pixel grid, in the focal plane, metres.
+        exposure: of a frame, seconds.
+    """
+
+    detector: Reference
+    rows: Annotated[Whole, Field(ge=8, le=8192)]
+    columns: Annotated[Whole, Field(ge=8, le=8192)]
+    pitch: PositiveLength
+    offset: Vector2
+    exposure: Exposure
+
+
+class ReturnFaceSpec(Spec):
+    """The flat face that returns the monitor's beam: distance from the camera's origin along the beam and diameter,
+    metres.
+    """
+
+    distance: PositiveLength
+    aperture: PositiveLength
+
+
+class MonitorSpec(Spec):
+    """The autocollimation monitor, alike in all cameras and in both channels of each.
+
+    Attributes:
+        wavelength: of the source, metres.
+        field: angle from the visual axis at which the area CCDs stand, left at +Y and right at -Y, radians.
+        reticle: light source.
+        area_ccd: detector.
+        return_face: what sends the light back.
+        frames: number of frames in one measurement.
+    """
+
+    wavelength: Wavelength
+    field: MonitorField
+    reticle: ReticleSpec
+    area_ccd: AreaCcdSpec
+    return_face: ReturnFaceSpec
+    frames: Frames = 9
+
+
+class InstrumentSpec(Spec):
+    """Cameras on a common base, each with its monitor.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        cameras: by name; the first is the reference for the change of the intersection angle.
+        central_prism: common reference.
+        monitor: of every camera.
+    """
+
+    name: Name
+    description: Text = ""
+    cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
+    central_prism: CentralPrismSpec
+    monitor: MonitorSpec

@@ -1,0 +1,182 @@
+"""A job: which instrument, what is perturbed, what is rendered and how the images are analysed. Its file is the user's
+main input.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal, Protocol
+
+from pydantic import AfterValidator, Field, WithJsonSchema
+
+from optics.zernike import MAX_NOLL
+from scenes.errors import InputError, Issue, Problem, names_text, nearest, shown
+from scenes.frozen_dict import FrozenDict
+from scenes.instrument import Frames, Reference
+from scenes.quantity import Quantity, Vector
+from scenes.spec import Name, NothingIsEmpty, Paths, Spec, Whole
+from scenes.units import ANGLE, LENGTH, SCALE
+
+Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
+Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
+FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
+ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
+
+NO_MOTION = (0.0, 0.0, 0.0)
+DEFAULT_PIVOT = "origin"
+HIGHEST_NOLL = MAX_NOLL
+"""Highest Zernike term of a figure, radial order 10."""
+_TERM = re.compile(r"Z([1-9][0-9]{0,3})")
+
+
+def noll(term: str) -> int:
+    """The Noll index of a figure term: 5 for "Z5".
+
+    Raises:
+        Problem: not Z1 .. Z231.
+    """
+    match = _TERM.fullmatch(term)
+    if match is None or int(match[1]) > HIGHEST_NOLL:
+        raise Problem("not a Zernike term", shown(term), f"Z1 .. Z{HIGHEST_NOLL} (Noll's numbering)")
+    return int(match[1])
+
+
+def _is_term(term: str) -> str:
+    noll(term)
+    return term
+
+
+Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
+
+
+class PerturbationSpec(Spec):
+    """What happens to one body of the instrument: a small rigid motion, a scale change, and for a mirror a figure
+    error.
+
+    Attributes:
+        rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
+        shift: in the body's own frame, metres.
+        pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
+        figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
+        scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
+    """
+
+    rotate: Rotation = NO_MOTION
+    shift: Shift = NO_MOTION
+    pivot: Name = DEFAULT_PIVOT
+    figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenDict)] = Field(default_factory=FrozenDict)
+    scale: ScaleChange = 0.0
+
+    def uses(self) -> tuple[str, ...]:
+        """Which of rotate, shift, figure and scale do something."""
+        done = {
+            "rotate": any(self.rotate),
+            "shift": any(self.shift),
+            "figure": any(self.figure.values()),
+            "scale": self.scale != 0.0,
+        }
+        return tuple(name for name, does in done.items() if does)
+
+
+def _some(images: tuple[str, ...]) -> tuple[str, ...]:
+    if not images:
+        raise Problem("nothing to render", "an empty list", "[spots]")
+    return images
+
+
+class RenderSpec(Spec):
+    """What is rendered.
+
+    Attributes:
+        images: which images; at present the monitor's spots.
+        frames: number of frames, None for as many as the instrument's monitor takes.
+        seed: of every random number in the job.
+    """
+
+    images: Annotated[tuple[Literal["spots"], ...], AfterValidator(_some)] = ("spots",)
+    frames: Frames | None = None
+    seed: Annotated[Whole, Field(ge=0, le=2**63 - 1)] = 1
+
+
+class AnalysisSpec(Spec):
+    """How the images are analysed: by which method the centres of the spots are found."""
+
+    centroid: Literal["ml", "gaussian", "energy"] = "ml"
+
+
+class JobSpec(Spec):
+    """A job.
+
+    Attributes:
+        instrument: name of an instrument in scenes/instruments, or path of an own file, relative to the job's file.
+        perturb: node path -> perturbation; empty for the nominal state.
+        render: what is rendered.
+        analysis: how it is analysed.
+    """
+
+    instrument: Reference
+    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenDict)
+    render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
+    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
+
+
+@dataclass(frozen=True)
+class NodeInfo:
+    """What may be done to a body of the instrument.
+
+    Attributes:
+        pivots: names of its pivots.
+        allows: which of "rotate", "shift", "figure" and "scale".
+    """
+
+    pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
+    allows: frozenset[str] = frozenset({"rotate", "shift"})
+
+
+class Node(Protocol):
+    """Anything that says of a body what `NodeInfo` does."""
+
+    @property
+    def pivots(self) -> tuple[str, ...]:
+        """Names of its pivots."""
+
+    @property
+    def allows(self) -> frozenset[str]:
+        """Which of "rotate", "shift", "figure" and "scale" may be done to it."""
+
+
+def check_nodes(job: JobSpec, nodes: Mapping[str, Node]) -> None:
+    """Check that every perturbed node exists, has the named pivot and allows what is done to it.
+
+    Args:
+        job: as loaded.
+        nodes: node path -> what may be done to it, for all bodies of the instrument.
+
+    Raises:
+        InputError: one issue for each fault, with the nearest valid name.
+    """
+    issues = [issue for path, what in job.perturb.items() for issue in _node_issues(job, nodes, path, what)]
+    if issues:
+        raise InputError(*issues)
+
+
+def _node_issues(job: JobSpec, nodes: Mapping[str, Node], path: str, what: PerturbationSpec) -> list[Issue]:
+    if path not in nodes:
+        meant = nearest(path, nodes)
+        return [
+            job.issue(
+                "no such node", ("perturb", path), found=path, allowed=names_text(sorted(nodes)), suggestion=meant
+            )
+        ]
+    info, issues = nodes[path], []
+    for action in what.uses():
+        if action not in info.allows:
+            allowed = names_text(sorted(info.allows)) or "nothing"
+            issues.append(job.issue(f"this node does not allow {action}", ("perturb", path, action), allowed=allowed))
+    if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
+        known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))
+        key, meant = ("perturb", path, "pivot"), nearest(what.pivot, known)
+        issues.append(
+            job.issue("this node has no such pivot", key, found=what.pivot, allowed=names_text(known), suggestion=meant)
+        )
+    return issues

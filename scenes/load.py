@@ -1,0 +1,123 @@
+"""Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
+
+The library's folders are scenes/cameras, scenes/instruments and scenes/detectors; a file's name without .yaml is its
+name there.
+"""
+
+from pathlib import Path
+from typing import TypeVar
+
+from scenes.camera import CameraSpec
+from scenes.detector import DetectorSpec
+from scenes.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.instrument import InstrumentSpec
+from scenes.job import JobSpec
+from scenes.spec import Spec
+from scenes.translate import validate
+from scenes.yaml_file import read_yaml
+
+SpecType = TypeVar("SpecType", bound=Spec)
+
+LIBRARY = Path(__file__).resolve().parent
+EXAMPLES = LIBRARY / "examples"
+CAMERAS, INSTRUMENTS, DETECTORS = "cameras", "instruments", "detectors"
+
+
+def library_names(folder: str) -> tuple[str, ...]:
+    """The names in one folder of the library ("cameras", "instruments" or "detectors"), sorted."""
+    return tuple(sorted(path.stem for path in (LIBRARY / folder).glob("*.yaml")))
+
+
+def load_job(path: str | Path) -> JobSpec:
+    """Read a job. The instrument it names is looked for, not read.
+
+    Raises:
+        InputError: the file cannot be read or is not a valid job, or there is no such instrument; one issue for each
+            fault.
+    """
+    job = validate(JobSpec, read_yaml(path))
+    instrument_path(job)
+    return job
+
+
+def instrument_path(job: JobSpec) -> Path:
+    """The file of the job's instrument.
+
+    Raises:
+        InputError: there is none, said with the line of the job's file.
+    """
+    return _find(INSTRUMENTS, job.instrument, job, ("instrument",))
+
+
+def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = None) -> InstrumentSpec:
+    """Read an instrument. The cameras and the detector it names are looked for, not read.
+
+    Args:
+        name_or_path: a name in the library, or a path (anything with a slash or ending in .yaml or .yml).
+        relative_to: folder that a relative path starts from, the current one by default.
+
+    Raises:
+        InputError: as `load_job`.
+    """
+    instrument = _load(InstrumentSpec, INSTRUMENTS, name_or_path, relative_to)
+    paths_of_cameras(instrument)
+    path_of_detector(instrument)
+    return instrument
+
+
+def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
+    """Name in the instrument -> file of its camera. Raises InputError if there is none."""
+    return {
+        name: _find(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
+        for name, mounted in instrument.cameras.items()
+    }
+
+
+def path_of_detector(instrument: InstrumentSpec) -> Path:
+    """The file of the area CCD's data sheet. Raises InputError if there is none."""
+    return _find(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
+
+
+def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> CameraSpec:
+    """Read a camera; arguments and errors as `load_instrument`."""
+    return _load(CameraSpec, CAMERAS, name_or_path, relative_to)
+
+
+def load_detector(name_or_path: str | Path, relative_to: str | Path | None = None) -> DetectorSpec:
+    """Read a detector's data sheet; arguments and errors as `load_instrument`."""
+    return _load(DetectorSpec, DETECTORS, name_or_path, relative_to)
+
+
+def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None) -> SpecType:
+    path = _candidate(folder, name_or_path, Path(relative_to) if relative_to is not None else Path())
+    if path is None:
+        name, names = str(name_or_path), library_names(folder)
+        allowed = f"{names_text(names)}, or the path of a .yaml file"
+        raise InputError(
+            Issue(f"no such name in {folder}", found=shown(name), allowed=allowed, suggestion=nearest(name, names))
+        )
+    return validate(model, read_yaml(path))
+
+
+def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
+    """The file that a specification refers to, or an InputError at the line of the reference."""
+    file = owner.source.file
+    path = _candidate(folder, reference, Path(file).parent if file else Path())
+    if path is None:
+        names = library_names(folder)
+        allowed = f"{names_text(names)}, or the path of a .yaml file"
+        raise owner.error(
+            f"no such name in {folder}", key, found=reference, allowed=allowed, suggestion=nearest(reference, names)
+        )
+    if not path.is_file():
+        raise owner.error(f"no such file: {path}", key)
+    return path
+
+
+def _candidate(folder: str, name_or_path: str | Path, base: Path) -> Path | None:
+    """Where a reference leads: a library file that exists, a path that may not, or None for an unknown name."""
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
+        return base / text
+    path = LIBRARY / folder / f"{text}.yaml"
+    return path if text in library_names(folder) else None

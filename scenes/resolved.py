@@ -1,0 +1,81 @@
+"""A job together with everything it refers to, so that one file says all that went into a run."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from scenes.camera import CameraSpec
+from scenes.detector import DetectorSpec
+from scenes.frozen_dict import FrozenDict
+from scenes.instrument import InstrumentSpec
+from scenes.job import JobSpec
+from scenes.load import (
+    instrument_path,
+    load_camera,
+    load_detector,
+    load_instrument,
+    load_job,
+    path_of_detector,
+    paths_of_cameras,
+)
+from scenes.spec import Paths, Source, Spec
+from scenes.translate import validate
+from scenes.yaml_file import dump_yaml, read_yaml
+
+
+class ResolvedJob(Spec):
+    """A job with its instrument, cameras and detector.
+
+    Attributes:
+        job: as the user wrote it, defaults filled in.
+        instrument: what `job.instrument` names.
+        cameras: what `instrument.cameras.<name>.camera` says -> prescription.
+        detector: data sheet of the monitor's area CCDs.
+    """
+
+    job: JobSpec
+    instrument: InstrumentSpec
+    cameras: Annotated[Paths[CameraSpec], Field(min_length=1)]
+    detector: DetectorSpec
+
+    @property
+    def frames(self) -> int:
+        """Number of frames: the job's if it gives one, else the instrument's."""
+        return self.job.render.frames or self.instrument.monitor.frames
+
+    def to_yaml(self) -> str:
+        """The text of a config.yaml; `resolve` reads it back to exactly the same values."""
+        return dump_yaml(self.plain())
+
+
+def resolve(path: str | Path) -> ResolvedJob:
+    """Read a job and all it refers to. The config.yaml of an earlier run can be given in place of a job.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid.
+    """
+    yaml = read_yaml(path)
+    if isinstance(yaml.data, dict) and "job" in yaml.data:
+        return _complete(validate(ResolvedJob, yaml))
+    return resolve_job(load_job(path))
+
+
+def resolve_job(job: JobSpec) -> ResolvedJob:
+    """A job with all it refers to. Raises InputError as `resolve`."""
+    instrument = load_instrument(instrument_path(job))
+    files = paths_of_cameras(instrument)
+    cameras = {mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()}
+    detector = load_detector(path_of_detector(instrument))
+    # Built from checked parts: validating again would ask for quantities as text.
+    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=FrozenDict(cameras), detector=detector)
+
+
+def _complete(resolved: ResolvedJob) -> ResolvedJob:
+    """Check that every camera of the instrument is there, and let the job know where it was read."""
+    for mounted in resolved.instrument.cameras.values():
+        if mounted.camera not in resolved.cameras:
+            raise resolved.error(f"camera {mounted.camera!r} of the instrument is missing", ("cameras",))
+    source = resolved.source
+    job = resolved.job.with_source(Source(source.file, source.lines, ("job",)))
+    return resolved.model_copy(update={"job": job})

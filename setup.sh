@@ -1,0 +1,92 @@
+#!/usr/bin/env bash
+# Makes .venv beside this file, installs the twin into it and checks that it works. Safe to run again: a second run does nothing
+# but the check.
+set -euo pipefail
+
+usage() {
+    cat <<'TEXT'
+Usage: bash setup.sh [--test] [--help]
+
+Makes a virtual environment in .venv, installs the space camera twin and what it needs into it, and checks that it works.
+
+  --test   also install what the tests need (pytest, ruff, mypy, and the programs the twin is checked against)
+  --help   this text
+
+Needs Python 3.11 or newer with its venv module, and libatomic.so.1. As root on Debian or Ubuntu the last two are installed when
+they are missing; as an ordinary user you are told what to install.
+The variable PYTHON names the interpreter to use, for instance PYTHON=python3.13.
+TEXT
+}
+
+extras=""
+for argument in "$@"; do
+    case "$argument" in
+        --test) extras="[test,oracles]" ;;
+        -h | --help) usage; exit 0 ;;
+        *) echo "setup.sh: unknown option $argument" >&2; usage >&2; exit 2 ;;
+    esac
+done
+
+cd "$(dirname "${BASH_SOURCE[0]}")"
+say() { echo "setup: $*"; }
+fail() { echo "setup: $*" >&2; exit 1; }
+
+# --- Python -----------------------------------------------------------------------------------------------------------------
+new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; }
+python=""
+for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11 python3.14}; do
+    if command -v "$candidate" >/dev/null && new_enough "$candidate"; then
+        python="$(command -v "$candidate")"
+        break
+    fi
+done
+[ -n "$python" ] || fail "no Python 3.11 or newer found (looked for: ${PYTHON:-python3, python3.11 .. python3.14}). Install it, or name it: PYTHON=/path/to/python3 bash setup.sh"
+say "using $("$python" --version) at $python"
+
+# --- what pip cannot install ------------------------------------------------------------------------------------------------
+has_venv() { "$python" -c 'import venv, ensurepip' >/dev/null 2>&1; }
+has_libatomic() { [ "$(uname -s)" != Linux ] || "$python" -c 'import ctypes; ctypes.CDLL("libatomic.so.1")' >/dev/null 2>&1; }
+missing_packages() {
+    has_venv || echo python3-venv
+    has_libatomic || echo libatomic1
+}
+missing="$(missing_packages | xargs)"
+if [ -n "$missing" ] && [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    say "installing with apt: $missing"
+    # The package lists of a fresh system are empty or old.
+    apt-get update -qq || say "apt-get update failed; trying with the lists that are there"
+    # shellcheck disable=SC2086
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $missing >/dev/null \
+        || fail "apt could not install: $missing"
+    missing="$(missing_packages | xargs)"
+fi
+[ -z "$missing" ] || fail "please install: $missing
+       (on Debian or Ubuntu, as root: apt install $missing)
+       and run this again"
+
+# --- .venv ------------------------------------------------------------------------------------------------------------------
+if [ -e .venv ] && ! { new_enough .venv/bin/python && .venv/bin/python -m pip --version >/dev/null 2>&1; }; then
+    say ".venv does not work; making it anew"
+    rm -rf .venv
+fi
+if [ ! -e .venv ]; then
+    say "making .venv"
+    "$python" -m venv .venv
+fi
+
+# What is installed is decided by pyproject.toml, the Python version and where this folder is; when none has changed, nothing is
+# installed again. An installation for the tests serves everything else as well.
+stamp=".venv/installed"
+state="$({ cat pyproject.toml; .venv/bin/python -VV; pwd; } | sha256sum | cut -d' ' -f1)"
+if grep -qsxF -e "$state$extras" -e "$state[test,oracles]" "$stamp"; then
+    say "everything is installed already"
+else
+    say "installing (some minutes on a slow line)"
+    rm -f "$stamp"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".$extras" || fail "pip could not install the packages"
+    echo "$state$extras" >"$stamp"
+fi
+
+say "checking"
+.venv/bin/python -m twin.doctor --quick
+say "done"

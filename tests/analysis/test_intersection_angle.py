@@ -1,0 +1,78 @@
+"""Change of the intersection angle: signs, first order against the exact form, sigma."""
+
+import numpy as np
+import pytest
+
+from analysis.intersection_angle import exact, first_order
+from analysis.monitoring import ARCSEC, CameraParameters
+
+FORWARD, BACKWARD = np.deg2rad(26.0), np.deg2rad(-5.0)
+SIGMA = np.diag([0.03, 0.04, 1.0, 1.0]) * ARCSEC
+
+
+def camera(d_alpha=0.0, d_beta=0.0, d_gamma=0.0):
+    return CameraParameters.from_vector(np.array([d_alpha, d_beta, d_gamma, 0.0]), SIGMA @ SIGMA)
+
+
+def test_signs():
+    """Forward camera turned forward opens the angle, backward camera turned forward closes it."""
+    turn = 2 * ARCSEC
+    for form in (first_order, lambda f, b: exact(f, b, FORWARD, BACKWARD)):
+        assert form(camera(turn), camera()).change_rad == pytest.approx(turn, rel=1e-6)
+        assert form(camera(), camera(turn)).change_rad == pytest.approx(-turn, rel=1e-6)
+        assert form(camera(turn), camera(turn)).change_rad == pytest.approx(0, abs=1e-15)
+        assert form(camera(d_gamma=turn), camera()).change_rad == pytest.approx(0, abs=1e-15)
+
+
+def test_second_order():
+    """Turned apart sideways by d: cos(angle) -> cos(angle) - d^2/2-sized terms, from spherical trigonometry.
+
+    For unit vectors with latitudes +d and -d out of the plane: cos(new) = cos^2 d cos(angle) - sin^2 d.
+    """
+    d = 5e-3
+    change = exact(camera(d_beta=d), camera(d_beta=-d), FORWARD, BACKWARD).change_rad
+    angle = FORWARD - BACKWARD
+    expected = np.arccos(np.cos(d) ** 2 * np.cos(angle) - np.sin(d) ** 2) - angle
+    assert change == pytest.approx(expected, rel=1e-9)
+    assert change > 10 * ARCSEC
+    assert first_order(camera(d_beta=d), camera(d_beta=-d)).change_rad == 0
+
+
+def test_agree_for_small_angles():
+    """Random rotations of 10": the difference is second order, below (2 * 10")^2 * cot(31 deg) = 1.6e-8 rad."""
+    rng = np.random.default_rng(0)
+    vectors = np.zeros((2, 200, 4))
+    vectors[:, :, :2] = rng.uniform(-10, 10, (2, 200, 2)) * ARCSEC
+    one, two = (CameraParameters.from_vector(v, SIGMA @ SIGMA) for v in vectors)
+    linear, full = first_order(one, two), exact(one, two, FORWARD, BACKWARD)
+    assert linear.change_rad.shape == full.change_rad.shape == (200,)
+    assert np.abs(linear.change_rad - full.change_rad).max() < 1.6e-8
+    assert np.abs(linear.change_rad - full.change_rad).max() > 1e-11
+    assert np.allclose(full.sigma_rad, linear.sigma_rad, rtol=1e-3)
+
+
+def test_sigma_and_units():
+    out = first_order(camera(ARCSEC), camera(-ARCSEC)).to_dict()
+    assert out == {
+        "change_arcsec": pytest.approx(2.0),
+        "change_arcsec_sigma": pytest.approx(0.03 * np.sqrt(2)),
+    }
+
+
+def test_sigma_of_the_exact_form_by_draws():
+    """20 000 draws at a large sideways turn, where d_beta counts; a sigma has 0.5% error, limit 5 sigma (6e-7)."""
+    rng = np.random.default_rng(4)
+    base = np.array([0.0, 0.02, 0.0, 0.0])
+    draws = base + rng.standard_normal((20000, 4)) @ SIGMA
+    found = exact(CameraParameters.from_vector(draws, SIGMA @ SIGMA), camera(d_beta=-0.02), FORWARD, BACKWARD)
+    only_forward = CameraParameters.from_vector(base, SIGMA @ SIGMA)
+    quiet = CameraParameters.from_vector([0.0, -0.02, 0.0, 0.0], np.zeros((4, 4)))
+    stated = exact(only_forward, quiet, FORWARD, BACKWARD).sigma_rad
+    assert np.std(found.change_rad) == pytest.approx(stated, rel=5 / np.sqrt(2 * 20000))
+
+
+def test_bad_look_angles():
+    with pytest.raises(ValueError, match="same way"):
+        exact(camera(), camera(), 0.1, 0.1)
+    with pytest.raises(ValueError, match="forward_look_rad"):
+        exact(camera(), camera(), np.nan, 0.1)

@@ -1,0 +1,141 @@
+"""Weighted least squares against its own statistics, and the observability report on motions built to be confused."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.model_fit import RankError, fit, observability
+
+FALSE_ALARM = 1e-6
+NAMES = ["shift x", "shift y", "turn z", "scale"]
+# px per metre, metre, radian, unit scale: entries of very different size, as in life
+SPOTS = np.array(
+    [
+        [1.0e3, -2.9e5, 4.0e3, 9.0e4],
+        [-2.9e5, 2.0e3, -1.0e5, 5.0e3],
+        [1.5e3, -2.9e5, 4.0e3, -9.0e4],
+        [-2.9e5, -2.0e3, 1.0e5, 5.0e3],
+    ]
+)
+PARAMETERS = np.array([[0.18, 0, 0, 0], [0, 0.18, 0.02, 0], [0, 0, 1.0, 0], [0, 0, 0, 5.52]])
+_ROOT = np.random.default_rng(2).standard_normal((4, 4)) * 2e-3
+COVARIANCE = _ROOT @ _ROOT.T + 1e-6 * np.eye(4)
+SIZES = np.array([1e-5, 1e-5, 5e-5, 1e-5])
+
+
+def test_round_trip_without_noise():
+    motions = np.random.default_rng(0).standard_normal((30, 4)) * SIZES
+    found = fit(motions @ SPOTS.T, np.zeros((4, 4)), SPOTS, PARAMETERS)
+    truth = motions @ PARAMETERS.T
+    assert np.abs(found.vector - truth).max(axis=0) == pytest.approx(np.zeros(4), abs=1e-15)
+    assert not found.sigma.any()
+
+
+@pytest.mark.parametrize("chosen", [[0, 1, 2, 3], [0, 1]])
+def test_scatter_agrees_with_covariance(chosen):
+    """Chi-square of 500 estimates; with two motions and four coordinates the parameters have rank two."""
+    rng = np.random.default_rng(6)
+    spots, parameters = SPOTS[:, chosen], PARAMETERS[:, chosen]
+    motions = rng.standard_normal((500, len(chosen))) * SIZES[chosen]
+    noise = rng.multivariate_normal(np.zeros(4), COVARIANCE, 500)
+    found = fit(motions @ spots.T + noise, COVARIANCE, spots, parameters)
+    error = found.vector - motions @ parameters.T
+    rows = [0, 1, 2, 3] if len(chosen) == 4 else [0, 1]
+    weight = np.linalg.inv(found.covariance[0][np.ix_(rows, rows)])
+    chi2 = np.einsum("bi,ij,bj->", error[:, rows], weight, error[:, rows])
+    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, 500 * len(rows)) < 1 - FALSE_ALARM / 2
+
+
+def test_weighting_is_the_best_linear_one():
+    """Two motions: generalised least squares typed from the textbook; equal weights are worse."""
+    spots, parameters = SPOTS[:, :2], PARAMETERS[:, :2]
+    inverse = np.linalg.inv(COVARIANCE)
+    motion_covariance = np.linalg.inv(spots.T @ inverse @ spots)
+    shift = np.array([0.3, -0.2, 0.1, 0.4])
+    found = fit(shift, COVARIANCE, spots, parameters)
+    assert found.vector == pytest.approx(parameters @ motion_covariance @ spots.T @ inverse @ shift, rel=1e-9)
+    assert found.covariance == pytest.approx(parameters @ motion_covariance @ parameters.T, rel=1e-9, abs=1e-30)
+    plain = parameters @ np.linalg.pinv(spots)
+    assert np.all((plain @ COVARIANCE @ plain.T).diagonal()[:2] > found.covariance.diagonal()[:2])
+
+
+def test_covariance_per_state():
+    shift = np.random.default_rng(1).standard_normal((3, 4))
+    many = np.stack([COVARIANCE, 4 * COVARIANCE, np.eye(4)])
+    found = fit(shift, many, SPOTS[:, :3], PARAMETERS[:, :3])
+    for k in range(3):
+        alone = fit(shift[k], many[k], SPOTS[:, :3], PARAMETERS[:, :3])
+        assert np.allclose(found.vector[k], alone.vector, rtol=1e-10, atol=1e-25)
+        assert np.allclose(found.covariance[k], alone.covariance, rtol=1e-10, atol=1e-40)
+
+
+def test_rank_deficiency_names_the_null_vector():
+    spots = SPOTS.copy()
+    spots[:, 3] = 2e-3 * spots[:, 0] - 1e-3 * spots[:, 1]
+    with pytest.raises(RankError, match="moves no spot") as caught:
+        fit(np.zeros(4), COVARIANCE, spots, PARAMETERS, NAMES)
+    null = caught.value.null_vectors
+    assert null.shape == (1, 4)
+    assert null[0] / null[0, 3] == pytest.approx([-2e-3, 1e-3, 0, 1], rel=1e-6, abs=1e-9)
+    assert "shift x" in str(caught.value)
+    assert "scale" in str(caught.value)
+    assert "turn z" not in str(caught.value)
+    dead = SPOTS.copy()
+    dead[:, 1] = 0
+    with pytest.raises(RankError, match="shift y"):
+        fit(np.zeros(4), COVARIANCE, dead, PARAMETERS, NAMES)
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="at most 4"):
+        fit(np.zeros(4), COVARIANCE, np.ones((4, 5)), np.ones((4, 5)))
+    with pytest.raises(ValueError, match="positive definite"):
+        fit(np.zeros(4), -COVARIANCE, SPOTS, PARAMETERS)
+    with pytest.raises(ValueError, match="finite"):
+        fit(np.full(4, np.nan), COVARIANCE, SPOTS, PARAMETERS)
+    with pytest.raises(ValueError, match=r"\(4, P\)"):
+        fit(np.zeros(4), COVARIANCE, SPOTS[:3], PARAMETERS[:3])
+
+
+def test_observability_report():
+    """A tilt that looks exactly like a shift plus a turn, a motion without effect on spots, and the family itself."""
+    names = [*NAMES, "tilt", "piston", "nothing"]
+    mix = np.array([0.7e-3, 0.0, 2e-3, 0.0])  # tilt in terms of the family, per radian
+    spots = np.column_stack([SPOTS, SPOTS @ mix, np.zeros(4), np.zeros(4)])
+    truth = np.array([3e-3, 0, 0, 0])
+    parameters = np.column_stack([PARAMETERS, truth, [0, 0, 0, 1.0], np.zeros(4)])
+    sizes = np.array([1e-6, 1e-6, 5e-6, 1e-6, 5e-6, 1e-6, 1e-6])
+    report = observability(names, spots, parameters, sizes, COVARIANCE, [0, 1, 2, 3])
+    assert report.rank == report.family_rank == 4
+    assert report.singular_values.shape == (4,)
+    tilt = report.motions[4]
+    assert tilt.explained == pytest.approx(1, abs=1e-12)
+    assert tilt.imitation * sizes[:4] / sizes[4] == pytest.approx(mix, abs=1e-12)
+    assert tilt.reported == pytest.approx(PARAMETERS @ mix * 5e-6, rel=1e-9, abs=1e-20)
+    assert tilt.error == pytest.approx(PARAMETERS @ mix * 5e-6 - truth * 5e-6, rel=1e-9, abs=1e-20)
+    assert tilt.nearest in NAMES
+    for motion in report.motions[:4]:  # the family is reported as what it is
+        assert motion.error == pytest.approx(np.zeros(4), abs=1e-18)
+    text = "\n".join(report.statements)
+    assert "tilt" in text
+    assert "cannot be separated" in text
+    assert "piston (unit 1e-06 SI) moves no spot and is invisible" in text
+    assert "d_f +1 um" in text
+    assert "nothing (unit 1e-06 SI) moves no spot and changes no parameter" in text
+
+
+def test_observability_outside_a_small_family():
+    """With two motions fitted, a third is explained in part; the cosine is in the metric of the noise."""
+    report = observability(NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0, 1])
+    root = np.linalg.cholesky(COVARIANCE)
+    white = np.linalg.solve(root, SPOTS)
+    turn = report.motions[2]
+    residual = white[:, 2] - white[:, :2] @ np.linalg.lstsq(white[:, :2], white[:, 2], rcond=None)[0]
+    assert turn.explained == pytest.approx(1 - (residual @ residual) / (white[:, 2] @ white[:, 2]), rel=1e-6, abs=1e-9)
+    cosines = [white[:, 2] @ white[:, j] / np.linalg.norm(white[:, 2]) / np.linalg.norm(white[:, j]) for j in (0, 1)]
+    assert turn.cosine == pytest.approx(cosines[int(np.argmax(np.abs(cosines)))], rel=1e-9)
+    assert any("leaves a residual" in line for line in report.statements)
+    with pytest.raises(ValueError, match="family"):
+        observability(NAMES, SPOTS, PARAMETERS, SIZES, COVARIANCE, [0, 0])
+    with pytest.raises(ValueError, match="positive scales"):
+        observability(NAMES, SPOTS, PARAMETERS, SIZES[:2], COVARIANCE, [0])

@@ -1,0 +1,165 @@
+"""The printed and the derived formulas of paper 001: each by hand, their ratios, signs, sigma, and a plane-mirror round
+trip.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from analysis.monitoring import (
+    ARCSEC,
+    CameraParameters,
+    MonitorGeometry,
+    coefficients,
+    derived,
+    paper_joint,
+    paper_single,
+    shift_covariance,
+)
+
+# Field angles far larger than real ones, so that a forgotten cos^2 cannot hide.
+GEOMETRY = MonitorGeometry(7.68, 0.73, 7e-6, field_alpha_rad=0.3, field_beta_rad=0.2)
+ZERO = np.zeros((4, 4))
+FUNCTIONS = {"paper_single": paper_single, "paper_joint": paper_joint, "derived": derived}
+
+
+def printed(y01, y11, y02, y22, x01, x11, x02, x22, g):
+    """Equations (2), (3), (5), (7) typed from the page."""
+    delta, f, length = g.pixel_m, g.focal_length_m, g.separation_m
+    d_beta = math.atan((((y01 - y11) + (y02 - y22)) / 2 * delta) * math.cos(g.field_beta_rad) ** 2 / (2 * f))
+    d_alpha = math.atan((((x01 - x11) + (x02 - x22)) / 2 * delta) * math.cos(g.field_alpha_rad) ** 2 / (2 * f))
+    d_gamma = math.atan(((x01 - x11) + (x22 - x02)) / length * delta)
+    d_f = (((y11 - y01) + (y02 - y22)) / 2 * delta) * f / length
+    return [d_alpha, d_beta, d_gamma, d_f]
+
+
+@pytest.fixture
+def spots():
+    rng = np.random.default_rng(3)
+    return rng.uniform(40, 55, (50, 2, 2)), rng.uniform(40, 55, (50, 2, 2))
+
+
+def test_single_is_the_printed_one(spots):
+    before, after = spots
+    result = paper_single(before, after, ZERO, GEOMETRY)
+    for b, a, found in zip(before, after, result.vector, strict=True):
+        # side 0 = left = 1 of the paper; (row, column) = (y, x)
+        expected = printed(b[0, 0], a[0, 0], b[1, 0], a[1, 0], b[0, 1], a[0, 1], b[1, 1], a[1, 1], GEOMETRY)
+        assert found == pytest.approx(expected, rel=1e-11, abs=1e-22)
+
+
+def test_joint_is_table_1(spots):
+    before, after = spots
+    result = paper_joint(before, after, ZERO, GEOMETRY)
+    x_l, x_r = (before - after)[:, 0, 1], (before - after)[:, 1, 1]
+    y_l, y_r = (before - after)[:, 0, 0], (before - after)[:, 1, 0]
+    g = GEOMETRY
+    alpha = (x_l + x_r) / 2 * g.pixel_m * math.cos(0.3) ** 2 / (2 * g.focal_length_m)
+    beta = (y_l + y_r) / 2 * g.pixel_m * math.cos(0.2) ** 2 / (2 * g.focal_length_m)
+    gamma = (x_l - x_r) / g.separation_m * g.pixel_m
+    d_f = (-y_l + y_r) / 2 * g.pixel_m * g.focal_length_m / (2 * g.separation_m)
+    assert np.allclose(result.vector, np.stack([alpha, beta, gamma, d_f], axis=1), rtol=1e-12, atol=1e-22)
+
+
+def test_ratios_between_the_formulas():
+    single, joint, own = (coefficients(name, GEOMETRY) for name in FUNCTIONS)
+    assert np.allclose(single[2], 2 * own[2], rtol=1e-15)
+    assert np.allclose(joint[2], 2 * own[2], rtol=1e-15)
+    assert np.allclose(joint[3], 0.5 * own[3], rtol=1e-15)
+    assert np.allclose(single[3], own[3], rtol=1e-15)
+    assert np.allclose(single[0], math.cos(0.3) ** 2 * own[0], rtol=1e-15)
+    assert np.allclose(single[1], math.cos(0.2) ** 2 * own[1], rtol=1e-15)
+
+
+def test_derived_inverts_a_plane_mirror_return():
+    """Detector shifted by d moves the image by -2 d on it; ends of a line turned by t about Z shift by -+ t L/2 along
+    X.
+
+    The shift (x, y) of the detector turns the line of sight by x/f about Y and y/f about X in the paper's sign (which
+    equates them without naming axes' senses); a change of f by d_f with the line unscaled displaces the ends by
+    -+ (d_f / f) L / 2 in the return, doubled by the mirror.
+    """
+    g = GEOMETRY
+    x, y, turn, d_f = 30e-6, -20e-6, 12 * ARCSEC, 40e-6
+    half = g.separation_m / 2
+    shift_m = np.array([[y, x + turn * half], [y, x - turn * half]])
+    image_m = -2 * shift_m + 2 * (d_f / g.focal_length_m) * np.array([[half, 0], [-half, 0]])
+    before = np.full((2, 2), 48.0)
+    found = derived(before, before + image_m / g.pixel_m, ZERO, g)
+    assert found.vector == pytest.approx([x / g.focal_length_m, y / g.focal_length_m, turn, d_f], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", list(FUNCTIONS))
+def test_signs(name):
+    """One test per sign: a spot that moves to larger columns on both sides is a negative d_alpha, and so on."""
+    before = np.zeros((2, 2))
+    cases = {
+        0: np.array([[0.0, 1.0], [0.0, 1.0]]),
+        1: np.array([[1.0, 0.0], [1.0, 0.0]]),
+        2: np.array([[0.0, 1.0], [0.0, -1.0]]),
+        3: np.array([[1.0, 0.0], [-1.0, 0.0]]),
+    }
+    sign = {0: -1, 1: -1, 2: -1, 3: 1}
+    for parameter, after in cases.items():
+        vector = FUNCTIONS[name](before, after, ZERO, GEOMETRY).vector
+        assert np.sign(vector[parameter]) == sign[parameter]
+        assert np.all(np.delete(vector, parameter) == 0)
+
+
+@pytest.mark.parametrize("name", list(FUNCTIONS))
+def test_covariance_is_the_scatter(name):
+    """First-order propagation against the empirical covariance of 20 000 draws.
+
+    A variance from n draws has a relative error of sqrt(2/n) = 1%, a correlation of 0.7%: 5.5 sigma, four by four
+    entries.
+    """
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((4, 4)) * 1e-2
+    covariance = root @ root.T
+    before = np.array([[48.0, 47.0], [46.0, 49.0]])
+    after = before + 3.0 + (rng.standard_normal((20000, 4)) @ root.T).reshape(-1, 2, 2)
+    result = FUNCTIONS[name](before, after, covariance, GEOMETRY)
+    empirical = np.cov(result.vector.T)
+    stated = result.covariance[0]
+    scale = np.sqrt(np.outer(np.diag(stated), np.diag(stated)))
+    assert np.abs((empirical - stated) / scale).max() < 5.5 * np.sqrt(2 / 20000)
+
+
+def test_to_dict_units_and_shapes():
+    one = CameraParameters.from_vector([ARCSEC, 2 * ARCSEC, -3 * ARCSEC, 4e-6], np.diag([ARCSEC, 1, 1, 1e-6]) ** 2)
+    out = one.to_dict()
+    assert out["d_alpha_arcsec"] == pytest.approx(1)
+    assert out["d_beta_arcsec"] == pytest.approx(2)
+    assert out["d_gamma_arcsec"] == pytest.approx(-3)
+    assert out["d_f_um"] == pytest.approx(4)
+    assert out["d_alpha_arcsec_sigma"] == pytest.approx(1)
+    assert out["d_f_um_sigma"] == pytest.approx(1)
+    assert isinstance(out["d_f_um"], float)
+    assert len(out) == 8
+    many = CameraParameters.from_vector(np.zeros((3, 4)), ZERO).to_dict()
+    assert many["d_f_um"] == [0.0, 0.0, 0.0]
+
+
+def test_geometry_options_and_errors():
+    other = MonitorGeometry(7.68, 0.73, 7e-6, focal_length_x_m=7.0)
+    assert coefficients("derived", other)[0, 1] == pytest.approx(-7e-6 / 28)
+    assert coefficients("derived", other)[1, 0] == pytest.approx(-7e-6 / (4 * 7.68))
+    with pytest.raises(ValueError, match="separation_m"):
+        MonitorGeometry(7.68, 0.0, 7e-6)
+    with pytest.raises(ValueError, match="field_beta_rad"):
+        MonitorGeometry(7.68, 0.7, 7e-6, 0.0, 2.0)
+    with pytest.raises(ValueError, match="paper_single"):
+        coefficients("paper", other)
+    with pytest.raises(ValueError, match="2 sides"):
+        derived(np.zeros(4), np.zeros(4), ZERO, other)
+    with pytest.raises(ValueError, match="finite"):
+        derived(np.full((2, 2), np.nan), np.zeros((2, 2)), ZERO, other)
+
+
+def test_shift_covariance_blocks():
+    left, right = np.array([[1.0, 0.5], [0.5, 2.0]]), np.array([[3.0, 0.0], [0.0, 4.0]])
+    out = shift_covariance(left, right)
+    assert np.array_equal(out[:2, :2], left)
+    assert np.array_equal(out[2:, 2:], right)
+    assert not out[:2, 2:].any()

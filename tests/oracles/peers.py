@@ -1,0 +1,82 @@
+"""The reference cameras in other people's ray tracers, for the oracle tests and the benchmark."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optics.aperture import Circle
+from scenes.camera_model import IMAGE, CameraModel
+
+
+def batoid_camera(model: CameraModel, apertures: bool = False) -> Any:
+    """The camera as a ``batoid.CompoundOptic`` in the prescription frame; mirrors keep their names."""
+    import batoid
+
+    items = []
+    for name, surface in model.surfaces.items():
+        radius = 1.0 / surface.curvature
+        shape = batoid.Asphere(radius, surface.conic, list(surface.even)) if surface.even else None
+        shape = shape or batoid.Quadric(radius, surface.conic)
+        blocked = None
+        if apertures:
+            edge = model.apertures[name]
+            if isinstance(edge, Circle):
+                inside = batoid.ObscCircle(edge.radius, *edge.centre)
+            else:
+                inside = batoid.ObscRectangle(2.0 * edge.half_x, 2.0 * edge.half_y, *edge.centre)
+            blocked = batoid.ObscNegation(inside)
+        stand = batoid.CoordSys(origin=model.vertex(name))
+        items.append(batoid.Mirror(shape, name=name, coordSys=stand, obscuration=blocked))
+    stand = batoid.CoordSys(origin=[0.0, 0.0, model.spec.image.z])
+    items.append(batoid.Detector(batoid.Plane(), name=IMAGE, coordSys=stand))
+    return batoid.CompoundOptic(items, name=model.spec.name)
+
+
+def batoid_rays(position: np.ndarray, direction: np.ndarray) -> Any:
+    """A ``batoid.RayVector`` from arrays (N, 3); its time counts metres of optical path."""
+    import batoid
+
+    n = len(position)
+    columns = [np.ascontiguousarray(a[:, i]) for a in (position, np.broadcast_to(direction, position.shape)) for i in range(3)]
+    return batoid.RayVector(*columns, np.zeros(n), np.full(n, 650e-9))
+
+
+def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
+    """The camera as an ``optiland.optic.Optic`` in the prescription frame (the unit of length is of no concern to it)."""
+    from optiland.optic import Optic
+    from optiland.physical_apertures import RadialAperture, RectangularAperture
+
+    optic = Optic()
+    optic.add_surface(index=0, z=-np.inf)
+    for i, (name, surface) in enumerate(model.surfaces.items(), start=1):
+        edge = model.apertures[name]
+        clear = None
+        if apertures:
+            clear = RadialAperture(edge.radius) if isinstance(edge, Circle) else RectangularAperture(*edge.bounds)
+        shape: dict[str, Any] = {"surface_type": "standard"}
+        if surface.even:
+            shape = {"surface_type": "even_asphere", "coefficients": [0.0, *surface.even]}
+        optic.add_surface(
+            index=i,
+            z=float(model.vertex(name)[2]),
+            radius=1.0 / surface.curvature,
+            conic=surface.conic,
+            material="mirror",
+            is_stop=name == model.spec.stop,
+            aperture=clear,
+            **shape,
+        )
+    optic.add_surface(index=len(model.surfaces) + 1, z=model.spec.image.z)
+    optic.add_wavelength(0.65, is_primary=True)
+    return optic
+
+
+def optiland_rays(position: np.ndarray, direction: np.ndarray) -> Any:
+    """``optiland`` rays from arrays (N, 3)."""
+    from optiland.rays import RealRays
+
+    n = len(position)
+    columns = [np.array(a[:, i]) for a in (position, np.broadcast_to(direction, position.shape)) for i in range(3)]
+    return RealRays(*columns, np.ones(n), np.full(n, 0.65))

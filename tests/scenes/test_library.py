@@ -1,0 +1,215 @@
+"""The files that come with the twin, the user's own files beside them, and the resolved job."""
+
+import copy
+import math
+import pickle
+from pathlib import Path
+
+import pytest
+
+from scenes.errors import InputError
+from scenes.load import (
+    CAMERAS,
+    DETECTORS,
+    EXAMPLES,
+    INSTRUMENTS,
+    LIBRARY,
+    library_names,
+    load_camera,
+    load_detector,
+    load_instrument,
+    load_job,
+)
+from scenes.resolved import resolve
+from scenes.spec import Spec
+from scenes.translate import validate
+from scenes.yaml_file import dump_yaml, parse_yaml
+
+CAMERA_NAMES = ("gf7", "gf7_conic", "monitor")
+# Radius, conic constant, vertex; metres.
+MIRRORS = {
+    "gf7": [
+        (-6.74535927468851, -1.5146420994346, 0.0),
+        (-2.65226629663464, -1.78965940473169, -2.01593047747168),
+        (-4.36068001118994, -0.448918835734448, 0.147067458984473),
+    ],
+    "gf7_conic": [
+        (-11.85178535, -4.581036949, 0.0),
+        (-3.90237429, -0.8906451483, -2.3),
+        (-5.797588591, -0.003887453761, 0.0),
+    ],
+    "monitor": [
+        (-9.58178858618494, -1.88256106323586, 0.0),
+        (-3.69617798657152, -1.69073840835311, -2.90544449353535),
+        (-5.97252346397626, 0.24630894248323, 0.184554234498138),
+    ],
+}
+
+
+def test_names() -> None:
+    assert set(CAMERA_NAMES) <= set(library_names(CAMERAS))
+    assert {"gf7_pair", "monitor_pair"} <= set(library_names(INSTRUMENTS))
+    assert "monitor_ccd" in library_names(DETECTORS)
+
+
+@pytest.mark.parametrize("name", CAMERA_NAMES)
+def test_cameras(name: str) -> None:
+    camera = load_camera(name)
+    assert camera.name == name
+    assert list(camera.mirrors) == ["M1", "M2", "M3"]
+    assert [(m.radius, m.conic, m.z) for m in camera.mirrors.values()] == MIRRORS[name]
+    assert camera.stop == "M2"
+    assert camera.field_bias == pytest.approx(math.radians(6))
+    assert camera.edge_margin == 0.005
+    assert camera.line.pitch == 7e-6
+
+
+def test_aspheric_terms() -> None:
+    camera = load_camera("gf7")
+    assert dict(camera.mirrors["M2"].aspheric) == {"A4": -0.000664476944265854, "A6": 0.00567297548549554}
+    assert load_camera("monitor").mirrors["M3"].aspheric["A6"] == 3.3291995834447e-05
+    assert not load_camera("gf7_conic").mirrors["M1"].aspheric
+
+
+@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
+def test_instruments(name: str) -> None:
+    instrument = load_instrument(name)
+    assert instrument.name == name
+    assert list(instrument.cameras) == ["forward", "backward"]
+    assert instrument.cameras["forward"].look == pytest.approx(math.radians(26))
+    assert instrument.cameras["backward"].look == pytest.approx(math.radians(-5))
+    assert instrument.monitor.frames == 9
+    # The sub-aperture lies inside the entrance pupil, and the area CCD inside the field.
+    for mounted in instrument.cameras.values():
+        camera = load_camera(mounted.camera)
+        reach = math.hypot(*mounted.pupil_offset) + instrument.monitor.return_face.aperture / 2
+        assert reach < camera.entrance_pupil / 2
+        assert instrument.monitor.field < camera.field.x
+
+
+def test_a_full_well_is_just_below_saturation() -> None:
+    detector = load_detector("monitor_ccd")
+    full = detector.full_well_e * detector.system_gain_dn_per_e + detector.offset_dn
+    assert 0.95 * 2**detector.bit_depth < full < 2**detector.bit_depth - 1
+
+
+@pytest.mark.parametrize(
+    ("load", "wrong", "right"),
+    [
+        (load_camera, "gf8", "gf7"),
+        (load_instrument, "gf7-pair", "gf7_pair"),
+        (load_detector, "monitor_cdd", "monitor_ccd"),
+    ],
+)
+def test_unknown_names(load: object, wrong: str, right: str) -> None:
+    with pytest.raises(InputError, match=f"did you mean '{right}'"):
+        load(wrong)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("stop: M2", "stop: M4", ["the stop is not one of the mirrors", "M1, M2, M3"]),
+        ("radius: -2.65226629663464 m", "radius: 0 m", ["radius of curvature cannot be zero"]),
+        ("conic: -1.78965940473169", "conic: high", ["conic: not a number"]),
+        ("conic: -1.78965940473169", "conic: .inf", ["conic: not a finite number"]),
+        ("A4: -0.000664476944265854 1/m^3", "A4: -0.000664476944265854", ["aspheric.A4: a number without a unit"]),
+        ("A4: -0.000664476944265854 1/m^3", "A5: 1 1/m^3", ["A5: unknown key", "A4, A6, A8"]),
+        ("focal_length: 5.52 m", "focal_length: -5.52 m", ["greater than zero"]),
+        ("focal_length: 5.52 m", "", ["'focal_length' is missing", "focal_length: 20 um"]),
+        ("wavelength: 650 nm", "wavelength: 650 um", ["at most 100 um"]),
+        ("name: gf7", "name: a b", ["name: not a name"]),
+    ],
+)
+def test_mistakes_in_a_camera(old: str, new: str, words: list[str], tmp_path: Path) -> None:
+    text = (LIBRARY / CAMERAS / "gf7.yaml").read_text("utf-8")
+    assert text.count(old) == 1
+    path = tmp_path / "own.yaml"
+    path.write_text(text.replace(old, new), "utf-8")
+    # What is missing is told at the first line of where it belongs.
+    line = text[: text.index(old if new else "name:")].count("\n") + 1
+    with pytest.raises(InputError) as caught:
+        load_camera(path)
+    message = str(caught.value)
+    for word in words:
+        assert word in message
+    assert caught.value.line == line
+
+
+def own_instrument(folder: Path, camera: str = "own_camera.yaml", detector: str = "monitor_ccd") -> Path:
+    """An instrument, its camera and a job in a folder of the user's; returns the job's path."""
+    text = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
+    text = text.replace("camera: gf7", f"camera: {camera}", 1).replace("detector: monitor_ccd", f"detector: {detector}")
+    (folder / "own_camera.yaml").write_text((LIBRARY / CAMERAS / "gf7_conic.yaml").read_text("utf-8"), "utf-8")
+    (folder / "own.yaml").write_text(text, "utf-8")
+    job = folder / "job.yaml"
+    job.write_text("instrument: own.yaml\n", "utf-8")
+    return job
+
+
+def test_own_files_are_found_from_the_file_that_names_them(tmp_path: Path) -> None:
+    job = resolve(own_instrument(tmp_path))
+    assert {name: camera.name for name, camera in job.cameras.items()} == {"own_camera.yaml": "gf7_conic", "gf7": "gf7"}
+    assert load_instrument("own.yaml", relative_to=tmp_path) == job.instrument
+
+
+def test_wrong_references_are_told_at_their_line(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"own\.yaml:4: cameras\.forward\.camera: no such name in cameras.*did you mean 'gf7'"
+    ):
+        resolve(own_instrument(tmp_path, camera="gf77"))
+    with pytest.raises(InputError, match=r"own\.yaml:4: cameras\.forward\.camera: no such file"):
+        resolve(own_instrument(tmp_path, camera="elsewhere.yaml"))
+    with pytest.raises(InputError, match=r"own\.yaml:11: monitor\.area_ccd\.detector: .*did you mean 'monitor_ccd'"):
+        resolve(own_instrument(tmp_path, detector="monitor_cc"))
+
+
+def test_a_resolved_job_reads_back_to_the_same_bits(tmp_path: Path) -> None:
+    resolved = resolve(EXAMPLES / "perturb.yaml")
+    config = tmp_path / "config.yaml"
+    config.write_text(resolved.to_yaml(), "utf-8")
+    again = resolve(config)
+    assert again == resolved
+    assert again.model_dump() == resolved.model_dump()
+    assert again.to_yaml() == resolved.to_yaml()
+    assert again.job.source.line(("perturb", "base/forward/M2")) is not None
+    assert resolved.frames == 9
+
+
+def test_a_resolved_job_needs_its_cameras(tmp_path: Path) -> None:
+    text = resolve(EXAMPLES / "perturb.yaml").to_yaml().replace("\n  gf7:\n", "\n  other:\n")
+    config = tmp_path / "config.yaml"
+    config.write_text(text, "utf-8")
+    with pytest.raises(InputError, match="camera 'gf7' of the instrument is missing"):
+        resolve(config)
+
+
+def specimens() -> list[Spec]:
+    found: list[Spec] = [load_job(EXAMPLES / "perturb.yaml"), resolve(EXAMPLES / "perturb.yaml")]
+    found += [load_camera(name) for name in library_names(CAMERAS)]
+    found += [load_instrument(name) for name in library_names(INSTRUMENTS)]
+    found += [load_detector(name) for name in library_names(DETECTORS)]
+    return found
+
+
+@pytest.mark.parametrize("spec", specimens(), ids=lambda spec: f"{type(spec).__name__}-{getattr(spec, 'name', '')}")
+def test_every_specification_is_a_value(spec: Spec) -> None:
+    for twin in (
+        pickle.loads(pickle.dumps(spec)),
+        copy.deepcopy(spec),
+        validate(type(spec), parse_yaml(dump_yaml(spec.plain()))),
+    ):
+        assert twin == spec
+        assert hash(twin) == hash(spec)
+        assert repr(twin) == repr(spec)
+    field = next(iter(type(spec).model_fields))
+    with pytest.raises(ValueError, match="frozen"):
+        setattr(spec, field, None)
+
+
+def test_mappings_cannot_be_changed() -> None:
+    camera = load_camera("gf7")
+    with pytest.raises(TypeError, match="cannot be changed"):
+        camera.mirrors["M4"] = camera.mirrors["M1"]
+    with pytest.raises(TypeError, match="cannot be changed"):
+        camera.mirrors.clear()

@@ -1,0 +1,135 @@
+"""Quantities: exact values, exact round trips, and refusals that say what is allowed."""
+
+import math
+import random
+
+import pytest
+
+from scenes.errors import Problem
+from scenes.units import (
+    ANGLE,
+    KINDS,
+    LENGTH,
+    PER_LENGTH3,
+    PER_LENGTH5,
+    POWER,
+    SCALE,
+    TEMPERATURE,
+    TEMPERATURE_DIFFERENCE,
+    TIME,
+    Kind,
+    format_quantity,
+    parse_quantity,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "value"),
+    [
+        ("20 um", LENGTH, 20e-6),
+        ("20um", LENGTH, 20e-6),
+        (" 20  µm ", LENGTH, 20e-6),
+        ("650 nm", LENGTH, 650e-9),
+        ("-11851.78535 mm", LENGTH, -11.85178535),
+        ("+.5 m", LENGTH, 0.5),
+        ("3e-2 m", LENGTH, 0.03),
+        ("0 m", LENGTH, 0.0),
+        ("10 ppm", SCALE, 10e-6),
+        ("1 %", SCALE, 0.01),
+        ("2 um/m", SCALE, 2e-6),
+        ("10 ms", TIME, 0.01),
+        ("2 mW", POWER, 0.002),
+        ("20 degC", TEMPERATURE, 293.15),
+        ("20 °C", TEMPERATURE, 293.15),
+        ("0.1 K", TEMPERATURE_DIFFERENCE, 0.1),
+        ("1e-3 1/m^3", PER_LENGTH3, 1e-3),
+        ("1 1/mm^3", PER_LENGTH3, 1e9),
+        ("2 m^-5", PER_LENGTH5, 2.0),
+        ("180 deg", ANGLE, math.pi),
+        ("1 rad", ANGLE, 1.0),
+    ],
+)
+def test_exact_values(text: str, kind: Kind, value: float) -> None:
+    assert parse_quantity(text, kind) == value
+
+
+def test_arcseconds() -> None:
+    assert parse_quantity("2 arcsec", ANGLE) == pytest.approx(2 * math.pi / 648000, rel=4e-16)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "problem", "suggestion"),
+    [
+        (2, ANGLE, "a number without a unit", None),
+        ("2", ANGLE, "a number without a unit", None),
+        (0, LENGTH, "a number without a unit", None),
+        ("0", LENGTH, "a number without a unit", None),
+        (True, LENGTH, "not a quantity", None),
+        (None, LENGTH, "not a quantity", None),
+        (["1 m"], LENGTH, "not a quantity", None),
+        (float("nan"), ANGLE, "not a finite number", None),
+        (float("inf"), ANGLE, "not a finite number", None),
+        ("nan arcsec", ANGLE, "not a finite number", None),
+        ("-inf m", LENGTH, "not a finite number", None),
+        ("1e999 m", LENGTH, "not a finite number", None),
+        ("2 arcsek", ANGLE, "unknown unit 'arcsek'", "arcsec"),
+        ("2 Um", LENGTH, "unknown unit 'Um'", "um"),
+        ("3 dB", SCALE, "unknown unit", None),
+        ("2 um", ANGLE, "'um' is a unit of a length, not of an angle", None),
+        ("2 ppm", ANGLE, "'ppm' is a unit of a relative change, not of an angle", None),
+        ("1 rad", SCALE, "'rad' is a unit of an angle, not of a relative change", None),
+        ("2 sec", ANGLE, "'sec' is a unit of a time, not of an angle", "arcsec"),
+        ("2 degC", TEMPERATURE_DIFFERENCE, "not of a temperature difference", None),
+        ("21/m^3", PER_LENGTH3, "not a number with a unit", None),
+        ("9**9**9 m", LENGTH, "not a number with a unit", None),
+        ("__import__('os') m", LENGTH, "not a number with a unit", None),
+        ("1 m^99999999", LENGTH, "not a number with a unit", None),
+        ("1 " + "m*" * 500 + "m", LENGTH, "not a number with a unit", None),
+        ("9" * 10_000 + " m", LENGTH, "not a number with a unit", None),
+        ("٣ m", LENGTH, "not a number with a unit", None),
+        ("two um", LENGTH, "not a number with a unit", None),
+        ("", LENGTH, "not a number with a unit", None),
+    ],
+)
+def test_refused(text: object, kind: Kind, problem: str, suggestion: str | None) -> None:
+    with pytest.raises(Problem) as caught:
+        parse_quantity(text, kind)
+    assert problem in str(caught.value)
+    assert caught.value.suggestion == suggestion
+    assert caught.value.allowed is not None
+    assert kind.example in caught.value.allowed
+
+
+def test_text_reads_back_to_the_same_bits() -> None:
+    generator = random.Random(1)
+    checked = 0
+    for kind in (*KINDS, TEMPERATURE_DIFFERENCE):
+        values = [generator.uniform(-1, 1) * 10 ** generator.uniform(-12, 8) for _ in range(100)]
+        for value in [*values, 0.0, 5e-324, -1.7976931348623157e308]:
+            assert parse_quantity(format_quantity(value, kind), kind) == value
+            checked += 1
+    assert checked > 1000
+    assert math.copysign(1.0, parse_quantity(format_quantity(-0.0, LENGTH), LENGTH)) == -1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("2 arcsec", ANGLE),
+        ("-1.5 arcsec", ANGLE),
+        ("26 deg", ANGLE),
+        ("20 um", LENGTH),
+        ("650 nm", LENGTH),
+        ("-6.74535927468851 m", LENGTH),
+        ("10 ppm", SCALE),
+        ("20 degC", TEMPERATURE),
+    ],
+)
+def test_text_comes_out_as_it_went_in(text: str, kind: Kind) -> None:
+    assert format_quantity(parse_quantity(text, kind), kind) == text
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_no_text_for_what_is_not_finite(value: float) -> None:
+    with pytest.raises(ValueError, match="has no text"):
+        format_quantity(value, LENGTH)

@@ -1,0 +1,136 @@
+"""Files that nobody has vetted: everything but plain data is refused, with file and line."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from scenes.errors import InputError
+from scenes.yaml_file import LARGEST_BYTES, dump_yaml, parse_yaml, read_yaml
+
+BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        (BOMB, 1, "anchors are not allowed, found &a"),
+        ("x: 1\ny: *x\n", 2, "aliases are not allowed, found *x"),
+        ("a: {b: 1}\nc:\n  <<: {d: 2}\n", 3, "merge keys are not allowed"),
+        ("x: 1\ny: !!python/object/apply:os.system [ls]\n", 2, "tags are not allowed"),
+        ("x: !foo 1\n", 1, "tags are not allowed, found !foo"),
+        ("x: !!int '3'\n", 1, "tags are not allowed"),
+        ("! x: 1\n", 1, "tags are not allowed"),
+        ("%TAG ! tag:example.com,2000:\n---\nx: 1\n", 2, "%TAG"),
+        ("x: 1\ny: 2\nx: 3\n", 3, "duplicate key 'x', first on line 1"),
+        ("x:\n  y: 1\n  'y': 3\n", 3, "duplicate key 'y', first on line 2"),
+        ("x: 1\n---\ny: 2\n", 2, "a second document"),
+        ("x: 1\n? [1, 2]\n: 3\n", 2, "a key must be a plain name"),
+        ("x: [1, 2\ny: 3\n", 2, "not valid YAML"),
+        ("x: 1\n\ty: 3\n", 2, "not valid YAML"),
+        ("x: \x01\n", None, "not valid YAML"),
+        ("", 1, "the file is empty"),
+        ("# only a comment\n", 1, "the file is empty"),
+        ("---\n...\n", 1, "the file is empty"),
+        ("[" * 40 + "]" * 40, 1, "nested too deeply"),
+        ("[" * 500_000, 1, "nested too deeply"),
+    ],
+)
+def test_refused(text: str, line: int | None, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "input.yaml"
+    path.write_text(text, "utf-8")
+    with pytest.raises(InputError) as caught:
+        read_yaml(path)
+    assert caught.value.line == line
+    assert words in str(caught.value)
+    assert str(caught.value).startswith(str(path) + (f":{line}: " if line else ": "))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_yaml(tmp_path / "missing.yaml")
+    with pytest.raises(InputError, match="is a directory"):
+        read_yaml(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="Not a directory"):
+        read_yaml(tmp_path / "file" / "input.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_yaml("a\0b.yaml")
+    with pytest.raises(InputError, match="not a regular file"):
+        read_yaml("/dev/zero")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_no_permission(tmp_path: Path) -> None:
+    path = tmp_path / "input.yaml"
+    path.write_text("x: 1")
+    path.chmod(0)
+    with pytest.raises(InputError, match="Permission denied"):
+        read_yaml(path)
+
+
+def test_not_utf8_gives_the_line(tmp_path: Path) -> None:
+    path = tmp_path / "input.yaml"
+    path.write_bytes(b"x: 1\ny: \xff\n")
+    with pytest.raises(InputError, match=r"input\.yaml:2: not UTF-8 text: byte 0xff"):
+        read_yaml(path)
+
+
+def test_too_large(tmp_path: Path) -> None:
+    path = tmp_path / "input.yaml"
+    path.write_bytes(b"#" * (LARGEST_BYTES + 1))
+    with pytest.raises(InputError, match="too large; allowed: at most 1 MB"):
+        read_yaml(path)
+
+
+def test_plain_data_with_lines() -> None:
+    yaml = parse_yaml("a: 1\nb:\n  - 2 um\n  - {c: .nan, d: -.inf}\n'on': true\nn: ~\ntext: '1'\nno: 1e3\n")
+    assert yaml.data["a"] == 1
+    assert yaml.data["b"][0] == "2 um"
+    assert str(yaml.data["b"][1]["c"]) == "nan"
+    assert yaml.data["b"][1]["d"] == float("-inf")
+    assert [yaml.data[key] for key in ("on", "n", "text", "no")] == [True, None, "1", 1000.0]
+    assert yaml.lines["b", 1, "d"] == 4
+    assert yaml.lines["on",] == 5
+
+
+def test_a_byte_order_mark_is_fine(tmp_path: Path) -> None:
+    path = tmp_path / "input.yaml"
+    path.write_bytes(b"\xef\xbb\xbfx: 1\n")
+    assert read_yaml(path).data == {"x": 1}
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "",
+        "null",
+        "1",
+        "1e3",
+        ".5",
+        "-.inf",
+        ".nan",
+        "true",
+        "a: b",
+        "# no",
+        " x ",
+        "*a",
+        "&a",
+        "!t",
+        "a\nb",
+        "ü µm",
+        "[",
+        "<<",
+        "-",
+    ],
+)
+def test_awkward_text_survives_a_round_trip(value: str) -> None:
+    data = {"key": value, "list": [value, 1], value or "k": {"x": [[value]]}}
+    assert parse_yaml(dump_yaml(data)).data == data
+
+
+@pytest.mark.parametrize("value", [0.1, 1e-300, 1.7976931348623157e308, -0.0, 3, 10**20, 1e16, True, None, 5e-324])
+def test_numbers_survive_a_round_trip(value: object) -> None:
+    found = parse_yaml(dump_yaml({"x": value})).data["x"]
+    assert repr(found) == repr(value)

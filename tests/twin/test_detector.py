@@ -1,0 +1,171 @@
+"""The detector against the EMVA 1288 model that it claims to be.
+
+Every statistical limit is a two-sided chi-square (or normal) quantile with a false-alarm rate of 1e-6 per test.
+"""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from twin.detector import EmvaDetector, FixedPattern
+
+FALSE_ALARM = 1e-6
+SHEET = {
+    "quantum_efficiency": 0.6,
+    "system_gain_dn_per_e": 0.06,
+    "dark_noise_e": 8.0,
+    "dark_current_e_per_s": 20.0,
+    "full_well_e": 60000.0,
+    "prnu": 0.01,
+    "dsnu_e": 5.0,
+    "bit_depth": 12,
+    "offset_dn": 64.0,
+}
+
+
+def detector(**changes):
+    return EmvaDetector(**{**SHEET, **changes})
+
+
+def counter(**changes):
+    """A detector that writes down its electrons: one DN per electron, nothing else."""
+    ideal = {"system_gain_dn_per_e": 1.0, "dark_noise_e": 0.0, "dark_current_e_per_s": 0.0, "offset_dn": 0.0}
+    return detector(**{**ideal, "prnu": 0.0, "dsnu_e": 0.0, "bit_depth": 16, **changes})
+
+
+def uniform(*shape):
+    return FixedPattern(np.ones(shape), np.zeros(shape))
+
+
+@pytest.mark.parametrize("mean_e", [0.3, 3.0, 9.9, 10.1, 60.0, 2500.0, 40000.0])
+def test_electrons_are_poisson(mean_e):
+    sensor = counter()
+    frames = sensor.expose(np.full((64, 64), mean_e / 0.6), uniform(64, 64), 64, 0.0, seed=11)
+    electrons = frames.ravel()
+    law = stats.poisson(mean_e)
+    edges = np.unique(law.ppf(np.linspace(0, 1, 42)[1:-1]))  # some 40 bins of equal probability, or single counts
+    observed = np.bincount(np.searchsorted(edges, electrons), minlength=edges.size + 1)
+    expected = np.diff(np.concatenate([[0.0], law.cdf(edges), [1.0]])) * electrons.size
+    keep = expected > 0
+    chi2 = np.sum((observed[keep] - expected[keep]) ** 2 / expected[keep])
+    assert observed[~keep].sum() == 0
+    assert stats.chi2.sf(chi2, keep.sum() - 1) > FALSE_ALARM
+
+
+@pytest.mark.parametrize("photons", [0.0, 500.0, 60000.0])
+def test_photon_transfer(photons):
+    """Temporal mean and variance at three points of the photon transfer line, quantisation included.
+
+    Read noise of 1 DN, so that 1/12 DN^2 for the quantisation holds to exp(-2 pi^2) = 3e-9 and not only to per cent.
+    """
+    sensor = detector(prnu=0.0, dsnu_e=0.0, dark_noise_e=16.0)
+    frames = sensor.expose(np.full((48, 48), photons), uniform(48, 48), 200, 0.5, seed=5).astype(float)
+    noise = sensor.noise_model(0.5)
+    mean = sensor.expected_dn(np.full((1, 1), photons), 0.5)[0, 0]
+    variance = noise.temporal_variance_dn2(mean, 1)
+    count = frames.size
+    assert abs(frames.mean() - mean) < stats.norm.isf(FALSE_ALARM / 2) * np.sqrt(variance / count)
+    ratio = np.sum((frames - mean) ** 2) / variance
+    assert stats.chi2.ppf(FALSE_ALARM / 2, count) < ratio < stats.chi2.isf(FALSE_ALARM / 2, count)
+
+
+def test_fixed_pattern_survives_averaging_and_is_the_stated_one():
+    sensor = detector()
+    pattern = sensor.fixed_pattern((96, 96), 3)
+    for values, sigma in ((pattern.gain - 1, 0.01), (pattern.offset_e, 5.0)):
+        chi2 = np.sum((values / sigma) ** 2)
+        assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, values.size) < 1 - FALSE_ALARM / 2
+    frames = sensor.expose(np.full((96, 96), 50000.0), pattern, 100, 0.1, seed=9).astype(float)
+    mean = sensor.expected_dn(np.full((96, 96), 50000.0), 0.1, pattern)
+    variance = sensor.noise_model(0.1).temporal_variance_dn2(mean, 100)
+    chi2 = np.sum((frames.mean(axis=0) - mean) ** 2 / variance)
+    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, mean.size) < 1 - FALSE_ALARM / 2
+    # without the pattern the same comparison must fail: the test above has seen the pattern
+    flat = sensor.expected_dn(np.full((96, 96), 50000.0), 0.1)
+    assert np.sum((frames.mean(axis=0) - flat) ** 2 / variance) > 10 * mean.size
+
+
+def test_same_seed_same_bits_whatever_the_threads_and_the_company():
+    sensor = detector()
+    photons = np.random.default_rng(0).uniform(0, 3e4, (3, 2, 40, 30))
+    pattern = sensor.fixed_pattern((2, 40, 30), 1)
+    one = sensor.expose(photons, pattern, 5, 0.1, seed=7, threads=1)
+    assert one.shape == (3, 2, 5, 40, 30)
+    assert one.dtype == np.uint16
+    assert np.array_equal(one, sensor.expose(photons, pattern, 5, 0.1, seed=7, threads=3))
+    assert np.array_equal(one[:1], sensor.expose(photons[:1], pattern, 5, 0.1, seed=7))
+    assert np.array_equal(one, sensor.expose(photons, pattern, 5, 0.1, seed=np.random.SeedSequence(7)))
+    other = sensor.expose(photons, pattern, 5, 0.1, seed=8)
+    assert np.mean(one != other) > 0.9
+    assert np.mean(one[:, :, 0] != one[:, :, 1]) > 0.9
+    assert np.array_equal(sensor.fixed_pattern((2, 9, 9), 4).gain, sensor.fixed_pattern((2, 9, 9), 4).gain)
+
+
+def test_images_are_independent():
+    """Neighbouring images of one call: correlation of their noise within 5 sigma of zero (false alarm 6e-7)."""
+    sensor = counter()
+    frames = sensor.expose(np.full((2, 100, 100), 100.0), uniform(100, 100), 4, 0.0, seed=1).astype(float) - 60.0
+    correlation = np.mean(frames[0] * frames[1]) / 60.0
+    assert abs(correlation) < 5 / np.sqrt(frames[0].size)
+
+
+def test_well_and_converter_clip():
+    full = counter(full_well_e=1000.0)
+    frames = full.expose(np.full((32, 32), 1e5), uniform(32, 32), 2, 0.0, seed=1)
+    assert np.all(frames == 1000)
+    assert full.saturated(frames).pixels == 32 * 32
+    narrow = detector(bit_depth=8, full_well_e=1e6)
+    frames = narrow.expose(np.full((2, 32, 32), [[[1e5]], [[100.0]]]), uniform(32, 32), 2, 0.0, seed=1)
+    assert np.all(frames[0] == 255)
+    report = narrow.saturated(frames)
+    assert report.pixels.tolist() == [1024, 0]
+    assert report.any
+    assert narrow.saturation_dn == 255
+    # dark noise below zero grey values is clipped, not wrapped around
+    dark = detector(offset_dn=0.0, dark_noise_e=100.0).expose(np.zeros((32, 32)), uniform(32, 32), 2, 0.0, seed=1)
+    assert dark.min() == 0
+    assert dark.max() < 100
+
+
+def test_expected_dn_by_hand():
+    value = detector().expected_dn(np.array([[1000.0]]), 2.0)
+    assert value[0, 0] == pytest.approx(64 + 0.06 * (600 + 40), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("quantum_efficiency", 0.0),
+        ("quantum_efficiency", 1.2),
+        ("system_gain_dn_per_e", -1.0),
+        ("dark_noise_e", float("nan")),
+        ("dark_current_e_per_s", float("inf")),
+        ("full_well_e", 0.0),
+        ("prnu", 0.5),
+        ("dsnu_e", -1.0),
+        ("bit_depth", 17),
+        ("bit_depth", 11.5),
+        ("offset_dn", 5000.0),
+        ("prnu", "1%"),
+    ],
+)
+def test_impossible_data_sheets_name_the_field(field, value):
+    with pytest.raises(ValueError, match=field):
+        detector(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("photons", "frames", "exposure", "seed", "words"),
+    [
+        (np.full((4, 4), -1.0), 1, 0.1, 1, "photons"),
+        (np.full((4, 4), np.nan), 1, 0.1, 1, "photons"),
+        (np.full((4, 4), 1e13), 1, 0.1, 1, "photons"),
+        (np.zeros((5, 4)), 1, 0.1, 1, "fixed pattern"),
+        (np.zeros((4, 4)), 0, 0.1, 1, "frames"),
+        (np.zeros((4, 4)), 1, -0.1, 1, "exposure_s"),
+        (np.zeros((4, 4)), 1, 0.1, -1, "seed"),
+    ],
+)
+def test_impossible_exposures_are_explained(photons, frames, exposure, seed, words):
+    with pytest.raises(ValueError, match=words):
+        detector().expose(photons, uniform(4, 4), frames, exposure, seed)

@@ -1,0 +1,112 @@
+"""The doctor, and that a crashing child cannot take it with it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from optics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
+from twin import doctor
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(*arguments: str, **variables: str) -> "subprocess.CompletedProcess[str]":
+    environment = {**os.environ, **variables}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=120, check=False)
+
+
+def test_this_machine_is_ready() -> None:
+    result = run("-m", "twin.doctor", "--quick", "--json")
+    report = json.loads(result.stdout)
+    failed = [check for check in report["checks"] if check["status"] == "failed"]
+    assert result.returncode == 0, failed
+    assert report["ok"]
+    names = [check["name"] for check in report["checks"]]
+    assert {"Python", "system", "libatomic", "LLVM", "kernel", "render llvm_ad_mono", "mitsuba"} <= set(names)
+    assert len(names) > 15
+
+
+def test_a_missing_library_is_reported_and_fails() -> None:
+    result = run("-m", "twin.doctor", "--quick", **{VARIABLE: "/no/such/libLLVM.so"})
+    assert result.returncode == 1
+    assert "not ready" in result.stdout
+    assert "/no/such/libLLVM.so" in result.stdout.replace("\n", "")
+    assert "Traceback" not in result.stdout + result.stderr
+
+
+def test_a_crash_is_a_readable_failure() -> None:
+    with pytest.raises(RuntimeError, match="crashed with SIGABRT"):
+        doctor.run_probe(["-c", "import os; os.abort()"])
+
+
+def test_an_llvm_that_aborts_is_named_as_the_cause() -> None:
+    code = "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select: fmaximum\\n'); sys.stderr.flush(); os.abort()"
+    with pytest.raises(RuntimeError, match=r"needs LLVM 17 or newer.*Cannot select"):
+        doctor.run_probe(["-c", code])
+
+
+def test_a_hang_ends() -> None:
+    with pytest.raises(RuntimeError, match=r"no answer after 0\.5 s"):
+        doctor.run_probe(["-c", "import time; time.sleep(60)"], timeout_s=0.5)
+
+
+def test_a_child_without_an_answer() -> None:
+    with pytest.raises(RuntimeError, match="exit code 3 and no answer"):
+        doctor.run_probe(["-c", "raise SystemExit(3)"])
+
+
+def test_an_error_in_the_child_is_passed_on() -> None:
+    with pytest.raises(RuntimeError, match="no_such_variant"):
+        doctor.run_probe(["-m", "twin.probe", "render", "no_such_variant"])
+
+
+def test_the_variant_is_the_one_asked_for() -> None:
+    assert doctor.run_probe(["-m", "twin.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
+
+
+def test_every_dependency_is_pinned() -> None:
+    pins = doctor.pinned()
+    assert len(pins) > 10
+    assert pins["mitsuba"] == "3.9.1"
+    assert pins["drjit"] == "1.5.0"
+
+
+def test_llvm_is_the_one_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    assert ensure_llvm() == find_llvm()
+    assert os.environ[VARIABLE] == str(find_llvm())
+
+
+def test_a_users_llvm_is_respected(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own = tmp_path / "libLLVM.so"
+    own.touch()
+    monkeypatch.setenv(VARIABLE, str(own))
+    assert ensure_llvm() == own
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "missing.so"))
+    with pytest.raises(LibraryMissing, match=VARIABLE):
+        ensure_llvm()
+
+
+def test_libatomic_missing_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_library(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr("ctypes.CDLL", no_library)
+    with pytest.raises(LibraryMissing, match="apt install libatomic1"):
+        ensure_llvm()
+
+
+def test_drjit_imported_too_early_is_told() -> None:
+    """Either drjit found a usable LLVM by itself, or importing optics after it says what to do."""
+    code = "import drjit; drjit.has_backend(drjit.JitBackend.LLVM); import optics"
+    environment = {key: value for key, value in os.environ.items() if key != VARIABLE}
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment, timeout=60, check=False
+    )
+    assert result.returncode == 0 or "import optics first" in result.stderr

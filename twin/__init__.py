@@ -1,0 +1,1 @@
+"""Perturb, render, detect: the commands of the twin and their reports."""

@@ -1,0 +1,243 @@
+"""Is this machine ready? `python -m twin.doctor [--quick] [--json]`.
+
+Reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies, and runs a small float64 kernel
+and a small render in child processes, so that an unsuitable LLVM, which aborts the process that uses it, cannot take
+the doctor with it. Exit code 0 if the twin can run, 1 if not.
+"""
+
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+DISTRIBUTION = "space-camera-twin"
+OLDEST_PYTHON = (3, 11)
+PROBE_TIMEOUT_S = 120.0
+"""A probe takes about a second; this is only reached when something hangs."""
+
+Status = Literal["ok", "note", "failed"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the doctor's report. Only status "failed" makes the exit code 1; "note" is worth reading, no more."""
+
+    name: str
+    status: Status
+    detail: str
+
+
+def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[str, Any]:
+    """Run Python with these arguments in a child process and return the JSON object on its last line of stdout.
+
+    Args:
+        arguments: what follows the interpreter, for instance ["-m", "twin.probe", "kernel"].
+        timeout_s: the child is killed after this many seconds.
+
+    Raises:
+        RuntimeError: it crashed, hung, failed, or answered no JSON; the message is fit to show to a user.
+    """
+    root = str(Path(__file__).resolve().parent.parent)
+    environment = dict(os.environ)
+    environment["PYTHONPATH"] = os.pathsep.join(part for part in (root, environment.get("PYTHONPATH", "")) if part)
+    try:
+        child = subprocess.run(
+            [sys.executable, *arguments],
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(f"no answer after {timeout_s:g} s") from error
+    if child.returncode < 0:
+        number = -child.returncode
+        name = signal.Signals(number).name if number in set(signal.Signals) else str(number)
+        hint = "; Dr.Jit needs LLVM 17 or newer" if "Cannot select" in child.stderr else ""
+        raise RuntimeError(f"the process crashed with {name}{hint}{_last_words(child.stderr)}")
+    try:
+        answer = json.loads(child.stdout.strip().splitlines()[-1])
+    except (IndexError, json.JSONDecodeError) as error:
+        raise RuntimeError(f"exit code {child.returncode} and no answer{_last_words(child.stderr)}") from error
+    if "error" in answer:
+        raise RuntimeError(str(answer["error"]))
+    result: dict[str, Any] = answer["result"]
+    return result
+
+
+def examine(quick: bool = False) -> list[Check]:
+    """All checks, in the order of the report.
+
+    Args:
+        quick: leave out what the twin can do without: the GPU and the second Mitsuba variant.
+    """
+    checks = [_python(), _system(), _libatomic(), _llvm()]
+    checks.append(
+        _probe(
+            "kernel",
+            ["kernel"],
+            lambda r: f"float64 on LLVM {r['version']}, Dr.Jit {r['drjit']}, error {r['error']:.1e}",
+        )
+    )
+    for variant in ("llvm_ad_mono",) if quick else ("llvm_ad_mono", "llvm_ad_rgb"):
+        checks.append(
+            _probe(f"render {variant}", ["render", variant], lambda r: f"Mitsuba {r['mitsuba']}, {r['variant']}")
+        )
+    if not quick:
+        checks.append(_gpu())
+    return [*checks, *_pins()]
+
+
+def _python() -> Check:
+    good = sys.version_info >= OLDEST_PYTHON
+    needed = "" if good else f"; needs {'.'.join(map(str, OLDEST_PYTHON))} or newer"
+    return Check("Python", "ok" if good else "failed", f"{platform.python_version()} at {sys.executable}{needed}")
+
+
+def _system() -> Check:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return Check("system", "ok", f"{platform.platform()}, {usable} of {os.cpu_count()} cores usable")
+
+
+def _libatomic() -> Check:
+    try:
+        from optics.llvm import check_libatomic
+
+        check_libatomic()
+    except ImportError as error:
+        return Check("libatomic", "failed", str(error))
+    return Check("libatomic", "ok", "loads" if sys.platform == "linux" else "not needed here")
+
+
+def _llvm() -> Check:
+    chosen = "named by DRJIT_LIBLLVM_PATH" if os.environ.get("DRJIT_LIBLLVM_PATH") else "from karellen-llvm-core"
+    try:
+        from optics.llvm import ensure_llvm, find_llvm
+
+        library = ensure_llvm()
+    except ImportError as error:
+        return Check("LLVM", "failed", str(error))
+    if library is None:
+        return Check("LLVM", "note", "left to Dr.Jit's own search")
+    # Importing optics sets the variable, so what it holds now may come from either.
+    chosen = "from karellen-llvm-core" if library == find_llvm() else chosen
+    return Check("LLVM", "ok", f"{library} ({chosen})")
+
+
+def _probe(name: str, arguments: list[str], describe: Any) -> Check:
+    try:
+        return Check(name, "ok", describe(run_probe(["-m", "twin.probe", *arguments])))
+    except RuntimeError as error:
+        return Check(name, "failed", str(error))
+
+
+def _gpu() -> Check:
+    try:
+        result = run_probe(["-m", "twin.probe", "gpu"])
+    except RuntimeError as error:
+        return Check("GPU", "note", f"--backend cuda does not work: {error}")
+    if not result["available"]:
+        return Check("GPU", "note", "none that Dr.Jit can use; --backend cuda is not available")
+    return Check(
+        "GPU", "ok", f"{_gpu_name()}, CUDA {result['version']}, compute capability {result['compute_capability']}"
+    )
+
+
+def _gpu_name() -> str:
+    command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=20.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "NVIDIA GPU"
+    return ", ".join(answer.stdout.split("\n")).strip(", ") or "NVIDIA GPU"
+
+
+def pinned() -> dict[str, str]:
+    """Name -> version of every dependency that pyproject.toml pins and that this platform uses.
+
+    Read from the installed distribution, or from pyproject.toml when the twin runs from a folder without being
+    installed.
+    """
+    try:
+        requirements = [line for line in importlib.metadata.requires(DISTRIBUTION) or [] if "extra ==" not in line]
+    except importlib.metadata.PackageNotFoundError:
+        project = Path(__file__).resolve().parent.parent / "pyproject.toml"
+        requirements = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"] if project.exists() else []
+    pins = {}
+    for line in requirements:
+        match = re.match(r"([A-Za-z0-9._-]+)\s*==\s*([^\s;]+)", line)
+        # The only platform marker in use is LLVM's.
+        elsewhere = "platform_machine" in line and not (sys.platform == "linux" and platform.machine() == "x86_64")
+        if match and not elsewhere:
+            pins[match[1]] = match[2]
+    return pins
+
+
+def _pins() -> list[Check]:
+    checks = []
+    for name, version in pinned().items():
+        try:
+            found = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            checks.append(Check(name, "failed", f"not installed; pip install {name}=={version}"))
+            continue
+        if found != version:
+            checks.append(Check(name, "note", f"{found}, tested with {version}"))
+        else:
+            checks.append(Check(name, "ok", found))
+    return checks
+
+
+def _show(checks: list[Check], good: bool) -> None:
+    styles = {"ok": "green", "note": "yellow", "failed": "bold red"}
+    table = Table(title="space camera twin: doctor", title_justify="left")
+    table.add_column("check")
+    table.add_column("status")
+    table.add_column("detail", overflow="fold")
+    for check in checks:
+        table.add_row(check.name, Text(check.status, style=styles[check.status]), Text(check.detail))
+    console = Console()
+    console.print(table)
+    console.print("ready" if good else "not ready: see the lines marked failed")
+
+
+def main(
+    quick: Annotated[bool, typer.Option("--quick", help="Leave out the GPU and the second Mitsuba variant.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False,
+) -> None:
+    """Check Python, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies. Exit code 0 if the twin can run, 1
+    if not.
+    """
+    checks = examine(quick)
+    good = all(check.status != "failed" for check in checks)
+    if as_json:
+        report = {"ok": good, "checks": [asdict(check) for check in checks]}
+        sys.stdout.write(json.dumps(report, indent=2) + "\n")
+    else:
+        _show(checks, good)
+    raise typer.Exit(0 if good else 1)
+
+
+def _last_words(stderr: str) -> str:
+    """What the child said went wrong: LLVM's own error line if there is one, else the last line."""
+    lines = [line.strip() for line in stderr.splitlines() if line.strip()]
+    fatal = [line for line in lines if "LLVM ERROR" in line] or lines[-1:]
+    return f": {fatal[0][:300]}" if fatal else ""
+
+
+if __name__ == "__main__":
+    typer.run(main)

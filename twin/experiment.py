@@ -1,0 +1,144 @@
+"""The monitoring experiment: perturb the instrument, render what its area CCDs record, and let the analysis recover
+it.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from analysis.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitoring import MonitorGeometry
+from analysis.spot_template import SpotTemplate
+from optics.backend import Backend
+from optics.tree import Motion, State
+from scenes.instrument_model import Instrument, build_instrument
+from scenes.job import JobSpec, noll
+from scenes.resolved import ResolvedJob
+from twin.detector import EmvaDetector, FixedPattern
+from twin.monitor import MonitorPath
+from twin.motions import line_family
+from twin.truth import Truth, trace_truth, truth_jacobian
+
+TEMPLATE_MARGIN = 40
+"""Pixels by which the calibrated spot shape is larger than the CCD, so that it can be shifted over it."""
+
+EMVA_KEYS = (
+    "quantum_efficiency",
+    "system_gain_dn_per_e",
+    "dark_noise_e",
+    "dark_current_e_per_s",
+    "full_well_e",
+    "prnu",
+    "dsnu_e",
+    "bit_depth",
+    "offset_dn",
+)
+
+
+class MonitorExperiment:
+    """An instrument with its detectors and its nominal calibration; whatever is derived is worked out once, on demand.
+
+    Args:
+        resolved: the job with everything it names; its perturbation is not used here.
+        backend: where to trace.
+    """
+
+    def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
+        self.backend = backend
+        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
+        self.detector = EmvaDetector(**{key: getattr(resolved.detector, key) for key in EMVA_KEYS})
+        self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
+        self.path = MonitorPath(self.instrument, backend)
+
+    @cached_property
+    def wide_photons(self) -> np.ndarray:
+        """Expected photons of the unperturbed instrument with the template's margin, (C, rows + 2m, columns + 2m)."""
+        return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN)[0]
+
+    @property
+    def nominal_photons(self) -> np.ndarray:
+        """Expected photons per pixel and frame of the unperturbed instrument, (C, rows, columns)."""
+        m = TEMPLATE_MARGIN
+        return self.wide_photons[:, m:-m, m:-m]
+
+    @cached_property
+    def nominal_truth(self) -> Truth:
+        """Principal distances and intersection angle of the unperturbed instrument."""
+        return trace_truth(self.instrument, self.backend, [{}])
+
+    @cached_property
+    def calibration(self) -> MonitorCalibration:
+        """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
+        families = {name: line_family(name) for name in self.instrument.cameras}
+        motions = [motion for family in families.values() for motion in family]
+        spots = self.path.spot_jacobian(motions)
+        truth = truth_jacobian(self.instrument, self.backend, motions)
+        cameras = {}
+        for k, (name, family) in enumerate(families.items()):
+            own = slice(4 * k, 4 * k + 4)
+            cameras[name] = CameraCalibration(
+                geometry=self.geometry(name),
+                look_rad=self.instrument.spec.cameras[name].look,
+                spot_jacobian=spots[2 * k : 2 * k + 2, :, own].reshape(4, 4),
+                parameter_jacobian=truth[name][:, own],
+                motions=tuple(motion.label for motion in family),
+            )
+        template = SpotTemplate.stack([self._template(image) for image in self.wide_photons])
+        return MonitorCalibration(cameras, template, self.detector.noise_model(self.exposure))
+
+    def geometry(self, camera: str) -> MonitorGeometry:
+        """Calibrated numbers for the formulas: principal distance, plate scale across the line, distortion, L, pixel.
+
+        The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
+        """
+        x, y, *_ = line_family(camera)
+        by_x, by_y = truth_jacobian(self.instrument, self.backend, (x, y))[camera].T
+        return MonitorGeometry(
+            focal_length_m=self.nominal_truth.principal_distance[camera],
+            separation_m=self.instrument.separation[camera],
+            pixel_m=self.path.pitch,
+            field_alpha_rad=0.0,
+            field_beta_rad=self.instrument.spec.monitor.field,
+            focal_length_x_m=float(1.0 / abs(by_x[0])),
+            d_f_per_alpha_m=float(by_x[3] / by_x[0]),
+            d_gamma_per_beta=float(by_y[2] / by_y[1]),
+        )
+
+    def _template(self, image: np.ndarray) -> SpotTemplate:
+        """Calibrated shape of one spot; its centre is the energy centroid of the core (above 5% of the peak)."""
+        core = np.where(image > 0.05 * image.max(), image, 0.0)
+        row = float(core.sum(axis=1) @ np.arange(image.shape[0]) / core.sum())
+        column = float(core.sum(axis=0) @ np.arange(image.shape[1]) / core.sum())
+        return SpotTemplate.from_image(image, row, column, self.path.shape)
+
+    def pattern(self, seed: int) -> FixedPattern:
+        """PRNU and DSNU of all area CCDs; the same before and after."""
+        return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), _stream(seed, 0))
+
+    def frames_before(self, frames: int, seed: int) -> np.ndarray:
+        """Frames of the nominal state, uint16 (C, frames, rows, columns)."""
+        photons = self.nominal_photons
+        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 1))
+
+    def frames_after(self, photons: np.ndarray, frames: int, seed: int) -> np.ndarray:
+        """Frames of perturbed states with ``photons`` (S, C, rows, columns): uint16 (S, C, frames, rows, columns)."""
+        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 2))
+
+    def expected_frames(self, photons: np.ndarray) -> np.ndarray:
+        """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""
+        return self.detector.expected_dn(photons, self.exposure)
+
+
+def _stream(seed: int, number: int) -> np.random.SeedSequence:
+    """One of the independent random streams of a seed."""
+    return np.random.SeedSequence(seed, spawn_key=(number,))
+
+
+def state_of(job: JobSpec) -> State:
+    """The perturbed state that a job describes."""
+    return {
+        path: Motion(p.rotate, p.shift, p.pivot, p.scale, {noll(term): value for term, value in p.figure.items()})
+        for path, p in job.perturb.items()
+    }

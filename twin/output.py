@@ -1,0 +1,119 @@
+"""Files of a run folder."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tifffile
+import xarray as xr
+
+from twin.report import write_report
+from twin.results import RenderRun
+from twin.run_folder import MANIFEST, RunFolder
+from twin.scene_file import write_scene
+
+PACKAGES = (
+    "space-camera-twin",
+    "drjit",
+    "mitsuba",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "trimesh",
+    "karellen-llvm-core",
+)
+PREVIEW_SCALE = 4
+STRETCH = 30.0
+"""Steepness of the asinh stretch of previews: it shows the faint diffraction rings beside the core."""
+
+
+def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -> None:
+    """Write all files of a run into an open run folder.
+
+    Args:
+        run: what to write.
+        folder: where.
+        started: time of the start, seconds since the epoch.
+        clock: seconds that the computation took.
+    """
+    channels = run.experiment.path.channels
+    folder.write_text("config.yaml", run.resolved.to_yaml())
+    folder.write_json("truth.json", run.truth_dict())
+    folder.write_json("recovered.json", run.recovered_dict())
+    folder.write_json("crosstalk.json", {name: table.to_dict() for name, table in run.crosstalk.items()})
+    for i, channel in enumerate(channels):
+        for when, frames in (("before", run.before[i]), ("after", run.after[i])):
+            stem = f"images/{channel.camera}_{channel.side}_{when}"
+            folder.write_with(f"{stem}.tiff", partial(_write_tiff, frames))
+            folder.write_with(f"{stem}.png", partial(_write_preview, frames))
+    folder.write_with("irradiance.nc", lambda place: _irradiance(run).to_netcdf(place, engine="h5netcdf"))
+    folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
+    folder.write_with("report.html", lambda place: write_report(run, place))
+    manifest = {
+        "program": "twin.render",
+        "versions": {"python": platform.python_version(), **_versions()},
+        "backend": run.experiment.backend.name,
+        "seed": run.seed,
+        "frames": run.frames,
+        "started_unix_s": started,
+        "wall_time_s": clock,
+        "warnings": list(run.warnings),
+        "sha256": folder.checksums(),
+    }
+    folder.write_json(MANIFEST, manifest)
+
+
+def _versions() -> dict[str, str]:
+    out = {}
+    for package in PACKAGES:
+        try:
+            out[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            out[package] = "not installed"
+    return out
+
+
+def preview(frames: np.ndarray) -> np.ndarray:
+    """Eight-bit picture of the mean of frames (N, H, W) with an asinh stretch, enlarged."""
+    mean = frames.mean(axis=0)
+    low, high = np.percentile(mean, 5), mean.max()
+    level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)
+    shade = np.uint8(np.rint(255.0 * np.arcsinh(STRETCH * level) / np.arcsinh(STRETCH)))
+    return np.kron(shade, np.ones((PREVIEW_SCALE, PREVIEW_SCALE), np.uint8))
+
+
+def _write_tiff(frames: np.ndarray, place: Path) -> None:
+    tifffile.imwrite(place, frames, photometric="minisblack")
+
+
+def _write_preview(frames: np.ndarray, place: Path) -> None:
+    ok, encoded = cv2.imencode(".png", preview(frames))
+    if not ok:
+        raise OSError(f"cannot encode {place.name}")
+    place.write_bytes(encoded.tobytes())
+
+
+def _irradiance(run: RenderRun) -> xr.Dataset:
+    path = run.experiment.path
+    photons = np.stack([run.photons_before, run.photons_after])
+    return xr.Dataset(
+        {
+            "photons": (
+                ("state", "channel", "row", "column"),
+                photons,
+                {"long_name": "expected photons per pixel and frame"},
+            )
+        },
+        coords={
+            "state": ["before", "after"],
+            "channel": [c.key for c in path.channels],
+            "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x"}),
+            "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y"}),
+        },
+        attrs={"wavelength_m": path.wavelength, "pitch_m": path.pitch},
+    )

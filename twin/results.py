@@ -1,0 +1,107 @@
+"""Everything one render run finds, and its JSON forms (the contract of truth.json and recovered.json)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.recovery import Recovery
+from optics.tree import State
+from scenes.resolved import ResolvedJob
+from twin.crosstalk import PARAMETERS, TO_TABLE, CameraCrosstalk
+from twin.experiment import MonitorExperiment
+from twin.motions import ARCSEC
+from twin.truth import Truth
+
+
+@dataclass(frozen=True, eq=False)
+class RenderRun:
+    """One job's outcome.
+
+    Attributes:
+        resolved: the job with everything it names.
+        experiment: the instrument and its calibration.
+        state: what was perturbed.
+        frames, seed: of the exposures.
+        truth: by exact tracing.
+        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns).
+        before, after: grey values, uint16 (C, frames, rows, columns).
+        recovery: what the images say (one state).
+        crosstalk: camera -> response to elementary motions.
+        warnings: what the user should know.
+    """
+
+    resolved: ResolvedJob
+    experiment: MonitorExperiment
+    state: State
+    frames: int
+    seed: int
+    truth: Truth
+    photons_before: np.ndarray
+    photons_after: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    recovery: Recovery
+    crosstalk: Mapping[str, CameraCrosstalk]
+    warnings: tuple[str, ...]
+
+    def true_parameters(self, camera: str) -> dict[str, float]:
+        """True change of a camera in the units of the keys."""
+        change = self.truth.cameras[camera]
+        values = np.array([change.d_alpha[0], change.d_beta[0], change.d_gamma[0], change.d_f[0]]) * TO_TABLE
+        return {key: float(value) for key, value in zip(PARAMETERS, values, strict=True)}
+
+    def truth_dict(self) -> dict[str, Any]:
+        """Contents of truth.json."""
+        out: dict[str, Any] = {
+            "cameras": {
+                name: {
+                    **self.true_parameters(name),
+                    "principal_distance_mm": 1e3 * float(self.truth.principal_distance[name]),
+                }
+                for name in self.truth.cameras
+            }
+        }
+        if len(self.truth.cameras) == 2:
+            out["intersection_angle"] = {
+                "nominal_deg": float(np.degrees(self.truth.angle)),
+                "change_arcsec": float(self.truth.angle_change[0] / ARCSEC),
+            }
+        return out
+
+    def recovered_dict(self) -> dict[str, Any]:
+        """Contents of recovered.json."""
+        cameras = {
+            name: {estimator: _first(p.to_dict()) for estimator, p in estimators.items()}
+            for name, estimators in self.recovery.parameters.items()
+        }
+        spots: dict[str, Any] = {}
+        r = self.recovery
+        for i, channel in enumerate(self.experiment.path.channels):
+            spots.setdefault(channel.camera, {})[channel.side] = {
+                "before": _spot(r.before[0, i], r.sigma_before[0, i]),
+                "after": _spot(r.after[0, i], r.sigma_after[0, i]),
+            }
+        out: dict[str, Any] = {"cameras": cameras, "spots": spots}
+        if r.angle:
+            out["intersection_angle"] = {e: _first(a.to_dict()) for e, a in r.angle.items()}
+        out["centroid"] = self.resolved.job.analysis.centroid
+        out["frames"] = self.frames
+        return out
+
+
+def _first(arrays: Mapping[str, Any]) -> dict[str, float]:
+    """The only state's values."""
+    return {key: float(np.ravel(value)[0]) for key, value in arrays.items()}
+
+
+def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:
+    return {
+        "row": float(position[0]),
+        "column": float(position[1]),
+        "sigma_row": float(sigma[0]),
+        "sigma_column": float(sigma[1]),
+    }
