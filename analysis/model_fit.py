@@ -24,7 +24,11 @@ __all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "observabi
 Array = NDArray[np.float64]
 _SHOWN = (("d_alpha", 1 / ARCSEC, '"'), ("d_beta", 1 / ARCSEC, '"'), ("d_gamma", 1 / ARCSEC, '"'), ("d_f", 1e6, " um"))
 # Below this shift of any spot, px per unit of motion, a motion is called invisible; monitors resolve some 1e-3 px.
-_INVISIBLE_PX = 1e-6
+_INVISIBLE_PX = 1e-5
+# Statements leave out what is smaller than this part of the largest component beside it ...
+_NEGLIGIBLE = 1e-5
+# ... and what is below this, arcsec or um per unit of motion: the rounding of Jacobians taken by differences.
+_ROUNDING = 1e-6
 
 
 class RankError(ValueError):
@@ -194,38 +198,59 @@ def observability(
 def _statements(reports: list[MotionReport], family: list[str], rank: int) -> list[str]:
     """Sentences on the family as a whole, then on each motion that is not reported as what it is."""
     lines = [
-        f"Four spot coordinates see {rank} independent combination(s) of {len(reports)} motions;"
+        f"Four spot coordinates see {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} motions;"
         f" the model fits {len(family)}: {', '.join(family)}."
     ]
+    reach = {report.name: float(np.max(np.abs(report.signature_px))) for report in reports}
     for report in reports:
-        unit = f"{report.name} (unit {report.scale:g} SI)"
-        if report.name in family:
+        name = report.name
+        if name in family:
             if abs(report.cosine) > 0.99 and report.nearest is not None:
-                lines.append(f"{unit} and {report.nearest} look almost alike (cosine {report.cosine:+.6f}).")
+                lines.append(f"{name}: looks almost like {report.nearest} (cosine {report.cosine:+.6f}).")
             continue
-        if np.max(np.abs(report.signature_px)) <= _INVISIBLE_PX:
-            if np.any(report.true):
-                lines.append(f"{unit} moves no spot and is invisible; its true change is {_show(report.true)}.")
-            else:
-                lines.append(f"{unit} moves no spot and changes no parameter.")
+        if reach[name] <= _INVISIBLE_PX:
+            true = _show(report.true)
+            lines.append(
+                f"{name}: moves no spot and is invisible; its true change is {true}."
+                if true
+                else f"{name}: moves no spot and changes no parameter."
+            )
             continue
-        order = np.argsort(-np.abs(report.imitation))
-        mix = ", ".join(f"{report.imitation[k]:+.4g} x {family[k]}" for k in order if abs(report.imitation[k]) > 1e-9)
-        amount = np.max(np.abs(report.signature_px))
         if report.explained > 1 - 1e-6:
-            text = "cannot be separated from the family"
+            text = "cannot be told from the family"
         else:
-            text = f"is {100 * report.explained:.2f}% like the family and leaves a residual"
+            text = f"is {100 * report.explained:.3g}% like the family and leaves a residual"
+        amounts = [(float(a), other) for a, other in zip(report.imitation, family, strict=True)]
+        shown = [(a, other) for a, other in amounts if abs(a) * reach[other] > _NEGLIGIBLE * reach[name]]
+        mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * reach[item[1]])) or "nothing"
+        floor = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
         lines.append(
-            f"{unit} {text}: it moves a spot by up to {amount:.3g} px and is taken for {mix or 'nothing'}; the model"
-            f" reports {_show(report.reported)}, true is {_show(report.true)}."
+            f"{name}: {text}; one unit moves a spot by {reach[name]:.3g} px and reads as {mix}: the model says"
+            f" {_show(report.reported, floor) or 'no change'}; true is {_show(report.true, floor) or 'no change'}."
         )
     return lines
 
 
-def _show(values: Array) -> str:
+def _sum(terms: Sequence[tuple[float, str]]) -> str:
+    """A sum such as ``-0.755 x one + 0.535 x other``."""
+    text = ""
+    for amount, name in terms:
+        sign = (" - " if amount < 0 else " + ") if text else ("-" if amount < 0 else "")
+        text += f"{sign}{abs(amount):.3g} x {name}"
+    return text
+
+
+def _table(values: Array) -> Array:
+    """(4,) rad and m in the units of ``_SHOWN``."""
+    return values * np.array([factor for _, factor, _ in _SHOWN])
+
+
+def _show(values: Array, floor: float = 0.0) -> str:
+    """The components above ``floor`` (arcsec, um) and above rounding, empty when there is none."""
     return ", ".join(
-        f"{name} {value * factor:+.4g}{unit}" for value, (name, factor, unit) in zip(values, _SHOWN, strict=True)
+        f"{name} {value:+.3g}{unit}"
+        for value, (name, _, unit) in zip(_table(values), _SHOWN, strict=True)
+        if abs(value) > max(floor, _ROUNDING)
     )
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
 from optics.element import Element
+from optics.frozen_map import FrozenMap
 from optics.pose import Pose
 from optics.tree import PlacedBodies, RigidTree, State
 
@@ -39,8 +39,8 @@ class Assembly:
             for name in names:
                 if name not in self.elements:
                     raise ValueError(f"sequence {sequence!r} names unknown element {name!r}")
-        object.__setattr__(self, "elements", MappingProxyType(dict(self.elements)))
-        object.__setattr__(self, "sequences", MappingProxyType({k: tuple(v) for k, v in self.sequences.items()}))
+        object.__setattr__(self, "elements", FrozenMap(self.elements))
+        object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
 
     def sequence(self, name: str) -> tuple[Element, ...]:
         """The elements of a named sequence.

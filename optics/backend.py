@@ -45,7 +45,7 @@ class Backend:
         """
         import drjit as dr
 
-        array = self.Float(np.ascontiguousarray(np.atleast_1d(np.asarray(values, dtype=np.float64)).ravel()))
+        array = self.Float(_aligned(np.asarray(values, dtype=np.float64).ravel()))
         dr.make_opaque(array)
         return array
 
@@ -53,6 +53,22 @@ class Backend:
         """Upload an (n, 3) or (3,) array as a ``Vector3`` of width n."""
         rows = np.atleast_2d(np.asarray(values, dtype=np.float64))
         return self.Vector3(self.opaque(rows[:, 0]), self.opaque(rows[:, 1]), self.opaque(rows[:, 2]))
+
+
+_ALIGNMENT = 128
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """Copy of a flat array at an aligned address.
+
+    Dr.Jit reads a NumPy array in place and compiles the alignment of its address into the kernel; arrays that are
+    aligned only by chance would make a second kernel of the same code now and then.
+    """
+    room = np.empty(values.size + _ALIGNMENT // values.itemsize, values.dtype)
+    start = (-room.ctypes.data % _ALIGNMENT) // values.itemsize
+    aligned = room[start : start + values.size]
+    aligned[:] = values
+    return aligned
 
 
 def load_backend(name: str = "llvm") -> Backend:

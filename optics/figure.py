@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
 from optics import zernike
+from optics.frozen_map import FrozenMap
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class ZernikeFigure:
 
     radius: float
     centre: tuple[float, float] = (0.0, 0.0)
-    terms: Mapping[int, float] = field(default_factory=dict)
+    terms: Mapping[int, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         """Freeze the terms."""
         if not self.radius > 0.0:
             raise ValueError(f"a figure needs a positive radius, found {self.radius}")
-        object.__setattr__(self, "terms", MappingProxyType({int(k): float(v) for k, v in self.terms.items()}))
+        object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
         """Sag error at x, y (metres), NumPy."""
@@ -44,8 +44,9 @@ class GridFigure:
 
     Attributes:
         values: sag error in metres, shape (rows along y, columns along x), at least 4 x 4.
-        bounds: x_min, x_max, y_min, y_max of the first and last samples, metres. Outside them the figure is continued
-            by the spline's mirror condition; give a grid that covers the clear aperture.
+        bounds: x_min, x_max, y_min, y_max of the first and last samples, metres. The spline arrives at its edges with
+            zero slope (mirror condition) and stays at the edge's value outside: give a grid that reaches a few samples
+            beyond the clear aperture.
     """
 
     values: np.ndarray
@@ -79,7 +80,9 @@ class GridFigure:
         dx, dy = self.spacing
         column = (np.asarray(x) - self.bounds[0]) / dx
         row = (np.asarray(y) - self.bounds[2]) / dy
-        return np.asarray(map_coordinates(self.values, [row, column], order=3, mode="mirror"))
+        rows, columns = self.values.shape
+        place = [np.clip(row, 0.0, rows - 1.0), np.clip(column, 0.0, columns - 1.0)]
+        return np.asarray(map_coordinates(self.values, place, order=3, mode="mirror"))
 
 
 Figure = ZernikeFigure | GridFigure

@@ -8,7 +8,7 @@ import numpy as np
 
 from optics.backend import Backend
 from optics.system import SystemBatch
-from optics.trace import Rays, make_rays, trace
+from optics.trace import make_rays, trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def ray_matrix(
         dr.enable_grad(variable)
         dr.set_grad(variable, backend.vector(tangent.reshape(-1, 3)))
     out = trace(
-        backend, systems, Rays(rays.position, rays.direction, rays.path, rays.valid), keep=(stop,), evaluate=False
+        backend, systems, rays, keep=(stop,), evaluate=False
     )
     local, at_stop = out.local, out.hits[stop]
     # interior gradients are kept: the hit on the stop lies on the way to the image

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
-from types import MappingProxyType
 
+from optics.frozen_map import FrozenMap
 from optics.names import unknown_name
 
 REFERENCE_TEMPERATURE = 293.15
@@ -143,7 +143,7 @@ ZERODUR = Glass(
     2.325e-6,
     "Schott TIE-43, Optical Properties of ZERODUR, November 2007 (no constants of Schott's dn/dT formula published)",
 )
-GLASSES: Mapping[str, Glass] = MappingProxyType({g.name: g for g in (FUSED_SILICA, N_BK7, ZERODUR)})
+GLASSES: Mapping[str, Glass] = FrozenMap({g.name: g for g in (FUSED_SILICA, N_BK7, ZERODUR)})
 """The catalogue, by name."""
 
 

@@ -1,8 +1,8 @@
 """The pupil field of a camera that looks at a far point: what ``optics.diffraction.image`` turns into its image.
 
-The beam is collimated and evenly lit. Rays are aimed at quadrature nodes of the stop, so that its edge is exact in every
-state. With p the launch point on the incoming plane wavefront, s the point of the stop and (u, v) the direction cosines at
-the detector, power conservation |a|^2 du dv = dp / A makes the amplitude of a node
+The beam is collimated and evenly lit. Rays are aimed at quadrature nodes of the stop, so that its edge is exact in
+every state. With p the launch point on the incoming plane wavefront, s the point of the stop and (u, v) the direction
+cosines at the detector, power conservation |a|^2 du dv = dp / A makes the amplitude of a node
 
     a du dv = sqrt(|d(u, v)/dp| / A) * |dp/ds| * ds,    A = sum |dp/ds| ds,
 
@@ -21,7 +21,7 @@ from optics.backend import Backend
 from optics.diffraction import PupilField
 from optics.quadrature import PupilNodes
 from optics.system import SystemBatch
-from optics.trace import Rays, make_rays, require_some, trace
+from optics.trace import make_rays, require_some, trace
 from optics.wavefront import eikonal
 
 AIM_TOLERANCE = 1e-11
@@ -37,8 +37,8 @@ def aim_collimated(
         backend: where to trace.
         to_stop: B systems from the scene to the stop, their last element.
         direction: of the light, world, unit, (3,) or (B, 3).
-        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane wavefront
-            through it.
+        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane
+            wavefront through it.
         target: stop coordinates, (N, 2), metres.
 
     Returns:
@@ -93,7 +93,7 @@ def imaging_field(
     """
     target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
     position, axes = aim_collimated(backend, to_stop, direction, launch, target)
-    count, n = position.shape[:2]
+    count = len(position)
     heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], position.shape)
     traced, hit, turn = _differentiate(backend, systems, len(to_stop.structure) - 1, position, heading, axes)
     place, leaving, path, valid = traced
@@ -117,7 +117,7 @@ def _differentiate(
     tangent = np.broadcast_to(axes[:, None], (count, n, 2, 3))
     dr.set_grad(rays.position, backend.vector(tangent.reshape(-1, 3)))
     out = trace(
-        backend, systems, Rays(rays.position, rays.direction, rays.path, rays.valid), keep=(stop,), evaluate=False
+        backend, systems, rays, keep=(stop,), evaluate=False
     )
     at_stop = out.hits[stop]
     dr.forward_to(out.local.direction, at_stop, flags=dr.ADFlag.ClearEdges)

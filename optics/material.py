@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
+from optics.frozen_map import FrozenMap
 from optics.names import unknown_name
 
 
@@ -79,7 +79,7 @@ _ALL = (
     ),
     Material("aluminium", 23.6e-6, 2700.0, 68.9e9, 0.33, 167.0, "6061-T6, ASM Metals Handbook vol. 2"),
 )
-MATERIALS: Mapping[str, Material] = MappingProxyType({m.name: m for m in _ALL})
+MATERIALS: Mapping[str, Material] = FrozenMap({m.name: m for m in _ALL})
 """The catalogue, by name."""
 
 

@@ -31,13 +31,16 @@ class BeamMissedError(RuntimeError):
 class Rays:
     """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still alive.
 
-    Width B * N for B systems (system by system), or N to send the same N rays through each.
+    Attributes:
+        position, direction, path, valid: of width systems * N.
+        systems: number of systems that the rays are for, system by system; 1: every system gets all of them.
     """
 
     position: Any
     direction: Any
     path: Any
     valid: Any
+    systems: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,15 +79,18 @@ def _rows(vector: Any, count: int) -> np.ndarray:
 
 
 def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, path: np.ndarray | None = None) -> Rays:
-    """Upload rays given by arrays of shape (..., 3), metres and unit vectors."""
+    """Upload rays given by positions in metres and unit directions, broadcastable to each other.
+
+    Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own.
+    """
     import drjit as dr
 
-    position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
-    direction = np.asarray(direction, dtype=np.float64).reshape(-1, 3)
-    position, direction = np.broadcast_arrays(position, direction)
+    position, direction = np.broadcast_arrays(np.asarray(position, np.float64), np.asarray(direction, np.float64))
+    systems = position.shape[0] if position.ndim == 3 else 1
+    position, direction = position.reshape(-1, 3), direction.reshape(-1, 3)
     n = len(position)
     start = backend.opaque(np.zeros(n) if path is None else np.asarray(path, dtype=np.float64).ravel())
-    return Rays(backend.vector(position), backend.vector(direction), start, dr.full(backend.Bool, True, n))
+    return Rays(backend.vector(position), backend.vector(direction), start, dr.full(backend.Bool, True, n), systems)
 
 
 def trace(
@@ -100,7 +106,7 @@ def trace(
     Args:
         backend: where to compute.
         systems: B systems.
-        rays: B * N rays (system by system) or N rays that every system gets.
+        rays: for these systems, or rays that every system gets.
         keep: indices of elements whose hit points are wanted.
         world: also return the final rays in the world frame.
         evaluate: launch the kernel now (False leaves a graph to build on).
@@ -108,6 +114,9 @@ def trace(
     Returns:
         The rays at the last element. Rays that miss a surface or an aperture, or are totally reflected at a refracting
         surface, are marked invalid; their numbers stay finite but mean nothing.
+
+    Raises:
+        ValueError: the rays are for another number of systems.
     """
     import drjit as dr
 
@@ -128,7 +137,7 @@ def trace(
             valid = valid & ok
         if i in keep:
             hits[i] = p
-    local = Rays(p, d, path, valid)
+    local = Rays(p, d, path, valid, uploaded.count)
     outside = None
     if world:
         g = {name: lookup(array) for name, array in uploaded.values[-1].items() if name[0] in "WP"}
@@ -139,6 +148,7 @@ def trace(
             backend.Vector3(*(g[f"W{a}0"] * d.x + g[f"W{a}1"] * d.y + g[f"W{a}2"] * d.z for a in range(3))),
             path,
             valid,
+            uploaded.count,
         )
     if evaluate:
         dr.eval(
@@ -164,7 +174,9 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
     if count == 1:
         return rays, lambda array: array
     width = dr.width(rays.position)
-    if width % count or width < count:
+    if rays.systems not in (1, count):
+        raise ValueError(f"rays for {rays.systems} systems cannot go through {count}")
+    if rays.systems == 1:
         shared = width
         index = dr.arange(backend.UInt, count * shared)
         ray = index % dr.opaque(backend.UInt, shared)
@@ -201,8 +213,8 @@ def _distance(
 
     bent = structure.even or structure.figure_order >= 0 or structure.grid
     if structure.plane:
-        t = -p.z / d.z
         ok = dr.abs(d.z) > 1e-12
+        t = -p.z / dr.select(ok, d.z, 1.0)
         if not bent:
             return t, ok
     else:

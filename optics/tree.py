@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from optics.frozen_map import FrozenMap
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
 
@@ -29,7 +29,7 @@ class Body:
 
     path: str
     pose: Pose = field(default_factory=Pose)
-    pivots: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    pivots: Mapping[str, tuple[float, float, float]] = field(default_factory=FrozenMap)
     scales: bool = True
 
     def __post_init__(self) -> None:
@@ -38,7 +38,7 @@ class Body:
             ORIGIN: (0.0, 0.0, 0.0),
             **{k: (float(v[0]), float(v[1]), float(v[2])) for k, v in self.pivots.items()},
         }
-        object.__setattr__(self, "pivots", MappingProxyType(pivots))
+        object.__setattr__(self, "pivots", FrozenMap(pivots))
 
     @property
     def parent(self) -> str:
@@ -62,7 +62,11 @@ class Motion:
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pivot: str = ORIGIN
     scale: float = 0.0
-    figure: Mapping[int, float] = field(default_factory=dict)
+    figure: Mapping[int, float] = field(default_factory=FrozenMap)
+
+    def __post_init__(self) -> None:
+        """Freeze the figure."""
+        object.__setattr__(self, "figure", FrozenMap(self.figure))
 
 
 State = Mapping[str, Motion]
@@ -162,7 +166,7 @@ class RigidTree:
                 + np.einsum("sij,sj->si", here, offset)
             )
             scale[:, i] = inner * growth
-        return PlacedBodies(MappingProxyType(index), rotation, translation, scale)
+        return PlacedBodies(FrozenMap(index), rotation, translation, scale)
 
 
 COMPLEX_STEP = 1e-40

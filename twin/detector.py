@@ -16,7 +16,6 @@ H, W).
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -26,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.noise import NoiseModel
+from optics.threads import cores
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
@@ -251,7 +251,7 @@ class EmvaDetector:
 def _run(work: Callable[[tuple[int, ...], int], None], indices: list[tuple[int, ...]], threads: int | None) -> None:
     """Call work(index, number) for all indices on `threads` threads; the first error is raised here."""
     if threads is None:
-        threads = min(_cores(), 8)
+        threads = min(cores(), 8)
     if threads < 1:
         raise ValueError(f"detector: threads must be >= 1, found {threads!r}")
     if threads == 1 or len(indices) == 1:
@@ -261,13 +261,6 @@ def _run(work: Callable[[tuple[int, ...], int], None], indices: list[tuple[int, 
     with ThreadPoolExecutor(max_workers=threads) as pool:
         for _ in pool.map(work, indices, range(len(indices))):
             pass
-
-
-def _cores() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every platform
-        return os.cpu_count() or 1
 
 
 def _sequence(seed: Seed) -> np.random.SeedSequence:

@@ -4,14 +4,17 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
 
 from analysis.calibration import CameraCalibration, MonitorCalibration
 from analysis.monitoring import MonitorGeometry
+from analysis.recovery import Recovery, recover
 from analysis.spot_template import SpotTemplate
 from optics.backend import Backend
+from optics.threads import cores, one_blas_thread
 from optics.tree import Motion, State
 from scenes.instrument_model import Instrument, build_instrument
 from scenes.job import JobSpec, noll
@@ -122,18 +125,45 @@ class MonitorExperiment:
         photons = self.nominal_photons
         return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 1))
 
-    def frames_after(self, photons: np.ndarray, frames: int, seed: int) -> np.ndarray:
-        """Frames of perturbed states with ``photons`` (S, C, rows, columns): uint16 (S, C, frames, rows, columns)."""
-        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 2))
+    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int = 0) -> np.ndarray:
+        """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
+
+        Args:
+            photons: expected photons per pixel and frame, (S, C, rows, columns).
+            frames: per state.
+            seed: as for ``frames_before``; state number first + s draws from a stream of its own, so that the frames of
+                a state do not depend on how a series is cut into pieces.
+            first: number of the first state.
+        """
+        pattern = self.pattern(seed)
+        out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
+        for s, image in enumerate(photons):
+            out[s] = self.detector.expose(image, pattern, frames, self.exposure, _stream(seed, 2, first + s))
+        return out
+
+    def measure(
+        self, states: Sequence[State], frames: int, seed: int, centroid: str = "ml", chunk: int = 25
+    ) -> Iterator[tuple[slice, Recovery]]:
+        """Render, expose and recover many states against one nominal measurement, piece by piece to bound memory.
+
+        Yields:
+            The slice of ``states`` and what their images say.
+        """
+        before = self.frames_before(frames, seed)
+        for piece, photons in self.path.iterate_photons(states, chunk=chunk):
+            after = self.frames_after(photons, frames, seed, piece.start)
+            with one_blas_thread():
+                recovered = recover(before, after, self.calibration, centroid, cores())
+            yield piece, recovered
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
         """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""
         return self.detector.expected_dn(photons, self.exposure)
 
 
-def _stream(seed: int, number: int) -> np.random.SeedSequence:
+def _stream(seed: int, *number: int) -> np.random.SeedSequence:
     """One of the independent random streams of a seed."""
-    return np.random.SeedSequence(seed, spawn_key=(number,))
+    return np.random.SeedSequence(seed, spawn_key=number)
 
 
 def state_of(job: JobSpec) -> State:

@@ -18,10 +18,10 @@ from optics import quadrature, zernike
 from optics.aim import RayFan, aim, transverse_axes
 from optics.aperture import Circle
 from optics.backend import Backend
-from optics.diffraction import PupilField, image
+from optics.diffraction import Grid, PupilField, image
 from optics.pixel_response import PixelResponse
 from optics.system import assemble
-from optics.trace import Rays, make_rays, require_some, trace
+from optics.trace import make_rays, require_some, trace
 from optics.tree import COMPLEX_STEP, PlacedBodies, State
 from optics.wavefront import eikonal
 from scenes.instrument_model import BASE, Channel, Instrument
@@ -180,8 +180,7 @@ class MonitorPath:
         """Like ``expected_photons``, piece by piece: yields (slice of the states, photons)."""
         response = self.response
         border = margin + response.reach
-        y = self.axis(0, border)
-        x = self.axis(1, border)
+        y, x = (self.grid(axis, border) for axis in (0, 1))
         light = self.instrument.spec.monitor.reticle.photons_per_frame * self.pitch**2
         for start in range(0, len(states), chunk):
             some = states[start : start + chunk]
@@ -192,10 +191,14 @@ class MonitorPath:
                 np.swapaxes(photons.reshape(len(self.channels), len(some), *photons.shape[1:]), 0, 1),
             )
 
-    def axis(self, axis: int, margin: int = 0) -> np.ndarray:
-        """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
+    def grid(self, axis: int, margin: int = 0) -> Grid:
+        """Pixel centres of the rows (0) or columns (1) in detector coordinates from the CCD's centre."""
         n = self.shape[axis]
-        return (np.arange(-margin, n + margin) - 0.5 * (n - 1)) * self.pitch
+        return Grid(-(0.5 * (n - 1) + margin) * self.pitch, self.pitch, n + 2 * margin)
+
+    def axis(self, axis: int) -> np.ndarray:
+        """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
+        return self.grid(axis).points()
 
     def spot_jacobian(self, motions: Sequence[ElementaryMotion]) -> np.ndarray:
         """Derivative of every spot's position by elementary motions, by forward-mode AD through the whole path.
@@ -231,7 +234,7 @@ class MonitorPath:
             dr.set_grad(rays.position, self.backend.vector(np.broadcast_to(step, direction.shape).reshape(-1, 3)))
             dr.set_grad(rays.direction, self.backend.vector(direction_step.reshape(-1, 3)))
             out = trace(
-                self.backend, systems, Rays(rays.position, rays.direction, rays.path, rays.valid), evaluate=False
+                self.backend, systems, rays, evaluate=False
             )
             dr.forward_to(out.local.position)
             gradient = dr.grad(out.local.position)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
+import io
 from functools import partial
 from pathlib import Path
 
@@ -16,17 +15,9 @@ from twin.report import write_report
 from twin.results import RenderRun
 from twin.run_folder import MANIFEST, RunFolder
 from twin.scene_file import write_scene
+from twin.summary_figure import write_summary
+from twin.versions import versions
 
-PACKAGES = (
-    "space-camera-twin",
-    "drjit",
-    "mitsuba",
-    "numpy",
-    "scipy",
-    "opencv-python-headless",
-    "trimesh",
-    "karellen-llvm-core",
-)
 PREVIEW_SCALE = 4
 STRETCH = 30.0
 """Steepness of the asinh stretch of previews: it shows the faint diffraction rings beside the core."""
@@ -41,6 +32,7 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
         started: time of the start, seconds since the epoch.
         clock: seconds that the computation took.
     """
+    # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
     folder.write_text("config.yaml", run.resolved.to_yaml())
     folder.write_json("truth.json", run.truth_dict())
@@ -49,14 +41,15 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             stem = f"images/{channel.camera}_{channel.side}_{when}"
-            folder.write_with(f"{stem}.tiff", partial(_write_tiff, frames))
+            folder.write_bytes(f"{stem}.tiff", _tiff(frames))
             folder.write_with(f"{stem}.png", partial(_write_preview, frames))
-    folder.write_with("irradiance.nc", lambda place: _irradiance(run).to_netcdf(place, engine="h5netcdf"))
+    folder.write_bytes("irradiance.nc", _irradiance(run).to_netcdf(engine="h5netcdf"))
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
+    folder.write_with("summary.png", lambda place: write_summary(run, place))
     manifest = {
         "program": "twin.render",
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": versions(),
         "backend": run.experiment.backend.name,
         "seed": run.seed,
         "frames": run.frames,
@@ -68,16 +61,6 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
     folder.write_json(MANIFEST, manifest)
 
 
-def _versions() -> dict[str, str]:
-    out = {}
-    for package in PACKAGES:
-        try:
-            out[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            out[package] = "not installed"
-    return out
-
-
 def preview(frames: np.ndarray) -> np.ndarray:
     """Eight-bit picture of the mean of frames (N, H, W) with an asinh stretch, enlarged."""
     mean = frames.mean(axis=0)
@@ -87,8 +70,11 @@ def preview(frames: np.ndarray) -> np.ndarray:
     return np.kron(shade, np.ones((PREVIEW_SCALE, PREVIEW_SCALE), np.uint8))
 
 
-def _write_tiff(frames: np.ndarray, place: Path) -> None:
-    tifffile.imwrite(place, frames, photometric="minisblack")
+def _tiff(frames: np.ndarray) -> bytes:
+    """Frames (N, H, W) as a TIFF file of N pages."""
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, frames, photometric="minisblack")
+    return stream.getvalue()
 
 
 def _write_preview(frames: np.ndarray, place: Path) -> None:

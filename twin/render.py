@@ -3,33 +3,42 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+import threading
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from analysis.recovery import ESTIMATORS
 from optics.backend import NAMES, BackendUnavailable, load_backend
 from optics.llvm import LibraryMissing
 from scenes.errors import InputError
-from scenes.resolved import resolve
+from scenes.resolved import ResolvedJob, resolve
 from twin.output import write_run
 from twin.render_job import STAGES, render_job
 from twin.results import RenderRun
 from twin.run_folder import RunFolder, RunFolderError, next_free
 
 WRITE = "write the run folder"
-BAD_INPUT, FAILURE = 2, 1
+BAD_INPUT, FAILURE, INTERRUPTED, TERMINATED = 2, 1, 130, 143
+LARGEST_SEED = 2**63 - 1
 LABELS = {
-    "d_alpha_arcsec": 'd_alpha ["]',
-    "d_beta_arcsec": 'd_beta ["]',
-    "d_gamma_arcsec": 'd_gamma ["]',
-    "d_f_um": "d_f [um]",
+    "d_alpha_arcsec": ('d_alpha "', 4),
+    "d_beta_arcsec": ('d_beta "', 4),
+    "d_gamma_arcsec": ('d_gamma "', 3),
+    "d_f_um": ("d_f um", 2),
 }
+"""How the terminal's table names a parameter, and its decimals."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -41,7 +50,9 @@ def main(
         Path | None,
         typer.Option(help="Run folder to make. Default: runs/<name of the job>-<number>, the first that is free."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of all noise; overrides the file's.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise; overrides the file's.")
+    ] = None,
     frames: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Frames per state; overrides the file's.")
     ] = None,
@@ -86,6 +97,9 @@ def main(
     except (BackendUnavailable, LibraryMissing) as error:
         errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
         raise typer.Exit(FAILURE) from None
+    except KeyboardInterrupt:
+        errors.print("interrupted: nothing was kept", style="bold red")
+        raise typer.Exit(INTERRUPTED) from None
     if as_json:
         json.dump({"truth": run.truth_dict(), "recovered": run.recovered_dict()}, sys.stdout, allow_nan=False)
         sys.stdout.write("\n")
@@ -99,7 +113,7 @@ class InputErrorText(Exception):
 
 def _run(
     folder: RunFolder,
-    resolved: object,
+    resolved: ResolvedJob,
     backend: str,
     frames: int | None,
     seed: int | None,
@@ -115,49 +129,44 @@ def _run(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with folder, Progress(*columns, console=errors, disable=silent, transient=True) as bar:
+    tracer = load_backend(backend)
+    hidden = silent or not errors.is_terminal
+    with _exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
         task = bar.add_task("start", total=len(STAGES) + 1)
 
         def stage(name: str) -> None:
             bar.update(task, description=name, completed=float([*STAGES, WRITE].index(name)))
 
-        run = render_job(resolved, load_backend(backend), frames, seed, stage)  # type: ignore[arg-type]
+        run = render_job(resolved, tracer, frames, seed, stage)
         stage(WRITE)
         write_run(run, folder, started, time.monotonic() - clock)
         bar.update(task, completed=len(STAGES) + 1)
     return run
 
 
+@contextmanager
+def _exit_on_terminate() -> Iterator[None]:
+    """Let SIGTERM end the program as an exception, so that a half-written run folder is removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def leave(number: int, frame: object) -> None:
+        raise SystemExit(TERMINATED)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def _print_result(run: RenderRun, target: Path) -> None:
     """Result table and where to look next."""
+    table = _table(run)
     console = Console()
-    truth, recovered = run.truth_dict(), run.recovered_dict()
-    table = Table(
-        title=f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
-    )
-    table.add_column("camera")
-    table.add_column("parameter")
-    table.add_column("true", justify="right")
-    for estimator in next(iter(recovered["cameras"].values())):
-        table.add_column(estimator, justify="right")
-    table.add_column("model - true", justify="right")
-    table.add_column("in sigma", justify="right")
-    for camera, estimators in recovered["cameras"].items():
-        for key, label in LABELS.items():
-            true, model = truth["cameras"][camera][key], estimators["model"]
-            difference, sigma = model[key] - true, model[f"{key}_sigma"]
-            cells = [f"{e[key]:.4f}" for e in estimators.values()]
-            cells[-1] += f" +- {sigma:.4f}"
-            table.add_row(camera, label, f"{true:.4f}", *cells, f"{difference:+.4f}", f"{difference / sigma:+.1f}")
-        table.add_section()
-    if "intersection_angle" in truth:
-        true = truth["intersection_angle"]["change_arcsec"]
-        angles = recovered["intersection_angle"]
-        difference = angles["model"]["change_arcsec"] - true
-        sigma = angles["model"]["change_arcsec_sigma"]
-        cells = [f"{a['change_arcsec']:.4f}" for a in angles.values()]
-        cells[-1] += f" +- {sigma:.4f}"
-        table.add_row("both", 'angle ["]', f"{true:.4f}", *cells, f"{difference:+.4f}", f"{difference / sigma:+.1f}")
+    # a number that is cut is worse than a line that wraps
+    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
     console.print(table)
     console.print(
         "The model assumes that only the line CCD moves and the optics scale; other motions read as these: "
@@ -165,8 +174,36 @@ def _print_result(run: RenderRun, target: Path) -> None:
         style="dim",
     )
     for warning in run.warnings:
-        console.print(f"warning: {warning}", style="yellow", markup=False)
-    console.print(f"run folder: {target}   report: {target / 'report.html'}", markup=False, highlight=False)
+        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
+    console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _table(run: RenderRun) -> Table:
+    """What every estimator recovered, beside the truth."""
+    truth, recovered = run.truth_dict(), run.recovered_dict()
+    title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("", no_wrap=True)
+    heads = ("true", "paper\nsingle", "paper\njoint", "derived", "model", "sigma", "model\n- true", "in\nsigma")
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+
+    def add(label: str, key: str, decimals: int, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
+        model, sigma = estimators["model"][key], estimators["model"][f"{key}_sigma"]
+        values = [true, *(estimators[name][key] for name in ESTIMATORS), sigma]
+        cells = [f"{value:.{decimals}f}" for value in values]
+        table.add_row(label, *cells, f"{model - true:+.{decimals}f}", f"{(model - true) / sigma:+.1f}")
+
+    for camera, estimators in recovered["cameras"].items():
+        table.add_row(f"[bold]{escape(camera)}[/]")
+        for key, (label, decimals) in LABELS.items():
+            add(label, key, decimals, truth["cameras"][camera][key], estimators)
+    if "intersection_angle" in truth:
+        true = truth["intersection_angle"]["change_arcsec"]
+        table.add_row("[bold]both[/]")
+        add('angle "', "change_arcsec", 4, true, recovered["intersection_angle"])
+    return table
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from analysis.spot_positions import SpotError
 from optics.aim import AimError
 from optics.backend import Backend
 from optics.trace import BeamMissedError
+from optics.tree import State
 from scenes.errors import InputError
 from scenes.job import check_nodes
 from scenes.resolved import ResolvedJob
@@ -48,6 +49,8 @@ def render_job(
     """
     count = resolved.frames if frames is None else frames
     number = resolved.job.render.seed if seed is None else seed
+    # the run's config.yaml has to repeat the run, overrides included
+    resolved = resolved.with_render(count, number)
     progress(STAGES[0])
     experiment = MonitorExperiment(resolved, backend)
     check_nodes(resolved.job, experiment.instrument.nodes)
@@ -58,6 +61,7 @@ def render_job(
         progress(STAGES[2])
         calibration = experiment.calibration
         progress(STAGES[3])
+        _require_spots_on_ccds(experiment, state)
         nominal = experiment.nominal_photons
         photons = experiment.path.expected_photons([state])
     except (AimError, BeamMissedError) as error:
@@ -93,6 +97,25 @@ def render_job(
 
 def _covariances(recovery: Recovery) -> dict[str, np.ndarray]:
     return {name: recovery.shift_covariance[0, k] for k, name in enumerate(recovery.parameters)}
+
+
+def _require_spots_on_ccds(experiment: MonitorExperiment, state: State) -> None:
+    """Raise BeamMissedError when the middle of a spot falls outside its CCD, where nothing of it could be measured.
+
+    The wave of a spot at (x, y) has the eikonal L = L0 - u x - v y: its slope over the pupil is the spot's place.
+    """
+    path = experiment.path
+    field = path.fields([state])
+    for i, channel in enumerate(path.channels):
+        root = np.sqrt(field.amplitude[i])
+        plane = np.stack([np.ones_like(root), field.u[i], field.v[i]], axis=-1)
+        slope = np.linalg.lstsq(plane * root[:, None], field.eikonal[i] * root, rcond=None)[0]
+        place = -slope[:0:-1] / path.pitch + 0.5 * (np.array(path.shape) - 1)
+        if np.any(place < 0.0) or np.any(place > np.array(path.shape) - 1):
+            raise BeamMissedError(
+                f"the spot {channel.key} falls on row {place[0]:.0f}, column {place[1]:.0f}, outside its area CCD of "
+                f"{path.shape[0]} x {path.shape[1]} pixels"
+            )
 
 
 def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
