@@ -79,8 +79,7 @@ def image(field: PupilField, x: Grid, y: Grid) -> np.ndarray:
         rows = _waves(k * part.v, y, 1.0)
         columns = _waves(k * part.u, x, part.amplitude * np.exp(1j * k * part.eikonal))
         amplitude = np.swapaxes(rows, 0, 1) @ columns.transpose(1, 2, 0)
-        np.multiply(amplitude.real, amplitude.real, out=out[start : start + _AT_ONCE])
-        out[start : start + _AT_ONCE] += amplitude.imag * amplitude.imag
+        out[start : start + _AT_ONCE] = np.square(amplitude.real) + np.square(amplitude.imag)
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
         list(pool.map(piece, range(0, count, _AT_ONCE)))
@@ -96,14 +95,16 @@ def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float) -> np.
     """Factor * exp(i frequency * point) for frequencies (B, N) on a grid, (count, B, N).
 
     Built by doubling: exp(i q (p + m step)) = exp(i q p) exp(i q m step). Each sample is a product of at most
-    log2(count) + 1 exact phasors, so rounding stays below 1e-15 and few sines and cosines are needed.
+    log2(count) + 1 phasors whose phases are worked out in double precision; phasors and their sum are kept in single
+    precision, which costs some 1e-7 of the peak and saves half of the time.
     """
-    out = np.empty((grid.count, *frequency.shape), np.complex128)
+    out = np.empty((grid.count, *frequency.shape), np.complex64)
     out[0] = factor * np.exp(1j * frequency * grid.start)
     done = 1
     while done < grid.count:
         more = min(done, grid.count - done)
-        np.multiply(out[:more], np.exp(1j * frequency * (done * grid.step)), out=out[done : done + more])
+        turn = np.exp(1j * frequency * (done * grid.step)).astype(np.complex64)
+        np.multiply(out[:more], turn, out=out[done : done + more])
         done += more
     return out
 

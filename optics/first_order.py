@@ -73,9 +73,7 @@ def ray_matrix(
     for variable, tangent in ((rays.position, moves), (rays.direction, turns)):
         dr.enable_grad(variable)
         dr.set_grad(variable, backend.vector(tangent.reshape(-1, 3)))
-    out = trace(
-        backend, systems, rays, keep=(stop,), evaluate=False
-    )
+    out = trace(backend, systems, rays, keep=(stop,), evaluate=False)
     local, at_stop = out.local, out.hits[stop]
     # interior gradients are kept: the hit on the stop lies on the way to the image
     dr.forward_to(local.position, local.direction, at_stop, flags=dr.ADFlag.ClearEdges)

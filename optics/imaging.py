@@ -116,9 +116,7 @@ def _differentiate(
     dr.enable_grad(rays.position)
     tangent = np.broadcast_to(axes[:, None], (count, n, 2, 3))
     dr.set_grad(rays.position, backend.vector(tangent.reshape(-1, 3)))
-    out = trace(
-        backend, systems, rays, keep=(stop,), evaluate=False
-    )
+    out = trace(backend, systems, rays, keep=(stop,), evaluate=False)
     at_stop = out.hits[stop]
     dr.forward_to(out.local.direction, at_stop, flags=dr.ADFlag.ClearEdges)
 

@@ -44,6 +44,11 @@ class ResolvedJob(Spec):
         """Number of frames: the job's if it gives one, else the instrument's."""
         return self.job.render.frames or self.instrument.monitor.frames
 
+    def with_render(self, frames: int, seed: int) -> "ResolvedJob":
+        """The same with this number of frames and this seed, for values that a command overrides."""
+        render = self.job.render.model_copy(update={"frames": frames, "seed": seed})
+        return self.model_copy(update={"job": self.job.model_copy(update={"render": render})})
+
     def to_yaml(self) -> str:
         """The text of a config.yaml; `resolve` reads it back to exactly the same values."""
         return dump_yaml(self.plain())

@@ -127,11 +127,15 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
         covariance: camera -> (4, 4) px^2 of the spot shifts of a measurement, which weighs them.
     """
     instrument = experiment.instrument
+    sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
+    every = [motion for motions in sets.values() for motion in motions]
+    all_spots = experiment.path.spot_jacobian(every)
+    all_truth = truth_jacobian(instrument, experiment.backend, every)
     out = {}
-    for k, name in enumerate(instrument.cameras):
-        motions = (*line_family(name), *other_motions(instrument, name))
-        spots = experiment.path.spot_jacobian(motions)[2 * k : 2 * k + 2].reshape(4, -1)
-        truth = truth_jacobian(instrument, experiment.backend, motions)[name]
+    for k, (name, motions) in enumerate(sets.items()):
+        own = slice(len(motions) * k, len(motions) * (k + 1))
+        spots = all_spots[2 * k : 2 * k + 2, :, own].reshape(4, -1)
+        truth = all_truth[name][:, own]
         geometry = experiment.geometry(name)
         gains = {e: monitoring.coefficients(e, geometry) for e in ESTIMATORS if e != "model"}
         camera = experiment.calibration.cameras[name]

@@ -72,20 +72,25 @@ class MonitorExperiment:
         return trace_truth(self.instrument, self.backend, [{}])
 
     @cached_property
+    def _truth_by_family(self) -> dict[str, np.ndarray]:
+        """Camera -> (4, 4): its true parameters per unit of the four motions of its own line family."""
+        names = list(self.instrument.cameras)
+        motions = [motion for name in names for motion in line_family(name)]
+        every = truth_jacobian(self.instrument, self.backend, motions)
+        return {name: every[name][:, 4 * k : 4 * k + 4] for k, name in enumerate(names)}
+
+    @cached_property
     def calibration(self) -> MonitorCalibration:
         """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
         families = {name: line_family(name) for name in self.instrument.cameras}
-        motions = [motion for family in families.values() for motion in family]
-        spots = self.path.spot_jacobian(motions)
-        truth = truth_jacobian(self.instrument, self.backend, motions)
+        spots = self.path.spot_jacobian([motion for family in families.values() for motion in family])
         cameras = {}
         for k, (name, family) in enumerate(families.items()):
-            own = slice(4 * k, 4 * k + 4)
             cameras[name] = CameraCalibration(
                 geometry=self.geometry(name),
                 look_rad=self.instrument.spec.cameras[name].look,
-                spot_jacobian=spots[2 * k : 2 * k + 2, :, own].reshape(4, 4),
-                parameter_jacobian=truth[name][:, own],
+                spot_jacobian=spots[2 * k : 2 * k + 2, :, 4 * k : 4 * k + 4].reshape(4, 4),
+                parameter_jacobian=self._truth_by_family[name],
                 motions=tuple(motion.label for motion in family),
             )
         template = SpotTemplate.stack([self._template(image) for image in self.wide_photons])
@@ -96,8 +101,7 @@ class MonitorExperiment:
 
         The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
         """
-        x, y, *_ = line_family(camera)
-        by_x, by_y = truth_jacobian(self.instrument, self.backend, (x, y))[camera].T
+        by_x, by_y, *_ = self._truth_by_family[camera].T
         return MonitorGeometry(
             focal_length_m=self.nominal_truth.principal_distance[camera],
             separation_m=self.instrument.separation[camera],

@@ -20,8 +20,9 @@ from optics.aperture import Circle
 from optics.backend import Backend
 from optics.diffraction import Grid, PupilField, image
 from optics.pixel_response import PixelResponse
+from optics.quadrature import PupilNodes
 from optics.system import assemble
-from optics.trace import make_rays, require_some, trace
+from optics.trace import BeamMissedError, make_rays, require_some, trace
 from optics.tree import COMPLEX_STEP, PlacedBodies, State
 from optics.wavefront import eikonal
 from scenes.instrument_model import BASE, Channel, Instrument
@@ -29,6 +30,9 @@ from twin.motions import ElementaryMotion, pivot_states
 
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
+
+SPOT_RANGE = 0.8
+"""Share of the CCD's half size up to which a spot may be off its middle; farther out the estimators refuse it."""
 
 AIM_TOLERANCE = 1e-9
 """Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
@@ -58,14 +62,13 @@ class MonitorPath:
     Args:
         instrument: the instrument.
         backend: where to trace.
-        rings, arms: pupil quadrature (see ``optics.quadrature.disk``). The defaults reach 1e-6 of the peak over a CCD
-            that is 14 Airy radii wide.
+        nodes: pupil quadrature; by default one that is right to 1e-6 of the peak for spots anywhere in the middle
+            ``SPOT_RANGE`` of the CCD, out to the far corner.
     """
 
-    def __init__(self, instrument: Instrument, backend: Backend, rings: int = 12, arms: int = 40) -> None:
+    def __init__(self, instrument: Instrument, backend: Backend, nodes: PupilNodes | None = None) -> None:
         self.instrument = instrument
         self.backend = backend
-        self.nodes = quadrature.disk(rings, arms)
         self.channels: tuple[Channel, ...] = instrument.channels
         ccd = instrument.spec.monitor.area_ccd
         self.shape = (ccd.rows, ccd.columns)
@@ -74,6 +77,18 @@ class MonitorPath:
         face = instrument.assembly.elements[f"{self.channels[0].key}/return_face"].aperture
         assert isinstance(face, Circle)
         self.face_radius = face.radius
+        self.nodes = quadrature.disk_for(self._largest_phase()) if nodes is None else nodes
+
+    def _largest_phase(self) -> float:
+        """Phase at the pupil's edge for the pixel that is farthest from a spot, radians."""
+        reach = 0.5 * (1.0 + SPOT_RANGE) * self.pitch * float(np.hypot(*self.shape))
+        return 2.0 * np.pi * self.numerical_aperture * reach / self.wavelength
+
+    @property
+    def numerical_aperture(self) -> float:
+        """Of the returned beam at the CCD, the largest among the cameras."""
+        scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
+        return self.face_radius / float(np.min(scales))
 
     @cached_property
     def nominal(self) -> Aimed:
@@ -140,7 +155,9 @@ class MonitorPath:
         traced = trace(self.backend, systems, make_rays(self.backend, aimed.position, aimed.direction))
         position, direction, path, valid = traced.numpy()
         for i, channel in enumerate(self.channels):
-            require_some(valid[i * len(states) : (i + 1) * len(states)], f"the monitor channel {channel.key}")
+            own = slice(i * len(states), (i + 1) * len(states))
+            require_some(valid[own], f"the monitor channel {channel.key}")
+            self._require_on_ccd(channel, position[own])
         _, dx, dy = self._map
         u, v = direction[..., 0], direction[..., 1]
         determinant = np.abs((u @ dx.T) * (v @ dy.T) - (u @ dy.T) * (v @ dx.T))
@@ -150,13 +167,23 @@ class MonitorPath:
         phase = phase - phase[:, :1]
         return PupilField(u, v, phase, amplitude, self.wavelength)
 
+    def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
+        """Raise BeamMissedError when the middle of a spot (rays (S, N, 3) at the CCD) is outside its CCD."""
+        share = self.nodes.weight / np.sum(self.nodes.weight)
+        place = np.einsum("n,snk->sk", share, position[..., 1::-1]) / self.pitch + 0.5 * (np.array(self.shape) - 1)
+        outside = np.any((place < 0.0) | (place > np.array(self.shape) - 1), axis=-1)
+        if np.any(outside):
+            row, column = place[np.argmax(outside)]
+            raise BeamMissedError(
+                f"the spot {channel.key} falls on row {row:.0f}, column {column:.0f}, outside its area CCD of "
+                f"{self.shape[0]} x {self.shape[1]} pixels"
+            )
+
     @cached_property
     def response(self) -> PixelResponse:
         """What pixel and pinhole do to the image."""
         pinhole = self.instrument.spec.monitor.reticle.pinhole
-        model = next(iter(self.instrument.cameras.values()))
-        aperture = self.face_radius / float(model.first_order.focal_length[0])
-        return PixelResponse.fit(self.pitch, pinhole, cutoff=2.0 * aperture / self.wavelength)
+        return PixelResponse.fit(self.pitch, pinhole, cutoff=2.0 * self.numerical_aperture / self.wavelength)
 
     def expected_photons(self, states: Sequence[State], margin: int = 0, chunk: int = 32) -> np.ndarray:
         """Expected photons per pixel and frame.
@@ -233,9 +260,7 @@ class MonitorPath:
             dr.enable_grad(rays.position, rays.direction)
             dr.set_grad(rays.position, self.backend.vector(np.broadcast_to(step, direction.shape).reshape(-1, 3)))
             dr.set_grad(rays.direction, self.backend.vector(direction_step.reshape(-1, 3)))
-            out = trace(
-                self.backend, systems, rays, evaluate=False
-            )
+            out = trace(self.backend, systems, rays, evaluate=False)
             dr.forward_to(out.local.position)
             gradient = dr.grad(out.local.position)
             return np.stack([gradient.x.numpy(), gradient.y.numpy()], axis=-1).reshape(c * m, n, 2)

@@ -11,7 +11,6 @@ from analysis.spot_positions import SpotError
 from optics.aim import AimError
 from optics.backend import Backend
 from optics.trace import BeamMissedError
-from optics.tree import State
 from scenes.errors import InputError
 from scenes.job import check_nodes
 from scenes.resolved import ResolvedJob
@@ -61,7 +60,6 @@ def render_job(
         progress(STAGES[2])
         calibration = experiment.calibration
         progress(STAGES[3])
-        _require_spots_on_ccds(experiment, state)
         nominal = experiment.nominal_photons
         photons = experiment.path.expected_photons([state])
     except (AimError, BeamMissedError) as error:
@@ -97,25 +95,6 @@ def render_job(
 
 def _covariances(recovery: Recovery) -> dict[str, np.ndarray]:
     return {name: recovery.shift_covariance[0, k] for k, name in enumerate(recovery.parameters)}
-
-
-def _require_spots_on_ccds(experiment: MonitorExperiment, state: State) -> None:
-    """Raise BeamMissedError when the middle of a spot falls outside its CCD, where nothing of it could be measured.
-
-    The wave of a spot at (x, y) has the eikonal L = L0 - u x - v y: its slope over the pupil is the spot's place.
-    """
-    path = experiment.path
-    field = path.fields([state])
-    for i, channel in enumerate(path.channels):
-        root = np.sqrt(field.amplitude[i])
-        plane = np.stack([np.ones_like(root), field.u[i], field.v[i]], axis=-1)
-        slope = np.linalg.lstsq(plane * root[:, None], field.eikonal[i] * root, rcond=None)[0]
-        place = -slope[:0:-1] / path.pitch + 0.5 * (np.array(path.shape) - 1)
-        if np.any(place < 0.0) or np.any(place > np.array(path.shape) - 1):
-            raise BeamMissedError(
-                f"the spot {channel.key} falls on row {place[0]:.0f}, column {place[1]:.0f}, outside its area CCD of "
-                f"{path.shape[0]} x {path.shape[1]} pixels"
-            )
 
 
 def _too_large(resolved: ResolvedJob, reason: str) -> InputError:

@@ -52,7 +52,8 @@ class RenderRun:
         """True change of a camera in the units of the keys."""
         change = self.truth.cameras[camera]
         values = np.array([change.d_alpha[0], change.d_beta[0], change.d_gamma[0], change.d_f[0]]) * TO_TABLE
-        return {key: float(value) for key, value in zip(PARAMETERS, values, strict=True)}
+        # adding 0.0 turns a negative zero into a plain one
+        return {key: float(value) + 0.0 for key, value in zip(PARAMETERS, values, strict=True)}
 
     def truth_dict(self) -> dict[str, Any]:
         """Contents of truth.json."""

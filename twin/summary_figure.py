@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from analysis.recovery import ESTIMATORS
 from twin.report.content import results
 from twin.report.labels import ESTIMATOR_NAMES
+from twin.report.numbers import FAR
 from twin.report.spots_figure import GRAY, airy_radius, core_window, cross, mean_images, stretch
 from twin.report.svg import AFTER, BEFORE, BLUE, GREY, INK, LIGHT, VERMILION, look, to_png
 from twin.results import RenderRun
@@ -38,7 +39,7 @@ def _draw(run: RenderRun) -> Figure:
     tables = results(run)
     lines = 1 + sum(1 + len(table["rows"]) for table in tables)
     picture = WIDTH / columns
-    heights = (2.0 * picture + 0.5, 0.27 * lines + 0.35)
+    heights = (2.0 * picture + 0.5, 0.27 * lines + 0.5)
     figure = Figure(figsize=(WIDTH, sum(heights)), facecolor="white")
     top = heights[0] / sum(heights)
     before, after = mean_images(run)
@@ -77,7 +78,7 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
     count = 1 + sum(1 + len(table["rows"]) for table in tables)
-    axes.set_ylim(count + 0.7, 0.0)
+    axes.set_ylim(count + 1.2, 0.0)
     edges = [0.30, *(0.475 + 0.172 * k for k in range(len(ESTIMATORS)))]
     heads = ["true", *ESTIMATOR_NAMES.values()]
     y = 0.6
@@ -97,7 +98,5 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
                 axes.text(x - 0.013, y, text, fontsize=12.5, ha="right", va="center", color=INK)
                 mark, colour = ("▲", VERMILION) if cell["far"] else ("●", BLUE)
                 axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
-    note = (
-        "● within 3 sigma of the truth, ▲ beyond: another factor in the formula, or a motion that it does not know of"
-    )
-    axes.text(0.99, count + 0.25, note, fontsize=10.5, ha="right", va="center", color=GREY)
+    note = f"● within {FAR:g} sigma of the truth, ▲ beyond: a wrong factor, or a motion that the formula does not know"
+    axes.text(0.99, count + 0.7, note, fontsize=10.5, ha="right", va="center", color=GREY)

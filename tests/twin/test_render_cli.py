@@ -1,0 +1,440 @@
+"""`python -m twin.render` as a user runs it: results, exit codes, messages, and nothing left behind when it fails.
+
+Few tests start a process, since each needs seconds to begin; the others call the same command inside this one.
+"""
+
+import hashlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+from typer.testing import CliRunner
+
+import twin.render as command
+from scenes.load import EXAMPLES
+from twin.render_job import render_job
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = EXAMPLES / "perturb.yaml"
+FRAMES = 2
+CAMERAS, SIDES, STATES = ("forward", "backward"), ("left", "right"), ("before", "after")
+PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+ESTIMATORS = ("paper_single", "paper_joint", "derived", "model")
+IMAGES = {f"images/{c}_{s}_{t}" for c in CAMERAS for s in SIDES for t in STATES}
+FILES = {
+    "manifest.json",
+    "config.yaml",
+    "truth.json",
+    "recovered.json",
+    "crosstalk.json",
+    "irradiance.nc",
+    "report.html",
+    "scene.glb",
+    "summary.png",
+    *(f"{image}.tiff" for image in IMAGES),
+    *(f"{image}.png" for image in IMAGES),
+}
+# Signals that a shell set to "ignore" for a background job stay so in its children; a user's terminal has the default.
+AS_FROM_A_TERMINAL = (
+    "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "runpy.run_module('twin.render', run_name='__main__', alter_sys=True)"
+)
+
+
+def start(*arguments: object, **options: object) -> "subprocess.Popen[str]":
+    """The command as a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
+    code = [sys.executable, "-c", AS_FROM_A_TERMINAL, *map(str, arguments)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(code, cwd=ROOT, env=environment, start_new_session=True, **pipes, **options)
+
+
+def run(*arguments: object):
+    """The command inside this process: exit_code, stdout, stderr."""
+    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def files(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def frames_of(folder: Path) -> dict[str, np.ndarray]:
+    return {image: tifffile.imread(folder / f"{image}.tiff") for image in sorted(IMAGES)}
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """A run as a user starts it: the folder, what was printed, and the exit code."""
+    place = tmp_path_factory.mktemp("first")
+    process = start(EXAMPLE, "--out", place / "run", "--frames", FRAMES, "--seed", 5, "--json")
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    return place / "run", out, errors
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Two runs inside this process, one folder each, and what they computed: the first run again, and another seed."""
+    place = tmp_path_factory.mktemp("stored")
+    kept = []
+
+    def keep(*arguments, **options):
+        kept.append(render_job(*arguments, **options))
+        return kept[-1]
+
+    def repeat(config: Path):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(command, "render_job", keep)
+            again = run(config, "--out", place / "again", "--quiet")
+            other = run(EXAMPLE, "--out", place / "other", "--frames", FRAMES, "--seed", 6)
+        return place, again, other, kept
+
+    return repeat
+
+
+@pytest.fixture(scope="module")
+def repeated(first, stored):
+    return stored(first[0] / "config.yaml")
+
+
+@pytest.fixture
+def ready(repeated, monkeypatch):
+    """The computation is replaced by one that is done already, for tests of what comes before and after it."""
+    _, _, _, kept = repeated
+    monkeypatch.setattr(command, "render_job", lambda *arguments, **options: kept[0])
+
+
+# --- a run that works -------------------------------------------------------------------------------------------------
+
+
+def test_the_run_folder_is_complete(first):
+    folder, _, _ = first
+    assert files(folder) == FILES
+    assert files(folder.parent) == {f"run/{name}" for name in FILES}
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(manifest["sha256"]) == FILES - {"manifest.json"}
+    for name, digest in manifest["sha256"].items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+    assert (manifest["seed"], manifest["frames"], manifest["backend"]) == (5, FRAMES, "llvm")
+    assert manifest["wall_time_s"] > 0
+    assert {"python", "drjit", "numpy"} <= set(manifest["versions"])
+
+
+def test_json_is_all_that_is_printed(first):
+    folder, out, errors = first
+    assert errors == ""
+    assert out.count("\n") == 1
+    printed = json.loads(out)
+    assert set(printed) == {"truth", "recovered"}
+    for name in printed:
+        assert printed[name] == json.loads((folder / f"{name}.json").read_text())
+
+
+def test_keys_of_truth(first):
+    truth = json.loads((first[0] / "truth.json").read_text())
+    assert set(truth["cameras"]) == set(CAMERAS)
+    for camera in truth["cameras"].values():
+        assert set(PARAMETERS) <= set(camera)
+        assert all(np.isfinite(value) for value in camera.values())
+    assert np.isfinite(truth["intersection_angle"]["change_arcsec"])
+    assert truth["cameras"]["backward"]["d_beta_arcsec"] == pytest.approx(-2.02, abs=0.01)
+
+
+def test_keys_of_recovered(first):
+    recovered = json.loads((first[0] / "recovered.json").read_text())
+    with_sigma = {f"{key}{ending}" for key in PARAMETERS for ending in ("", "_sigma")}
+    for camera in CAMERAS:
+        assert set(recovered["cameras"][camera]) == set(ESTIMATORS)
+        for values in recovered["cameras"][camera].values():
+            assert set(values) == with_sigma
+            assert all(values[f"{key}_sigma"] > 0 for key in PARAMETERS)
+        assert set(recovered["spots"][camera]) == set(SIDES)
+        for side in SIDES:
+            assert set(recovered["spots"][camera][side]) == set(STATES)
+            for spot in recovered["spots"][camera][side].values():
+                assert set(spot) == {"row", "column", "sigma_row", "sigma_column"}
+                assert 0 < spot["row"] < 95
+    assert set(recovered["intersection_angle"]) == set(ESTIMATORS)
+    for values in recovered["intersection_angle"].values():
+        assert set(values) == {"change_arcsec", "change_arcsec_sigma"}
+
+
+def test_images_are_the_frames(first):
+    folder, _, _ = first
+    for image in sorted(IMAGES):
+        with tifffile.TiffFile(folder / f"{image}.tiff") as file:
+            assert len(file.pages) == FRAMES
+            assert file.pages[0].dtype == np.uint16
+            assert file.pages[0].shape == (96, 96)
+        assert (folder / f"{image}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_irradiance_opens(first):
+    with xr.open_dataset(first[0] / "irradiance.nc", engine="h5netcdf") as data:
+        assert data.photons.dims == ("state", "channel", "row", "column")
+        assert data.photons.shape == (2, 4, 96, 96)
+        assert list(data.state.values) == list(STATES)
+        assert list(data.channel.values) == [f"{c}/{s}" for c in CAMERAS for s in SIDES]
+        assert bool(np.isfinite(data.photons).all())
+        assert bool((data.photons >= 0).all())
+        assert data.attrs["wavelength_m"] == 650e-9
+
+
+def test_report_needs_nothing_from_outside(first):
+    text = (first[0] / "report.html").read_text("utf-8")
+    assert len(text) > 10_000
+    for reference in ('src="http', "src='http", '<link rel="stylesheet"', "@import", "<script src"):
+        assert reference not in text
+
+
+def test_config_repeats_the_run_bit_for_bit(first, repeated):
+    """The config of a run with --seed and --frames holds both, so that it alone repeats the run."""
+    folder, _, _ = first
+    place, again, _, _ = repeated
+    assert again.exit_code == 0
+    for name in ("truth.json", "recovered.json", "config.yaml"):
+        assert (place / "again" / name).read_bytes() == (folder / name).read_bytes()
+    one, two = frames_of(folder), frames_of(place / "again")
+    for image in one:
+        assert np.array_equal(one[image], two[image])
+
+
+def test_quiet_says_nothing(repeated):
+    _, again, _, _ = repeated
+    assert (again.stdout, again.stderr) == ("", "")
+
+
+def test_another_seed_is_other_noise_on_the_same_truth(first, repeated):
+    folder, _, _ = first
+    place, _, other, _ = repeated
+    assert other.exit_code == 0
+    assert (place / "other/truth.json").read_bytes() == (folder / "truth.json").read_bytes()
+    one, two = frames_of(folder), frames_of(place / "other")
+    for image in one:
+        assert np.mean(one[image] != two[image]) > 0.8
+
+
+def test_the_table_is_readable_in_a_narrow_terminal(repeated):
+    """No number is cut, and the table fits into 80 columns."""
+    place, _, other, _ = repeated
+    assert "…" not in other.stdout
+    assert str(place / "other") in other.stdout.replace("\n", "")
+    truth = json.loads((place / "other/truth.json").read_text())
+    for camera in CAMERAS:
+        assert camera in other.stdout
+        assert f"{truth['cameras'][camera]['d_alpha_arcsec']:.4f}" in other.stdout
+    table = [line for line in other.stdout.splitlines() if "d_" in line and '"' in line]
+    assert len(table) == 6
+    assert max(len(line) for line in table) <= 80
+
+
+def test_numbers_are_whole_however_narrow_the_terminal(ready, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "30")
+    result = run(EXAMPLE, "--out", tmp_path / "run")
+    assert result.exit_code == 0
+    assert "…" not in result.stdout
+    assert "-2.0226" in result.stdout
+
+
+def test_help_teaches():
+    result = run("--help")
+    assert result.exit_code == 0
+    for word in ("--out", "--seed", "--frames", "--backend", "--force", "--json", "--quiet", "rotate", "Exit codes"):
+        assert word in result.stdout
+
+
+def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for number in (1, 2):
+        assert run(EXAMPLE, "--quiet").exit_code == 0
+        assert (tmp_path / f"runs/perturb-00{number}/manifest.json").is_file()
+
+
+def test_force_replaces_a_run(ready, tmp_path):
+    assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet").exit_code == 0
+    (tmp_path / "run/note.txt").touch()
+    assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force").exit_code == 0
+    assert files(tmp_path / "run") == FILES
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+HEAD = "instrument: gf7_pair\nperturb:\n"
+BOMB = "\n".join(
+    ["a: &a [x, x, x]", *(f"{chr(98 + k)}: &{chr(98 + k)} [*{chr(97 + k)}, *{chr(97 + k)}]" for k in range(20))]
+)
+BAD_FILES = {
+    "unknown node": (
+        HEAD + "  base/forwards/M2: {shift: [0 um, 0 um, 3 um]}",
+        ("no such node", "base/forward/M2", ":3"),
+    ),
+    "unknown pivot": (HEAD + "  base/forward/focal_plane: {pivot: rear_nod}", ("pivot", "rear_node", ":3")),
+    "unknown key": (HEAD + "  base/forward/M2: {shfit: [0 um, 0 um, 3 um]}", ("unknown key", "shift", ":3")),
+    "unknown instrument": ("instrument: gf7_par", ("no such name in instruments", "gf7_pair")),
+    "unknown unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3 umm]}", ("unknown unit", "umm", ":3")),
+    "wrong unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3 deg]}", ("unit of an angle", ":3")),
+    "missing unit": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 3]}", ("without a unit", "shift[2]")),
+    "NaN": (HEAD + "  base/forward/M2: {shift: [0 um, .nan, 3 um]}", ("not a finite number", "shift[1]")),
+    "NaN with a unit": (HEAD + "  base/forward/M2: {shift: [0 um, nan um, 3 um]}", ("not a finite number",)),
+    "infinite": (HEAD + "  base/forward/M2: {shift: [0 um, .inf, 3 um]}", ("not a finite number",)),
+    "overflow": (HEAD + "  base/forward/M2: {shift: [0 um, 1e999 um, 3 um]}", ("not a finite number",)),
+    "absurd": (HEAD + "  base/forward/M2: {shift: [0 um, 0 um, 10 m]}", ("outside the limits", "10 m", "100 mm")),
+    "duplicate keys": (HEAD + "  base/forward/M2: {}\n  base/forward/M2: {}", ("duplicate key", "line 3", ":4")),
+    "YAML bomb": (BOMB, ("anchors are not allowed",)),
+    "tags": ("instrument: !!python/object/apply:os.system ['echo']", ("tags are not allowed",)),
+    "not YAML": ("instrument: [", ("not valid YAML",)),
+    "empty": ("", ("empty",)),
+    "binary": (b"\xff\xfe\x00", ("not UTF-8",)),
+    "too large": ("#" * 1_000_001, ("too large", "1 MB")),
+}
+
+
+def complains(result, *words: object) -> str:
+    """Exit code 2, one clear message on stderr and nothing else; returns the message."""
+    assert result.exit_code == 2, result.stdout + result.stderr
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("error:") == 1
+    assert "Traceback" not in result.stderr
+    for word in words:
+        assert str(word) in result.stderr
+    return result.stderr
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files(case, tmp_path):
+    content, words = BAD_FILES[case]
+    job = tmp_path / "job.yaml"
+    job.write_bytes(content if isinstance(content, bytes) else content.encode())
+    message = complains(run(job, "--out", tmp_path / "new/run"), job, *words)
+    assert len(message.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    complains(run(tmp_path / "none.yaml", "--out", tmp_path / "run"), "none.yaml: no such file")
+    complains(run(tmp_path, "--out", tmp_path / "run"), "is a directory")
+    complains(run("/dev/zero", "--out", tmp_path / "run"), "not a regular file")
+    locked = tmp_path / "locked.yaml"
+    locked.touch(mode=0)
+    if not os.access(locked, os.R_OK):  # root reads everything
+        complains(run(locked, "--out", tmp_path / "run"), "Permission denied")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--seed", "-1"],
+        ["--seed", "1.5"],
+        ["--seed", str(2**63)],
+        ["--frames", "0"],
+        ["--frames", "100000"],
+        ["--bakend", "llvm"],
+        ["--backend", "nonsense"],
+    ],
+)
+def test_bad_options(options, tmp_path):
+    result = run(EXAMPLE, "--out", tmp_path / "run", *options)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert options[0].strip("-") in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_job_at_all():
+    result = run()
+    assert result.exit_code == 2
+    assert "Missing argument" in result.stderr
+
+
+def test_output_that_exists(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").touch()
+    complains(run(EXAMPLE, "--out", tmp_path / "mine"), "exists", "--force")
+    complains(run(EXAMPLE, "--out", tmp_path / "mine", "--force"), "not a run folder")
+    (tmp_path / "file").touch()
+    complains(run(EXAMPLE, "--out", tmp_path / "file", "--force"), "is not a folder")
+    assert files(tmp_path) == {"mine/thesis.txt", "file"}
+
+
+def test_output_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").touch()
+    for place in (tmp_path / "file/run", tmp_path / ("n" * 300), "/proc/run", "/dev/null/run"):
+        complains(run(EXAMPLE, "--out", place), "the output folder")
+    assert files(tmp_path) == {"file"}
+
+
+TOO_MUCH = {
+    "beam off the mirrors": "base/forward/M1: {rotate: [3 deg, 0 deg, 0 deg], pivot: centre}",
+    "spot off the CCD": "base/forward/focal_plane: {shift: [0.6 mm, 0 um, 0 um]}",
+}
+
+
+@pytest.mark.parametrize("case", TOO_MUCH)
+def test_a_perturbation_that_loses_the_light_is_explained(case, tmp_path):
+    job = tmp_path / "job.yaml"
+    job.write_text(HEAD + "  " + TOO_MUCH[case])
+    message = complains(run(job, "--out", tmp_path / "run"), job, "base/forward/", "make them smaller")
+    assert "nan" not in message.lower()
+    assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
+
+
+def test_a_full_disk(ready, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (1000, 30_000, 100_000, 500_000):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            result = run(EXAMPLE, "--out", tmp_path / "new/run")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        message = complains(result, "cannot write to", "File too large", "nothing was kept")
+        assert len(message.splitlines()) == 1
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_no_gpu(tmp_path):
+    import drjit as dr
+
+    if dr.has_backend(dr.JitBackend.CUDA):
+        pytest.skip("there is a GPU")
+    result = run(EXAMPLE, "--out", tmp_path / "run", "--backend", "cuda")
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert "the cuda backend is not available" in result.stderr
+    assert "--backend llvm" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_leaves_nothing(number, code, tmp_path):
+    process = start(EXAMPLE, "--out", tmp_path / "new/run", "--quiet")
+    try:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.glob("new/.run.*.partial")):
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        time.sleep(0.3)
+        process.send_signal(number)
+        out, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == code
+    assert out == ""
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []

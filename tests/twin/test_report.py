@@ -1,0 +1,272 @@
+"""The report says what the results say, by itself: no other file, no network, nothing missing."""
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from analysis.recovery import ESTIMATORS
+from scenes.resolved import resolve
+from twin.render_job import render_job
+from twin.report import render_report
+from twin.report.content import goodness
+from twin.report.crosstalk_content import is_wrong
+from twin.report.labels import PARAMETERS
+from twin.report.numbers import FAR, decimals_for, fixed, plain, residual_text, significant
+from twin.report.systematics import systematics
+from twin.results import RenderRun
+from twin.summary_figure import write_summary
+
+VOID = {"meta", "br", "hr", "img", "input", "link", "col", "wbr"}
+NAMESPACES = ("http://www.w3.org/1999/xlink", "http://www.w3.org/2000/svg")
+
+
+@pytest.fixture(scope="module")
+def run(backend) -> RenderRun:
+    return render_job(resolve("scenes/examples/perturb.yaml"), backend)
+
+
+@pytest.fixture(scope="module")
+def page(run) -> str:
+    return render_report(run)
+
+
+class Cells(HTMLParser):
+    """Checks that tags are closed in order and collects the text of every cell with a data-key, and all text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.key: str | None = None
+        self.cells: dict[str, str] = {}
+        self.words: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.tags.append((tag, found))
+        if tag not in VOID:
+            self.open.append(tag)
+        if "data-key" in found:
+            self.key = found["data-key"]
+            assert self.key not in self.cells
+            self.cells[self.key] = ""
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+        if tag == "td":
+            self.key = None
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.words.append(data)
+        if self.key is not None:
+            self.cells[self.key] += data
+
+
+@pytest.fixture(scope="module")
+def parsed(page) -> Cells:
+    parser = Cells()
+    parser.feed(page)
+    parser.close()
+    assert parser.open == []
+    return parser
+
+
+def number(text: str) -> tuple[float, float]:
+    """Value of a shown number and half a unit of its last digit."""
+    plain_text = text.strip().replace("\N{MINUS SIGN}", "-").replace("+", "")
+    places = len(plain_text.partition(".")[2])
+    return float(plain_text), 0.5 * 10.0**-places * (1 + 1e-6)
+
+
+def test_well_formed_and_complete(page, parsed):
+    assert page.startswith("<!DOCTYPE html>")
+    titles = re.findall(r"<h2>(\d)", page)
+    assert titles == [str(k) for k in range(1, len(titles) + 1)]
+    assert len(titles) == 9
+    drawings = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
+    assert len(drawings) == 5  # two cameras' spots, residuals, side view, footprints
+    for drawing in drawings:
+        named = drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+        assert "xmlns:xlink" in drawing
+        ET.fromstring(named)
+
+
+def test_needs_nothing_else(page, parsed):
+    """No script, link, font or picture from outside; pictures are data in the page."""
+    text = page
+    for namespace in NAMESPACES:
+        text = text.replace(f'"{namespace}"', "")
+    assert not re.search(r"https?:|//www|@import|file:", text)
+    assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in parsed.tags}
+    images = [attrs for tag, attrs in parsed.tags if tag in ("img", "image")]
+    assert len(images) >= 16
+    for attrs in images:
+        source = attrs.get("src") or attrs.get("xlink:href") or attrs.get("href")
+        assert source is not None
+        assert source.startswith("data:image/png;base64,")
+    for tag, attrs in parsed.tags:
+        for name in ("href", "xlink:href", "src"):
+            value = attrs.get(name)
+            assert value is None or value.startswith(("#", "data:")), (tag, value)
+    assert len(page) < 4_000_000
+
+
+def test_nothing_is_missing(parsed):
+    words = " ".join(parsed.words)
+    for bad in ("nan", "NaN", "None", "inf", "np.float64"):
+        assert not re.search(rf"(?<![A-Za-z]){bad}(?![A-Za-z])", words), bad
+
+
+def test_recovered_and_true_are_the_results(run, parsed):
+    recovered, truth = run.recovered_dict(), run.truth_dict()
+    checked = 0
+    for name, estimators in recovered["cameras"].items():
+        for p in PARAMETERS:
+            shown, step = number(parsed.cells[f"{name}.{p.key}.true"])
+            assert shown == pytest.approx(truth["cameras"][name][p.key], abs=step)
+            for estimator in ESTIMATORS:
+                value, sigma = estimators[estimator][p.key], estimators[estimator][f"{p.key}_sigma"]
+                text = parsed.cells[f"{name}.{p.key}.{estimator}"]
+                match = re.fullmatch(r"(\S+) ± (\d+\.\d+)([●▲]) (\S+) σ", text.strip())
+                assert match is not None, text
+                for part, expected in zip(match.groups()[:2], (value, sigma), strict=True):
+                    shown, step = number(part)
+                    assert shown == pytest.approx(expected, abs=step)
+                    assert step < 0.06 * sigma  # digits enough to judge by
+                ratio = (value - truth["cameras"][name][p.key]) / sigma
+                assert match[4] == residual_text(ratio)
+                assert (match[3] == "▲") == (abs(ratio) > FAR)
+                checked += 1
+    assert checked == 32
+    for estimator, angle in recovered["intersection_angle"].items():
+        shown, step = number(parsed.cells[f"intersection_angle.{estimator}"].partition(" ±")[0])
+        assert shown == pytest.approx(angle["change_arcsec"], abs=step)
+
+
+def test_spot_positions_are_the_results(run, parsed):
+    pitch = 1e6 * run.experiment.path.pitch
+    checked = 0
+    for camera, sides in run.recovered_dict()["spots"].items():
+        for side, one in sides.items():
+            for axis in ("row", "column"):
+                key = f"{camera}/{side}.{axis}"
+                shift = one["after"][axis] - one["before"][axis]
+                expected = {
+                    "before": one["before"][axis],
+                    "after": one["after"][axis],
+                    "shift_px": shift,
+                    "shift_um": shift * pitch,
+                }
+                for column, value in expected.items():
+                    shown, step = number(parsed.cells[f"{key}.{column}"].partition(" ±")[0])
+                    assert shown == pytest.approx(value, abs=step)
+                    checked += 1
+    assert checked == 32
+
+
+def test_factors_are_the_results(run, parsed):
+    for name, table in run.crosstalk.items():
+        for f in table.factors:
+            for which in ("by_model", "by_truth"):
+                shown, step = number(parsed.cells[f"factor.{name}.{f.estimator}.{f.parameter}.{which}"])
+                assert shown == pytest.approx(getattr(f, which), abs=step)
+
+
+def test_every_motion_and_perturbation_is_named(run, parsed):
+    words = " ".join(parsed.words)
+    for path in run.state:
+        assert path in words
+    assert "rotate (2, \N{MINUS SIGN}1.5, 10) arcsec" in words
+    assert "shift (0, 0, 3) µm" in words
+    for table in run.crosstalk.values():
+        for motion in table.motions:
+            assert motion.body.removeprefix("base/") in words
+        for statement in table.observability.statements[1:]:
+            assert statement.partition(": ")[0].replace("[um]", "[µm]") in words
+
+
+def test_crosstalk_explains_the_systematic_residuals(run):
+    """What the table predicts is what is left beside noise: 4.5 sigma in one of eight is a false alarm of 5e-5."""
+    checked = 0
+    largest = 0.0
+    for name in run.crosstalk:
+        bias = systematics(run, name).bias["model"]
+        for k, p in enumerate(PARAMETERS):
+            model = run.recovered_dict()["cameras"][name]["model"]
+            error = model[p.key] - run.truth_dict()["cameras"][name][p.key]
+            largest = max(largest, abs(error) / model[f"{p.key}_sigma"])
+            assert abs(error - bias[k]) < 4.5 * model[f"{p.key}_sigma"]
+            checked += 1
+    assert checked == 8
+    assert largest > 50  # there was something to explain
+    texts = {g["name"]: g for g in goodness(run)}
+    assert "M2 along Z, 3 um" in texts["forward"]["outside"]
+    assert "tilt" in texts["backward"]["outside"]
+    assert not texts["forward"]["uncovered"]
+
+
+def test_nothing_perturbed(backend, tmp_path):
+    job = tmp_path / "nothing.yaml"
+    job.write_text("instrument: gf7_pair\nrender: {images: [spots], frames: 2, seed: 3}\n")
+    run = render_job(resolve(job), backend)
+    page = render_report(run)
+    parser = Cells()
+    parser.feed(page)
+    assert parser.open == []
+    assert "Nothing was perturbed" in page
+    assert "nothing moved outside the family" in page
+    assert number(parser.cells["forward.d_f_um.true"])[0] == 0
+
+
+def test_summary_picture(run, tmp_path):
+    place = tmp_path / "summary.png"
+    write_summary(run, place)
+    image = cv2.imread(str(place))
+    assert image.shape[1] == 1400
+    assert 600 < image.shape[0] < 1600
+    assert image.std() > 20
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (3e-7, "0"),
+        (0.03637, "0.0364"),
+        (-4.0337, "\N{MINUS SIGN}4.03"),
+        (0.99999, "1.00"),
+        (-2.72e-4, "\N{MINUS SIGN}2.7e\N{MINUS SIGN}4"),
+        (54.58, "54.6"),
+        (math.nan, "\N{EM DASH}"),
+    ],
+)
+def test_significant_digits(value, text):
+    assert significant(value) == text
+
+
+def test_decimals_follow_sigma():
+    assert [decimals_for(s) for s in (0.013, 0.99, 12.0, 3.4e-4, 0.0)] == [3, 2, 0, 5, 4]
+    assert fixed(-0.00001, 3, sign=True) == "0.000"
+    assert fixed(1.23456, 3, sign=True) == "+1.235"
+    assert plain(650.0) == "650"
+    assert residual_text(-1234.4) == "\N{MINUS SIGN}1\N{NARROW NO-BREAK SPACE}234"
+    assert residual_text(None) == "\N{EM DASH}"
+
+
+def test_what_is_marked_wrong():
+    assert is_wrong(1.2, 1.0)
+    assert not is_wrong(1.05, 1.0)
+    assert is_wrong(1e-3, 0.0)
+    assert not is_wrong(1e-7, 0.0)
+    assert not is_wrong(1e-3, 0.0, floor=2e-3)
+    assert not np.isnan(FAR)

@@ -1,0 +1,241 @@
+"""A run folder appears whole or not at all."""
+
+import hashlib
+import json
+import os
+import resource
+import stat
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from twin import run_folder
+from twin.run_folder import MANIFEST, RunFolder, RunFolderError, is_run_folder, next_free
+
+
+def everything(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+def a_run(target: Path, text: str = "first", force: bool = False) -> Path:
+    with RunFolder(target, force) as folder:
+        folder.write_text("a/b.txt", text)
+        folder.write_json(MANIFEST, {"program": "twin.test", "sha256": folder.checksums()})
+    return target
+
+
+def test_files_appear_at_the_end_and_all_at_once(tmp_path):
+    target = tmp_path / "run"
+    with RunFolder(target) as folder:
+        folder.write_text("text.txt", "ä\n")
+        folder.write_json("deep/down/data.json", {"x": [1.5, None]})
+        folder.write_with("deep/array.npy", lambda place: np.save(place, np.arange(3)))
+        assert not target.exists()
+        assert folder.path.parent == tmp_path  # the same file system, so that the rename is one step
+        sums = folder.checksums()
+    assert everything(tmp_path) == {
+        "run",
+        "run/text.txt",
+        "run/deep",
+        "run/deep/array.npy",
+        "run/deep/down",
+        "run/deep/down/data.json",
+    }
+    assert set(sums) == {"text.txt", "deep/array.npy", "deep/down/data.json"}
+    for name, digest in sums.items():
+        assert hashlib.sha256((target / name).read_bytes()).hexdigest() == digest
+    assert (target / "text.txt").read_text("utf-8") == "ä\n"
+    assert json.loads((target / "deep/down/data.json").read_text()) == {"x": [1.5, None]}
+
+
+def test_permissions_follow_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        target = a_run(tmp_path / "run")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(target.stat().st_mode) == 0o750
+
+
+def break_off(folder: RunFolder, error: BaseException, act=lambda: None) -> None:
+    """Write a file, do something else, and fail."""
+    with folder:
+        folder.write_text("a/b.txt", "half")
+        act()
+        raise error
+
+
+@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(3), MemoryError()])
+def test_nothing_stays_when_something_goes_wrong(tmp_path, error):
+    with pytest.raises(type(error)):
+        break_off(RunFolder(tmp_path / "new" / "deeper" / "run"), error)
+    assert everything(tmp_path) == set()
+
+
+def test_parents_that_others_use_stay(tmp_path):
+    with pytest.raises(ValueError, match="x"):
+        break_off(RunFolder(tmp_path / "new" / "run"), ValueError("x"), (tmp_path / "new" / "other.txt").touch)
+    assert everything(tmp_path) == {"new", "new/other.txt"}
+
+
+def test_a_failing_disk_is_one_sentence(tmp_path):
+    def fail(place: Path) -> None:
+        place.write_text("half")
+        raise OSError(28, "a page of\nlibrary internals", str(place))
+
+    with (
+        pytest.raises(RunFolderError, match=r"^cannot write to .*run: No space left on device; nothing was kept$"),
+        RunFolder(tmp_path / "run") as folder,
+    ):
+        folder.write_with("big.bin", fail)
+    assert everything(tmp_path) == set()
+
+
+@contextmanager
+def largest_file(size: int):
+    """Files of this process cannot grow beyond ``size``: EFBIG in place of ENOSPC."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+WRITERS = {
+    "text": lambda folder, data: folder.write_text("a.txt", "x" * data.nbytes),
+    "json": lambda folder, data: folder.write_json("a.json", data.ravel().tolist()),
+    "a library": lambda folder, data: folder.write_with("a.csv", lambda place: np.savetxt(place, data)),
+    # HDF5 itself must not write to a full disk: closing the file then crashes the process
+    "netcdf": lambda folder, data: folder.write_bytes(
+        "a.nc", xr.Dataset({"a": (("x", "y"), data)}).to_netcdf(engine="h5netcdf")
+    ),
+}
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("size", [1000, 100_000])
+def test_a_full_disk(tmp_path, writer, size):
+    data = np.random.default_rng(1).random((200, 300))
+    with (
+        pytest.raises(RunFolderError, match=r"cannot write to [^\n]*: File too large; nothing was kept$"),
+        largest_file(size),
+        RunFolder(tmp_path / "run") as folder,
+    ):
+        WRITERS[writer](folder, data)
+    assert everything(tmp_path) == set()
+
+
+def test_nan_is_no_json(tmp_path):
+    with pytest.raises(ValueError, match="JSON"), RunFolder(tmp_path / "run") as folder:
+        folder.write_json("a.json", {"x": float("nan")})
+    assert everything(tmp_path) == set()
+
+
+def test_an_existing_folder_is_kept(tmp_path):
+    target = a_run(tmp_path / "run")
+    with pytest.raises(RunFolderError, match=r"exists; choose another with --out, or replace it with --force"):
+        RunFolder(target)
+    assert (target / "a/b.txt").read_text() == "first"
+
+
+def test_force_replaces_a_run(tmp_path):
+    target = a_run(tmp_path / "run")
+    (target / "old.txt").touch()
+    a_run(target, "second", force=True)
+    assert everything(tmp_path) == {"run", "run/a", "run/a/b.txt", f"run/{MANIFEST}"}
+    assert (target / "a/b.txt").read_text() == "second"
+
+
+def test_force_replaces_an_empty_folder(tmp_path):
+    (tmp_path / "run").mkdir()
+    a_run(tmp_path / "run", force=True)
+    assert is_run_folder(tmp_path / "run")
+
+
+def test_force_keeps_the_old_run_when_the_new_one_fails(tmp_path):
+    target = a_run(tmp_path / "run")
+    with pytest.raises(ValueError, match="x"):
+        break_off(RunFolder(target, force=True), ValueError("x"))
+    assert (target / "a/b.txt").read_text() == "first"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_force_puts_the_old_run_back_when_the_rename_fails(tmp_path, monkeypatch):
+    target = a_run(tmp_path / "run")
+    real = os.rename
+
+    def rename(source, end):
+        if str(source).endswith(".partial"):
+            raise OSError(13, "no")
+        real(source, end)
+
+    monkeypatch.setattr(run_folder.os, "rename", rename)
+    with pytest.raises(RunFolderError, match="Permission denied"):
+        a_run(target, "second", force=True)
+    assert (target / "a/b.txt").read_text() == "first"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    "manifest", [None, "", "[]", '{"name": "a web page"}', '{"program": "other.tool", "sha256": {}}', "\xff"]
+)
+def test_force_replaces_nothing_that_is_not_a_run(tmp_path, manifest):
+    """Web applications and browser extensions keep a manifest.json as well."""
+    target = tmp_path / "precious"
+    target.mkdir()
+    (target / "thesis.txt").touch()
+    if manifest is not None:
+        (target / MANIFEST).write_text(manifest, encoding="latin-1")
+    with pytest.raises(RunFolderError, match="is not a run folder"):
+        RunFolder(target, force=True)
+    assert (target / "thesis.txt").exists()
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_file_or_a_link_in_the_way(tmp_path, force):
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="is not a folder"):
+        RunFolder(tmp_path / "file", force)
+    (tmp_path / "link").symlink_to(a_run(tmp_path / "run"))
+    with pytest.raises(RunFolderError, match="is not a folder"):
+        RunFolder(tmp_path / "link", force)
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(RunFolderError, match="is not a folder"):
+        RunFolder(tmp_path / "dangling", force)
+
+
+def test_a_place_that_cannot_be(tmp_path):
+    (tmp_path / "file").touch()
+    for target in (tmp_path / "file" / "run", tmp_path / ("n" * 300) / "run", tmp_path / ("n" * 250)):
+        with pytest.raises(RunFolderError, match=r"^cannot (make|look at) the output folder"), RunFolder(target):
+            pytest.fail("the block must not run")
+    assert everything(tmp_path) == {"file"}
+
+
+def test_somebody_else_takes_the_name_meanwhile(tmp_path):
+    target = tmp_path / "run"
+
+    def take() -> None:
+        target.mkdir()
+        (target / "theirs.txt").touch()
+
+    def lose() -> None:
+        with RunFolder(target) as folder:
+            folder.write_text("a.txt", "mine")
+            take()
+
+    with pytest.raises(RunFolderError, match="in place"):
+        lose()
+    assert everything(tmp_path) == {"run", "run/theirs.txt"}
+
+
+def test_next_free(tmp_path):
+    assert next_free(tmp_path, "job") == tmp_path / "job-001"
+    (tmp_path / "job-001").mkdir()
+    (tmp_path / "job-002").symlink_to(tmp_path / "nowhere")
+    assert next_free(tmp_path, "job") == tmp_path / "job-003"

@@ -1,0 +1,169 @@
+"""scene.glb holds every body where the perturbed instrument has it."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from optics.tree import Motion
+from scenes.instrument_model import BASE
+from twin.light_paths import FIELDS, trace_light_paths
+from twin.scene_file import BOARD, build_scene, mirror_mesh
+
+TOLERANCE = 1e-3
+"""Metres: meshes and float32 files are for looking at."""
+STATE = {
+    "base/forward/M2": Motion(shift=(0.0, 0.0, 2e-3)),  # enough to be seen in a millimetre's tolerance
+    "base/backward/focal_plane": Motion(rotate=(0.0, 0.0, 0.02)),
+}
+
+
+@pytest.fixture(scope="module")
+def paths(backend, gf7_pair):
+    small = {path: Motion(motion.rotate, (0.0, 0.0, 1e-5)) for path, motion in STATE.items() if "M2" in path}
+    return trace_light_paths(gf7_pair, backend, small)
+
+
+@pytest.fixture(scope="module")
+def loaded(gf7_pair, paths, tmp_path_factory):
+    """The scene of a state with large motions, written and read back."""
+    placed = gf7_pair.assembly.place([STATE])
+    scene = build_scene(gf7_pair, type(paths)(paths.beams, placed))
+    place = tmp_path_factory.mktemp("scene") / "scene.glb"
+    place.write_bytes(scene.export(file_type="glb"))
+    return trimesh.load_scene(place), placed
+
+
+def box(scene: trimesh.Scene, name: str) -> np.ndarray:
+    """Bounds of a node's mesh in the base frame, (2, 3) metres."""
+    matrix, geometry = scene.graph.get(name)
+    points = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def test_every_body_is_a_node_where_it_stands(gf7_pair, loaded):
+    scene, placed = loaded
+    for body in gf7_pair.assembly.tree.bodies:
+        assert body.path in scene.graph.nodes
+        matrix, _ = scene.graph.get(body.path)
+        pose = placed.pose(body.path)
+        assert np.abs(matrix[:3, 3] - pose.translation).max() < 1e-6
+        assert np.abs(matrix[:3, :3] - pose.rotation).max() < 1e-6
+    assert scene.graph.transforms.parents["base/forward/M1"] == "base/forward"
+
+
+def test_boxes_of_mirrors_and_detectors(gf7_pair, loaded):
+    """Front surfaces sampled from the prescription's sag, detectors from their sizes, all in the base frame."""
+    scene, placed = loaded
+    checked = 0
+    for camera, model in gf7_pair.cameras.items():
+        for mirror in model.mirrors:
+            path = f"{BASE}/{camera}/{mirror}"
+            outline = model.apertures[mirror].outline()
+            z = model.surfaces[mirror].sag(*outline.T)
+            front = placed.pose(path).apply(np.column_stack([outline, z]))
+            found = box(scene, path)
+            # across, the mesh ends where the clear aperture does; along the axis it has its thickness as well
+            assert np.all(found[0] < front.min(axis=0) + TOLERANCE)
+            assert np.all(found[1] > front.max(axis=0) - TOLERANCE)
+            assert np.abs(found[:, 1] - [front[:, 1].min(), front[:, 1].max()]).max() < TOLERANCE
+            local = scene.geometry[scene.graph.get(path)[1]].vertices
+            x0, x1, y0, y1 = model.apertures[mirror].bounds
+            assert np.allclose([*local.min(axis=0)[:2], *local.max(axis=0)[:2]], [x0, y0, x1, y1], atol=TOLERANCE)
+            assert np.ptp(local[:, 2]) < np.ptp(z) + 0.1 * max(x1 - x0, y1 - y0)
+            checked += 1
+        line = 0.5 * model.spec.line.pixels * model.spec.line.pitch
+        body = f"{BASE}/{camera}/focal_plane/line"
+        ends = placed.pose(body).apply(np.array([[0.0, -line, 0.0], [0.0, line, 0.0]]))
+        assert np.abs(box(scene, body) - np.sort(ends, axis=0)).max() < 1.6e-3  # and it is drawn 2 mm wide
+        checked += 1
+    ccd = gf7_pair.spec.monitor.area_ccd
+    for channel in gf7_pair.channels:
+        corners = (
+            0.5 * ccd.pitch * np.array([[sx * ccd.columns, sy * ccd.rows, 0.0] for sx in (-1, 1) for sy in (-1, 1)])
+        )
+        world = placed.pose(channel.ccd_body).apply(corners)
+        assert np.abs(box(scene, channel.ccd_body) - [world.min(axis=0), world.max(axis=0)]).max() < TOLERANCE
+        radius = 0.5 * gf7_pair.spec.monitor.return_face.aperture
+        face = box(scene, channel.face_body)
+        centre = placed.pose(channel.face_body).translation
+        assert np.all(face[0] < centre + TOLERANCE)
+        assert np.all(face[1] > centre - TOLERANCE)
+        assert face[1, 1] - face[0, 1] == pytest.approx(2 * radius, abs=TOLERANCE)
+        checked += 2
+    assert checked == 2 * 4 + 4 * 2
+
+
+def test_the_state_is_seen(gf7_pair, loaded):
+    scene, _ = loaded
+    nominal = gf7_pair.assembly.place().pose("base/forward/M2")
+    moved = scene.graph.get("base/forward/M2")[0][:3, 3] - nominal.translation
+    assert np.linalg.norm(moved) == pytest.approx(2e-3, rel=1e-3)
+
+
+def test_meshes_are_solid_and_behind_the_light(gf7_pair, loaded):
+    scene, _ = loaded
+    solid = [name for name in scene.geometry if not name.startswith("light/")]
+    assert len(solid) > 20
+    for name in solid:
+        mesh = scene.geometry[name]
+        assert mesh.is_watertight, name
+        assert mesh.volume > 0, name
+    for camera, model in gf7_pair.cameras.items():
+        for mirror in model.mirrors:  # the reflecting side is the one that the next element is on
+            mesh = scene.geometry[scene.graph.get(f"{BASE}/{camera}/{mirror}")[1]]
+            middle = model.apertures[mirror].outline().mean(axis=0)
+            sag = float(model.surfaces[mirror].sag(*middle))
+            back = float(mesh.vertices[:, 2].mean()) - sag
+            index = model.mirrors.index(mirror)
+            following = [model.vertex(m)[2] for m in model.mirrors] + [model.spec.image.z]
+            assert np.sign(back) == -np.sign(following[index + 1] - following[index])
+    board = scene.geometry[scene.graph.get("base/forward/focal_plane")[1]]
+    assert board.extents[2] == pytest.approx(BOARD, abs=1e-6)
+    assert board.vertices[:, 2].min() > 0  # behind the detectors: light arrives along +Z
+
+
+def test_light_is_there_in_its_colours(gf7_pair, paths, loaded):
+    scene, _ = loaded
+    names = {name for name in scene.graph.nodes if name.startswith("light/")}
+    assert len(names) == len(paths.beams) == 2 * (len(FIELDS) + 2)
+    for name in names:
+        assert scene.geometry[scene.graph.get(name)[1]].vertices.shape[0] > 100
+    colours = {
+        kind: {tuple(scene.geometry[n].visual.material.baseColorFactor) for n in scene.geometry if kind in n}
+        for kind in ("/imaging/", "/monitor/")
+    }
+    assert not colours["/imaging/"] & colours["/monitor/"]
+
+
+def test_beams_go_where_they_must(gf7_pair, paths):
+    """Imaging beams fill the stop and end on the line CCD, monitor beams on their area CCD; none leaves an aperture."""
+    for beam in paths.beams:
+        model = gf7_pair.cameras[beam.camera]
+        for (mirror, _), points in beam.footprints.items():
+            x0, x1, y0, y1 = model.apertures[mirror].bounds
+            assert np.all(points >= np.array([x0, y0]) - 1e-5)
+            assert np.all(points <= np.array([x1, y1]) + 1e-5)
+        if beam.is_monitor:
+            assert len(beam.footprints) == 2 * len(model.mirrors)
+            mine = (c for c in gf7_pair.channels if f"{c.camera}/monitor/{c.side}" == f"{beam.camera}/{beam.name}")
+            channel = next(mine)
+            ccd = paths.placed.pose(channel.ccd_body).inverse().apply(beam.vertices[:, -1])
+            assert np.abs(ccd).max() < 1e-3
+        else:
+            plane = paths.placed.pose(f"{BASE}/{beam.camera}/focal_plane").inverse().apply(beam.vertices[:, -1])
+            assert np.abs(plane[:, [0, 2]]).max() < 1e-9
+            stop = beam.footprints[model.spec.stop, 0]
+            radius = model.apertures[model.spec.stop].bounds[1]
+            assert np.linalg.norm(stop[1:], axis=1) == pytest.approx(radius, abs=2e-6)
+            rays = np.diff(beam.vertices[:, :2], axis=1)[:, 0]
+            angle = rays @ rays[0] / np.linalg.norm(rays, axis=1) / np.linalg.norm(rays[0])
+            assert np.all(angle > 1 - 1e-9)  # collimated toward the scene
+
+
+def test_mirror_mesh_follows_the_sag(gf7):
+    for name in gf7.mirrors:
+        mesh = mirror_mesh(gf7.surfaces[name], gf7.apertures[name], 1.0)
+        triangles = mesh.triangles_center
+        inside = triangles[mesh.face_normals[:, 2] < -0.5]
+        assert len(inside) > 500
+        assert np.abs(inside[:, 2] - gf7.surfaces[name].sag(inside[:, 0], inside[:, 1])).max() < TOLERANCE

@@ -1,0 +1,67 @@
+"""``report.html``: one self-contained page that says what a run did, what it found and how far to trust it."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from twin.light_paths import trace_light_paths
+from twin.report import content, crosstalk_content, labels
+from twin.report.light_path_figure import footprints_svg, side_view_svg
+from twin.report.numbers import FAR
+from twin.report.residual_figure import residuals_svg
+from twin.report.spots_figure import spots_svg
+from twin.results import RenderRun
+from twin.versions import versions
+
+__all__ = ["render_report", "write_report"]
+
+TEMPLATE = "report.html.j2"
+
+
+def write_report(run: RenderRun, place: Path) -> None:
+    """Write the report of a run.
+
+    Args:
+        run: the run.
+        place: the HTML file.
+    """
+    place.write_text(render_report(run), encoding="utf-8")
+
+
+def render_report(run: RenderRun) -> str:
+    """The page as text."""
+    experiment = run.experiment
+    paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
+    tables = content.results(run)
+    names = list(experiment.instrument.cameras)
+    figures = {
+        "spots": {name: Markup(spots_svg(run, name)) for name in names},
+        "residuals": Markup(residuals_svg(content.residual_panels(tables), labels.ESTIMATOR_NAMES)),
+        "side": Markup(side_view_svg(experiment.instrument, paths)),
+        "footprints": Markup(footprints_svg(experiment.instrument, paths)),
+    }
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
+    return template.render(
+        setup=content.setup(run),
+        tables=tables,
+        summary=content.summary(tables),
+        spots=content.spots(run),
+        goodness=content.goodness(run),
+        crosstalk=crosstalk_content.crosstalk_tables(run),
+        wrong_percent=round(100 * crosstalk_content.WRONG),
+        factors=crosstalk_content.factors(run),
+        statements=crosstalk_content.statements(run),
+        figures=figures,
+        labels=labels,
+        far=f"{FAR:g}",
+        run=run,
+        pitch_um=f"{1e6 * experiment.path.pitch:g}",
+        config=run.resolved.to_yaml(),
+        versions=versions(),
+        backend=experiment.backend.name,
+    )

@@ -1,0 +1,210 @@
+"""What the report says: the results as text and tables, ready for the template."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from analysis.recovery import ESTIMATORS
+from optics.tree import Motion
+from scenes.instrument_model import BASE
+from twin.motions import ARCSEC
+from twin.report.labels import CENTROID_NOTES, PARAMETERS
+from twin.report.numbers import FAR, decimals_for, fixed, plain, residual, residual_text
+from twin.report.systematics import joined, systematics
+from twin.results import RenderRun
+
+ANGLE_LABEL = "change of the angle between the two lines of sight"
+
+
+def setup(run: RenderRun) -> dict[str, Any]:
+    """Instrument, exposure and perturbations."""
+    spec, instrument = run.resolved.instrument, run.experiment.instrument
+    cameras = []
+    for name, model in instrument.cameras.items():
+        focal = run.experiment.nominal_truth.principal_distance[name]
+        site, line = spec.cameras[name], model.spec.line
+        cameras.append(
+            {
+                "name": name,
+                "model": model.spec.name,
+                "look": fixed(float(np.degrees(site.look)), 2, sign=True),
+                "focal": fixed(focal, 4),
+                "f_number": fixed(focal / model.spec.entrance_pupil, 1),
+                "line": f"{line.pixels} × {plain(1e6 * line.pitch)} µm = {fixed(1e3 * line.pixels * line.pitch, 1)} mm",
+                "separation": fixed(1e3 * instrument.separation[name], 2),
+            }
+        )
+    monitor = spec.monitor
+    ccd = monitor.area_ccd
+    facts = [
+        ("Instrument", f"{spec.name}: {spec.description}".rstrip(": ")),
+        (
+            "Monitor",
+            f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
+            f"{plain(1e3 * monitor.return_face.aperture)} mm wide, area CCDs at "
+            f"±{plain(float(np.degrees(monitor.field)))}° of field",
+        ),
+        (
+            "Area CCD",
+            f"{ccd.rows} × {ccd.columns} pixels of {plain(1e6 * ccd.pitch)} µm, "
+            f"{run.resolved.detector.bit_depth} bits, exposure {plain(1e3 * ccd.exposure)} ms",
+        ),
+        (
+            "Light",
+            f"{plain(1e-6 * monitor.reticle.photons_per_frame)} million photons per spot and frame expected at the CCD",
+        ),
+        ("Frames", f"{run.frames} before and {run.frames} after, seed {run.seed}"),
+        ("Spot centres", CENTROID_NOTES[run.resolved.job.analysis.centroid]),
+    ]
+    moved = [{"node": path, "motion": _motion_text(m), "pivot": m.pivot} for path, m in run.state.items()]
+    return {"cameras": cameras, "facts": facts, "perturbations": moved, "warnings": run.warnings}
+
+
+def _motion_text(motion: Motion) -> str:
+    parts = []
+    for name, vector, unit, size in (("rotate", motion.rotate, "arcsec", ARCSEC), ("shift", motion.shift, "µm", 1e-6)):
+        if any(vector):
+            parts.append(f"{name} ({', '.join(plain(v / size) for v in vector)}) {unit}")
+    if motion.scale:
+        parts.append(f"scale {plain(1e6 * motion.scale)} ppm")
+    terms = [f"Z{j} {plain(1e9 * a)} nm" for j, a in motion.figure.items() if a]
+    if terms:
+        parts.append(f"figure {', '.join(terms)}")
+    return "; ".join(parts) or "nothing (all zero)"
+
+
+def results(run: RenderRun) -> list[dict[str, Any]]:
+    """Tables of recovered against true: one per camera, one for the angle."""
+    recovered, truth = run.recovered_dict(), run.truth_dict()
+    tables = []
+    for name, estimators in recovered["cameras"].items():
+        rows = []
+        for p in PARAMETERS:
+            values = {e: (estimators[e][p.key], estimators[e][f"{p.key}_sigma"]) for e in ESTIMATORS}
+            rows.append(_row(f"{name}.{p.key}", p.symbol, p.unit, p.meaning, truth["cameras"][name][p.key], values))
+        tables.append({"title": f"Camera {name}", "rows": rows})
+    if "intersection_angle" in truth:
+        angle = recovered["intersection_angle"]
+        values = {e: (angle[e]["change_arcsec"], angle[e]["change_arcsec_sigma"]) for e in ESTIMATORS}
+        true = truth["intersection_angle"]
+        nominal = fixed(true["nominal_deg"], 4)
+        row = _row("intersection_angle", "Δθ", "arcsec", ANGLE_LABEL, true["change_arcsec"], values)
+        tables.append({"title": f"Angle between the cameras, nominally {nominal}°", "rows": [row]})
+    return tables
+
+
+def _row(
+    key: str, symbol: str, unit: str, meaning: str, true: float, values: dict[str, tuple[float, float]]
+) -> dict[str, Any]:
+    finest = min((s for _, s in values.values() if s > 0), default=0.0)
+    cells = []
+    for estimator, (value, sigma) in values.items():
+        places = decimals_for(sigma)
+        ratio = residual(value - true, sigma)
+        cells.append(
+            {
+                "key": f"{key}.{estimator}",
+                "value": fixed(value, places),
+                "sigma": fixed(sigma, places),
+                "residual": residual_text(ratio),
+                "far": ratio is not None and abs(ratio) > FAR,
+                "ratio": ratio,
+            }
+        )
+    return {
+        "key": key,
+        "symbol": symbol,
+        "unit": unit,
+        "meaning": meaning,
+        "true": fixed(true, decimals_for(finest)),
+        "cells": cells,
+    }
+
+
+def residual_panels(tables: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """The residuals of ``results`` for the figure."""
+
+    def ratios(row: dict[str, Any]) -> dict[str, float | None]:
+        return {e: cell["ratio"] for e, cell in zip(ESTIMATORS, row["cells"], strict=True)}
+
+    return {table["title"]: {row["symbol"]: ratios(row) for row in table["rows"]} for table in tables}
+
+
+def spots(run: RenderRun) -> list[dict[str, Any]]:
+    """Measured spot positions and shifts."""
+    rows = []
+    pitch = 1e6 * run.experiment.path.pitch
+    measured = run.recovered_dict()["spots"]
+    for i, channel in enumerate(run.experiment.path.channels):
+        one = measured[channel.camera][channel.side]
+        covariance = run.recovery.shift_covariance[0, i // 2]
+        for j, axis in enumerate(("row", "column")):
+            start, end = one["before"], one["after"]
+            shift = end[axis] - start[axis]
+            k = 2 * (i % 2) + j
+            sigma = float(np.sqrt(covariance[k, k]))
+            rows.append(
+                {
+                    "key": f"{channel.key}.{axis}",
+                    "channel": f"{channel.camera} {channel.side}",
+                    "first": axis == "row",
+                    "axis": axis,
+                    "before": _with_sigma(start[axis], start[f"sigma_{axis}"]),
+                    "after": _with_sigma(end[axis], end[f"sigma_{axis}"]),
+                    "shift_px": _with_sigma(shift, sigma, sign=True),
+                    "shift_um": _with_sigma(shift * pitch, sigma * pitch, sign=True),
+                }
+            )
+    return rows
+
+
+def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
+    places = decimals_for(sigma)
+    return f"{fixed(value, places, sign)} ± {fixed(sigma, places)}"
+
+
+def goodness(run: RenderRun) -> list[dict[str, Any]]:
+    """Residuals of the model against what the crosstalk table says they must be."""
+    out = []
+    recovered, truth = run.recovered_dict()["cameras"], run.truth_dict()["cameras"]
+    for name in run.experiment.instrument.cameras:
+        found = systematics(run, name)
+        rows = []
+        for k, p in enumerate(PARAMETERS):
+            sigma = recovered[name]["model"][f"{p.key}_sigma"]
+            error = recovered[name]["model"][p.key] - truth[name][p.key]
+            bias = float(found.bias["model"][k])
+            places = decimals_for(sigma)
+            left = residual(error - bias, sigma)
+            rows.append(
+                {
+                    "symbol": p.symbol,
+                    "unit": p.unit,
+                    "error": fixed(error, places, sign=True),
+                    "in_sigma": residual_text(residual(error, sigma)),
+                    "bias": fixed(bias, places, sign=True),
+                    "left": fixed(error - bias, places, sign=True),
+                    "left_in_sigma": residual_text(left),
+                    "far": left is not None and abs(left) > FAR,
+                }
+            )
+        out.append({"name": name, "rows": rows, "outside": joined(found.outside), "uncovered": joined(found.uncovered)})
+    return out
+
+
+def summary(tables: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many of each estimator's readings agree with the truth."""
+    counts = {e: [0, 0] for e in ESTIMATORS}
+    for table in tables:
+        for row in table["rows"]:
+            for estimator, cell in zip(ESTIMATORS, row["cells"], strict=True):
+                counts[estimator][1] += 1
+                counts[estimator][0] += not cell["far"]
+    return {e: {"good": good, "all": every} for e, (good, every) in counts.items()}
+
+
+def body_name(path: str) -> str:
+    """A body's path without the base."""
+    return path.removeprefix(f"{BASE}/")

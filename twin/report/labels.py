@@ -1,0 +1,43 @@
+"""Names for readers of what the results call by keys."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One of the four parameters: key in the results, symbol, unit as shown, meaning."""
+
+    key: str
+    symbol: str
+    unit: str
+    meaning: str
+
+
+PARAMETERS = (
+    Parameter("d_alpha_arcsec", "Δα", "arcsec", "rotation of the line of sight about Y, the line CCD"),
+    Parameter("d_beta_arcsec", "Δβ", "arcsec", "rotation of the line of sight about X, the flight direction"),
+    Parameter("d_gamma_arcsec", "Δγ", "arcsec", "rotation of the imaged line about the line of sight"),
+    Parameter("d_f_um", "Δf", "µm", "change of the principal distance"),
+)
+
+ESTIMATOR_NAMES = {
+    "paper_single": "printed, single",
+    "paper_joint": "printed, joint",
+    "derived": "derived",
+    "model": "model",
+}
+ESTIMATOR_NOTES = {
+    "paper_single": "eqs. (2), (3), (5), (7) of the paper as printed",
+    "paper_joint": "Table 1 of the paper, joint changes, as printed",
+    "derived": "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
+    "model": "weighted least squares on all spot coordinates with the Jacobian of the traced instrument",
+}
+CENTROID_NOTES = {
+    "ml": "maximum-likelihood fit of the calibrated spot shape",
+    "gaussian": "fit of a Gaussian",
+    "energy": "windowed energy centroid, as in the paper",
+}

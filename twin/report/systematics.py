@@ -1,0 +1,88 @@
+"""How far the systematic errors of a run follow from its crosstalk table: readings of motions outside the family."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.recovery import ESTIMATORS
+from optics.tree import Motion
+from scenes.instrument_model import BASE, CENTRAL_PRISM
+from twin.crosstalk import CameraCrosstalk
+from twin.motions import ElementaryMotion
+from twin.report.numbers import plain
+from twin.results import RenderRun
+
+FAMILY = 4
+"""The first motions of a crosstalk table are the family that the estimators assume."""
+SHOWN = 1e-3
+"""Least amount of a motion, in its table unit, that is spoken of."""
+
+
+@dataclass(frozen=True, eq=False)
+class Systematics:
+    """What the crosstalk table makes of a run's motions, for one camera.
+
+    Attributes:
+        bias: estimator -> (4,) reading minus truth, to first order, in the units of the results.
+        outside: motions of this run outside the family, as text with amounts.
+        uncovered: what was moved but is in no row of the table.
+    """
+
+    bias: dict[str, np.ndarray]
+    outside: tuple[str, ...]
+    uncovered: tuple[str, ...]
+
+
+def systematics(run: RenderRun, camera: str) -> Systematics:
+    """Sum the crosstalk table over the motions of a run."""
+    table = run.crosstalk[camera]
+    amounts = np.array([_amount(run, motion) for motion in table.motions])
+    bias = {e: (table.readings[e] - table.true) @ amounts for e in ESTIMATORS}
+    pairs = list(zip(table.motions, amounts, strict=True))[FAMILY:]
+    outside = tuple(f"{m.label}, {plain(float(a), 4)} {m.unit}" for m, a in pairs if abs(a) > SHOWN)
+    return Systematics(bias, outside, _uncovered(run, camera, table))
+
+
+def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
+    """How much of an elementary motion the run's state holds, in its table unit; pivots converted to first order."""
+    motion = run.state.get(elementary.body)
+    if motion is None:
+        return 0.0
+    if elementary.kind == "rotate":
+        value = motion.rotate[elementary.axis]
+    elif elementary.kind == "scale":
+        value = motion.scale
+    else:
+        value = _shift_at(run, elementary.body, motion, elementary.pivot)[elementary.axis]
+    return float(value) / elementary.unit_size
+
+
+def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:
+    """The shift, metres, that makes the same rotation and scale about another pivot the same motion to first order."""
+    pivots = next(b for b in run.experiment.instrument.assembly.tree.bodies if b.path == body).pivots
+    arm = np.array(pivots[motion.pivot]) - np.array(pivots[pivot])
+    return np.asarray(np.array(motion.shift) - np.cross(motion.rotate, arm) - motion.scale * arm)
+
+
+def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
+    """Bodies that moved, reach this camera and have no row in the table."""
+    own = f"{BASE}/{camera}"
+    bodies = {motion.body for motion in table.motions}
+    ideal = {path for path, use in run.experiment.instrument.nodes.items() if use.ideal}
+    out = []
+    for path, motion in run.state.items():
+        if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
+            continue
+        if path not in bodies and path not in ideal and (any(motion.rotate) or any(motion.shift) or motion.scale):
+            out.append(path)
+        if any(motion.figure.values()):
+            out.append(f"{path} (figure)")
+    return tuple(out)
+
+
+def joined(names: Sequence[str]) -> str:
+    """``a; b; c`` without repetitions."""
+    return "; ".join(dict.fromkeys(names))
