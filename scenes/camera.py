@@ -4,8 +4,8 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
+from optics.frozen_map import FrozenMap
 from scenes.errors import Problem, names_text, nearest, shown
-from scenes.frozen_dict import FrozenDict
 from scenes.quantity import AsphereTerms, Length, PositiveLength, Quantity, Wavelength
 from scenes.spec import Name, Named, Number, Spec, Text, Whole
 from scenes.units import ANGLE, LENGTH
@@ -26,7 +26,7 @@ class MirrorSpec(Spec):
     z: Length
     radius: Length
     conic: Number = 0.0
-    aspheric: AsphereTerms = Field(default_factory=FrozenDict)
+    aspheric: AsphereTerms = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
     def _is_curved(self) -> "MirrorSpec":

@@ -47,7 +47,7 @@ class CameraModel:
         focal_plane: the focal-plane frame in the prescription frame.
         first_order: parabasal quantities about the centre's chief ray.
         image_direction: direction of the centre's chief ray at the image.
-        rear_node: point one focal length upstream of the line's centre along that ray.
+        rear_node: point one focal length (along the line) upstream of the line's centre along that ray.
     """
 
     spec: CameraSpec
@@ -63,6 +63,16 @@ class CameraModel:
     def mirrors(self) -> tuple[str, ...]:
         """Mirror names in the order of the light from the scene."""
         return tuple(self.spec.mirrors)
+
+    @property
+    def line_focal_length(self) -> float:
+        """Focal length along the line about the centre's chief ray, metres (the papers' f)."""
+        return float(abs(self.first_order.scale[0, 0, 0]))
+
+    @property
+    def cross_focal_length(self) -> float:
+        """Focal length across the line; a field-biased camera is anamorphic, metres."""
+        return float(abs(self.first_order.scale[0, 1, 1]))
 
     def vertex(self, mirror: str) -> np.ndarray:
         """Vertex of a mirror's parent surface in the prescription frame, metres."""
@@ -135,7 +145,7 @@ def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
     chief = first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
     stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(np.linalg.det(chief.entrance_magnification[0]))))
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
-    focal_length = float(chief.focal_length[0])
+    focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
     return CameraModel(
         spec,
         surfaces,

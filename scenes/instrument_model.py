@@ -154,7 +154,7 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
     """Where the reticles and area CCDs stand: at +-f tan(field) along the line."""
-    half = float(model.first_order.focal_length[0]) * float(np.tan(spec.monitor.field))
+    half = model.line_focal_length * float(np.tan(spec.monitor.field))
     dx, dy = spec.monitor.area_ccd.offset
     return [
         Channel(camera, side, pinhole=(-dx, sign * half - dy), ccd=(0.0, sign * half))

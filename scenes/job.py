@@ -9,9 +9,9 @@ from typing import Annotated, Literal, Protocol
 
 from pydantic import AfterValidator, Field, WithJsonSchema
 
+from optics.frozen_map import FrozenMap
 from optics.zernike import MAX_NOLL
 from scenes.errors import InputError, Issue, Problem, names_text, nearest, shown
-from scenes.frozen_dict import FrozenDict
 from scenes.instrument import Frames, Reference
 from scenes.quantity import Quantity, Vector
 from scenes.spec import Name, NothingIsEmpty, Paths, Spec, Whole
@@ -24,8 +24,6 @@ ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
 
 NO_MOTION = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
-HIGHEST_NOLL = MAX_NOLL
-"""Highest Zernike term of a figure, radial order 10."""
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 
@@ -33,11 +31,11 @@ def noll(term: str) -> int:
     """The Noll index of a figure term: 5 for "Z5".
 
     Raises:
-        Problem: not Z1 .. Z231.
+        Problem: not Z1 .. Z66.
     """
     match = _TERM.fullmatch(term)
-    if match is None or int(match[1]) > HIGHEST_NOLL:
-        raise Problem("not a Zernike term", shown(term), f"Z1 .. Z{HIGHEST_NOLL} (Noll's numbering)")
+    if match is None or int(match[1]) > MAX_NOLL:
+        raise Problem("not a Zernike term", shown(term), f"Z1 .. Z{MAX_NOLL} (Noll's numbering)")
     return int(match[1])
 
 
@@ -64,7 +62,7 @@ class PerturbationSpec(Spec):
     rotate: Rotation = NO_MOTION
     shift: Shift = NO_MOTION
     pivot: Name = DEFAULT_PIVOT
-    figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenDict)] = Field(default_factory=FrozenDict)
+    figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     scale: ScaleChange = 0.0
 
     def uses(self) -> tuple[str, ...]:
@@ -115,7 +113,7 @@ class JobSpec(Spec):
     """
 
     instrument: Reference
-    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenDict)
+    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
     analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
 

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
+from optics.frozen_map import FrozenMap
 from scenes.errors import Problem, shown
-from scenes.frozen_dict import FrozenDict
 from scenes.units import (
     ANGLE,
     LENGTH,
@@ -141,7 +141,7 @@ class Terms:
             for name, item in self.of.items()
         }
         terms = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
-        return core_schema.no_info_after_validator_function(FrozenDict, terms)
+        return core_schema.no_info_after_validator_function(FrozenMap, terms)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         items = {name: item.__get_pydantic_json_schema__(schema, handler) for name, item in self.of.items()}

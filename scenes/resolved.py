@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import Field
 
+from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
 from scenes.detector import DetectorSpec
-from scenes.frozen_dict import FrozenDict
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.load import (
@@ -73,7 +73,7 @@ def resolve_job(job: JobSpec) -> ResolvedJob:
     cameras = {mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()}
     detector = load_detector(path_of_detector(instrument))
     # Built from checked parts: validating again would ask for quantities as text.
-    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=FrozenDict(cameras), detector=detector)
+    return ResolvedJob.model_construct(job=job, instrument=instrument, cameras=FrozenMap(cameras), detector=detector)
 
 
 def _complete(resolved: ResolvedJob) -> ResolvedJob:

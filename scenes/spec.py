@@ -12,8 +12,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, StringConstraints
 
+from optics.frozen_map import FrozenMap
 from scenes.errors import InputError, Issue, KeyPath, shown
-from scenes.frozen_dict import FrozenDict
 
 Value = TypeVar("Value")
 
@@ -32,8 +32,8 @@ def _nothing_is_empty(value: Any) -> Any:
     return {} if value is None else value
 
 
-def _freeze(value: Mapping[str, Value]) -> FrozenDict[Value]:
-    return FrozenDict(value)
+def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
+    return FrozenMap(value)
 
 
 Named = Annotated[dict[Name, Value], AfterValidator(_freeze)]

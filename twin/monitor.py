@@ -211,7 +211,7 @@ class MonitorPath:
         light = self.instrument.spec.monitor.reticle.photons_per_frame * self.pitch**2
         for start in range(0, len(states), chunk):
             some = states[start : start + chunk]
-            irradiance = image(self.fields(some), x, y)
+            irradiance = image(self.fields(some), x, y, single=True)
             photons = light * response.apply(irradiance)
             yield (
                 slice(start, start + len(some)),

@@ -39,12 +39,13 @@ def batoid_rays(position: np.ndarray, direction: np.ndarray) -> Any:
     import batoid
 
     n = len(position)
-    columns = [np.ascontiguousarray(a[:, i]) for a in (position, np.broadcast_to(direction, position.shape)) for i in range(3)]
+    both = (position, np.broadcast_to(direction, position.shape))
+    columns = [np.ascontiguousarray(a[:, i]) for a in both for i in range(3)]
     return batoid.RayVector(*columns, np.zeros(n), np.full(n, 650e-9))
 
 
 def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
-    """The camera as an ``optiland.optic.Optic`` in the prescription frame (the unit of length is of no concern to it)."""
+    """The camera as an ``optiland.optic.Optic`` in the prescription frame, in metres."""
     from optiland.optic import Optic
     from optiland.physical_apertures import RadialAperture, RectangularAperture
 
@@ -78,5 +79,6 @@ def optiland_rays(position: np.ndarray, direction: np.ndarray) -> Any:
     from optiland.rays import RealRays
 
     n = len(position)
-    columns = [np.array(a[:, i]) for a in (position, np.broadcast_to(direction, position.shape)) for i in range(3)]
+    both = (position, np.broadcast_to(direction, position.shape))
+    columns = [np.array(a[:, i]) for a in both for i in range(3)]
     return RealRays(*columns, np.ones(n), np.full(n, 0.65))

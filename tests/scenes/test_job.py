@@ -86,7 +86,7 @@ NODE = "  base/forward/M2: "
         ),
         (HEAD + NODE + "{rotate: [0 deg, -6 deg, 0 deg]}", 3, ["found '-6 deg', allowed: at most 5 deg in size"]),
         (HEAD + NODE + "{figure: {Z5: 1 mm}}", 3, ["figure.Z5", "at most 100 um in size"]),
-        (HEAD + NODE + "{figure: {Q5: 1 um}}", 3, ["figure.Q5: not a Zernike term", "Z1 .. Z231"]),
+        (HEAD + NODE + "{figure: {Q5: 1 um}}", 3, ["figure.Q5: not a Zernike term", "Z1 .. Z66"]),
         (HEAD + NODE + "{scale: 2 %}", 3, ["at most 1 percent in size"]),
         (HEAD + NODE + "{scale: 10}", 3, ["a number without a unit", "ppm"]),
         (HEAD + NODE + "{rotate: [1 deg, 1 deg]}", 3, ["not a list of 3 quantities; found 2 of them"]),

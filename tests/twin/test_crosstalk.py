@@ -14,7 +14,7 @@ PIXEL_NOISE = (1e-3) ** 2 * np.eye(4)  # px^2, weighs the four coordinates alike
 @pytest.fixture(scope="module", params=["gf7_pair", "monitor_pair"])
 def table(request, experiment):
     setup = experiment(request.param)
-    return setup, crosstalk(setup, {name: PIXEL_NOISE for name in setup.instrument.cameras})
+    return setup, crosstalk(setup, dict.fromkeys(setup.instrument.cameras, PIXEL_NOISE))
 
 
 def row(cameras, camera, label):
@@ -38,7 +38,7 @@ def test_table_is_what_the_images_say(table, backend):
         change = trace_truth(setup.instrument, backend, states).cameras[name]
         true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f]) * TO_TABLE[:, None] / units
         assert len(states) == 34
-        # second order of a motion: 1% of its own effect; and 2e-5 px of the template's interpolation, spread over the units
+        # second order of a motion: 1% of its own effect; 2e-5 px: interpolation of the template, over the units
         assert np.all(np.abs(shift - found.spot_shift) < 0.01 * strongest + 2e-5 / units)
         camera = setup.calibration.cameras[name]
         per_pixel = np.abs(camera.parameter_jacobian @ np.linalg.inv(camera.spot_jacobian)).sum(axis=1) * TO_TABLE

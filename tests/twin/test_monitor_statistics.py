@@ -1,4 +1,4 @@
-"""With the default light and nine frames: stated sigmas against the scatter over 200 seeds, and the Cramer-Rao bound."""
+"""With the default light and nine frames: stated sigmas against the scatter over 200 seeds; the Cramer-Rao bound."""
 
 import numpy as np
 import pytest

@@ -1,0 +1,35 @@
+import numpy as np
+import pytest
+
+from optics.aperture import Circle, Rectangle
+
+
+def test_circle() -> None:
+    ring = Circle(2.0, (1.0, -1.0), inner=0.5)
+    x, y = np.array([1.0, 1.0, 3.0, 3.1, 1.5]), np.array([-1.0, 0.0, -1.0, -1.0, -1.0])
+    np.testing.assert_array_equal(ring.contains(x, y), [False, True, True, False, True])
+    assert ring.bounds == (-1.0, 3.0, -3.0, 1.0)
+    np.testing.assert_allclose(np.linalg.norm(ring.outline(33) - (1.0, -1.0), axis=-1), 2.0)
+
+
+def test_rectangle() -> None:
+    box = Rectangle(2.0, 1.0, (0.5, 0.0))
+    np.testing.assert_array_equal(
+        box.contains(np.array([2.5, 2.51, -1.5, 0.0]), np.array([1.0, 0.0, 0.0, 1.01])), [1, 0, 1, 0]
+    )
+    assert box.bounds == (-1.5, 2.5, -1.0, 1.0)
+    outline = box.outline(40)
+    np.testing.assert_array_equal(outline[0], outline[-1])
+    assert bool(np.all(box.contains(*outline.T)))
+
+
+@pytest.mark.parametrize("sizes", [(0.0, 0.0), (-1.0, 0.0), (1.0, 1.0), (1.0, -0.1), (float("nan"), 0.0)])
+def test_bad_circles_are_refused(sizes: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="aperture"):
+        Circle(sizes[0], inner=sizes[1])
+
+
+@pytest.mark.parametrize("sizes", [(0.0, 1.0), (1.0, -1.0), (float("nan"), 1.0)])
+def test_bad_rectangles_are_refused(sizes: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="aperture"):
+        Rectangle(*sizes)

@@ -1,0 +1,142 @@
+"""Many states in one launch, and one compilation for all numbers."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from optics import quadrature
+from optics.aim import AimError, RayFan, aim, transverse_axes
+from optics.system import assemble
+from optics.trace import make_rays, trace
+from optics.tree import Motion, State
+from scenes.camera_model import field_direction
+from twin.monitor import MonitorPath
+from twin.truth import trace_truth
+
+ARCSEC = np.pi / 180 / 3600
+
+
+def some_states(count: int, seed: int, bodies: tuple[str, ...]) -> list[State]:
+    rng = np.random.default_rng(seed)
+
+    def motion() -> Motion:
+        rotate, shift = rng.normal(0, 5 * ARCSEC, 3), rng.normal(0, 5e-6, 3)
+        return Motion((rotate[0], rotate[1], rotate[2]), (shift[0], shift[1], shift[2]))
+
+    return [{body: motion() for body in bodies} for _ in range(count)]
+
+
+def launch(gf7, n: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    direction = field_direction(gf7.spec, 0.0, 0.0)
+    rng = np.random.default_rng(3)
+    axes = transverse_axes(direction, np.array([1.0, 0.0, 0.0]))
+    origin = gf7.camera_frame.apply([0.0, 0.0, 2.6])
+    return origin + rng.uniform(-0.25, 0.25, (n, 2)) @ axes, direction
+
+
+def test_a_batch_of_states_is_a_loop_of_single_states(backend, gf7) -> None:
+    bare = gf7.bare_assembly()
+    states = some_states(7, 1, ("M1", "M2", "M3", "image"))
+    rays = make_rays(backend, *launch(gf7))
+    together = trace(backend, assemble(bare, ["imaging"], states), rays, keep=(1,), world=True)
+    assert together.world is not None
+    batch = (*together.numpy(), *together.numpy(together.world), together.hit(1))
+    for s, state in enumerate(states):
+        single = trace(backend, assemble(bare, ["imaging"], [state]), rays, keep=(1,), world=True)
+        assert single.world is not None
+        alone = (*single.numpy(), *single.numpy(single.world), single.hit(1))
+        for many, one in zip(batch, alone, strict=True):
+            # the same operations; the compiler may contract other products into fma
+            np.testing.assert_allclose(many[s], one[0], rtol=0, atol=1e-14)
+
+
+def test_each_system_may_have_its_own_rays(backend, gf7) -> None:
+    bare = gf7.bare_assembly()
+    systems = assemble(bare, ["imaging"], some_states(3, 1, ("M2",)))
+    position, direction = launch(gf7, 60)
+    shared = trace(backend, systems, make_rays(backend, position, direction)).numpy()
+    own = trace(backend, systems, make_rays(backend, np.tile(position, (3, 1, 1)), direction)).numpy()
+    with pytest.raises(ValueError, match="rays for 2 systems cannot go through 3"):
+        trace(backend, systems, make_rays(backend, np.tile(position, (2, 1, 1)), direction))
+    for a, b in zip(shared, own, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_slices_of_a_batch(backend, gf7) -> None:
+    systems = assemble(gf7.bare_assembly(), ["imaging"], some_states(5, 2, ("M2",)))
+    rays = make_rays(backend, *launch(gf7, 40))
+    whole = trace(backend, systems, rays).numpy()[0]
+    checked = 0
+    for piece, part in systems.slices(2):
+        np.testing.assert_allclose(trace(backend, part, rays).numpy()[0], whole[piece], rtol=0, atol=1e-14)
+        checked += part.count
+    assert checked == 5
+
+
+def test_sequences_of_other_structure_are_refused(gf7_pair) -> None:
+    with pytest.raises(ValueError, match="different lengths"):
+        assemble(gf7_pair.assembly, ["forward/imaging", "forward/left/monitor"])
+    with pytest.raises(ValueError, match="different kinds"):
+        assemble(gf7_pair.assembly, [("forward/M1",), ("forward/M2",)])
+
+
+def test_aim_reaches_its_points_and_says_when_it_cannot(backend, gf7) -> None:
+    bare = gf7.bare_assembly(apertures=False)
+    to_stop = assemble(bare, [gf7.mirrors[:2]], some_states(4, 5, ("M1", "M2")))
+    nodes = quadrature.disk(3)
+    target = 0.1 * np.stack([nodes.x, nodes.y], axis=-1)
+    direction = field_direction(gf7.spec, 0.01, 0.001)[None, None]
+    fan = RayFan(
+        -3.0 * direction, direction, transverse_axes(direction, np.array([[[1.0, 0.0, 0.0]]])), moves_position=True
+    )
+    q, slope = aim(backend, to_stop, fan, target)
+    hit = trace(backend, to_stop, make_rays(backend, *fan.at(q))).numpy()[0][..., :2]
+    np.testing.assert_allclose(hit, np.broadcast_to(target, hit.shape), rtol=0, atol=1e-11)
+    assert slope.shape == (4, nodes.count, 2, 2)
+    again, _ = aim(backend, to_stop, fan, target, start=q, jacobian=slope)
+    np.testing.assert_array_equal(again, q)
+    with pytest.raises(AimError, match="did not converge"):
+        aim(backend, to_stop, fan, np.full((1, 2), np.inf))
+
+
+def new_kernels(work) -> tuple[int, int]:
+    """Kernels launched and kernels compiled while ``work`` runs."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        work()
+        dr.sync_thread()
+        history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    return len(history), sum(not k["cache_hit"] for k in history)
+
+
+def test_other_numbers_compile_no_new_kernel(backend, gf7, gf7_pair) -> None:
+    bare = gf7.bare_assembly()
+    path = MonitorPath(gf7_pair, backend)
+    bodies = ("base/backward/M2", "base/forward/focal_plane", "base/backward/focal_plane")
+    to_stop = assemble(bare, [gf7.mirrors[:2]])
+
+    def aimed(x: float) -> None:
+        direction = field_direction(gf7.spec, x, 0.3 * x)[None, None]
+        fan = RayFan(-3.0 * direction, direction, transverse_axes(direction, np.array([[[1.0, 0.0, 0.0]]])), True)
+        aim(backend, to_stop, fan, np.full((1, 2), 1e-3 + x))
+
+    works = {
+        "trace": lambda seed: trace(
+            backend, assemble(bare, ["imaging"], some_states(2, seed, ("M1", "M2"))), make_rays(backend, *launch(gf7))
+        ),
+        "aim": lambda seed: aimed(1e-3 * seed),
+        "monitor": lambda seed: path.fields(some_states(2, seed, bodies)),
+        "truth": lambda seed: trace_truth(gf7_pair, backend, some_states(2, seed, bodies)),
+    }
+    for name, work in works.items():
+        work(1)
+        launched, compiled = new_kernels(lambda work=work: work(2))
+        assert launched > 0, name
+        assert compiled == 0, f"{name} compiled {compiled} of {launched} kernels anew"
+
+
+def test_the_check_above_can_see_a_compilation(backend) -> None:
+    """A number baked in as a literal, other in every run so that no cache on disk knows it."""
+    literal = float(np.random.default_rng().uniform())
+    launched, compiled = new_kernels(lambda: dr.eval(backend.opaque([1.0, 2.0]) * literal + 1.0))
+    assert (launched, compiled) == (1, 1)

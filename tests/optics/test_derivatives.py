@@ -1,0 +1,155 @@
+"""Derivatives by Dr.Jit's AD through the gf7 camera, against central differences of the same trace."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from optics.assembly import Assembly
+from optics.first_order import first_order, ray_matrix
+from optics.system import SystemBatch, assemble
+from optics.trace import Traced, make_rays, trace
+from optics.tree import Motion, State
+from scenes.camera_model import IMAGE, collimated, field_direction
+
+MOTIONS = [
+    (body, kind, axis)
+    for body in ("M1", "M2", "M3", IMAGE)
+    for kind, axes in (("rotate", 3), ("shift", 3), ("scale", 1))
+    for axis in range(axes)
+]
+STEP = {"rotate": 1e-5, "shift": 1e-5, "scale": 1e-5}
+BASE: State = {
+    "M2": Motion(rotate=(1e-4, -5e-5, 2e-4), shift=(5e-5, -2e-5, 3e-5)),
+    "M3": Motion(shift=(1e-5, 2e-5, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def bare(gf7) -> Assembly:
+    return gf7.bare_assembly(apertures=False)
+
+
+@pytest.fixture(scope="module")
+def rays(backend, gf7, bare):
+    """Nine rays of an off-axis field: positions (9, 3) and the direction."""
+    direction = field_direction(gf7.spec, np.radians(0.7), np.radians(-0.1))
+    radius = gf7.apertures["M2"].radius
+    grid = 0.65 * radius * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+    return collimated(backend, assemble(bare, [gf7.mirrors[:2]]), direction[None], grid)[0], direction
+
+
+def columns(traced: Traced) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    position, direction, path, valid = traced.numpy()
+    assert valid.all()
+    return position, direction, path
+
+
+def gradients(backend, systems: SystemBatch, rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    out = trace(backend, systems, make_rays(backend, *rays), evaluate=False).local
+    dr.forward_to(out.position, out.direction, out.path, flags=dr.ADFlag.ClearEdges)
+
+    def rows(vector) -> np.ndarray:
+        return np.stack([c.numpy() for c in dr.grad(vector)], axis=-1).reshape(systems.count, -1, 3)
+
+    return rows(out.position), rows(out.direction), dr.grad(out.path).numpy().reshape(systems.count, -1)
+
+
+def moved(body: str, kind: str, axis: int, h: float) -> State:
+    start = BASE.get(body, Motion())
+    if kind == "scale":
+        return {**BASE, body: replace(start, scale=start.scale + h)}
+    vector = list(getattr(start, kind))
+    vector[axis] += h
+    return {**BASE, body: replace(start, **{kind: tuple(vector)})}
+
+
+def test_forward_mode_for_every_motion(backend, bare, rays) -> None:
+    systems = assemble(bare, ["imaging"], [BASE] * len(MOTIONS), MOTIONS)
+    forward = gradients(backend, systems, rays)
+    states = [moved(*m, h * STEP[m[1]]) for m in MOTIONS for h in (1, -1)]
+    values = columns(trace(backend, assemble(bare, ["imaging"], states), make_rays(backend, *rays)))
+    width = 2.0 * np.array([STEP[kind] for _, kind, _ in MOTIONS])
+    for exact, value in zip(forward, values, strict=True):
+        pairs = value.reshape(len(MOTIONS), 2, *value.shape[1:])
+        difference = (pairs[:, 0] - pairs[:, 1]) / width.reshape(-1, *[1] * (value.ndim - 1))
+        # derivatives are 5 to 20 m/rad and 1 m/m; truncation h^2 f''' and rounding 1e-15 / h are below 1e-8
+        np.testing.assert_allclose(exact, difference, rtol=1e-7, atol=1e-8)
+    moves = np.max(np.abs(forward[0]), axis=(1, 2)) > 0.0
+    assert [m for m, moved in zip(MOTIONS, moves, strict=True) if not moved] == [(IMAGE, "scale", 0)]  # a plane
+
+
+@pytest.mark.parametrize("mirror", [0, 1, 2])
+@pytest.mark.parametrize("name", ["c", "k", "A0"])
+def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str) -> None:
+    systems = assemble(bare, ["imaging"], [BASE])
+    uploaded = replace(systems.upload(backend), differentiable=True)
+    parameter = uploaded.values[mirror][name]
+    dr.enable_grad(parameter)
+    dr.set_grad(parameter, backend.opaque([1.0]))
+    out = trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local
+    dr.forward_to(out.position, out.path, flags=dr.ADFlag.ClearEdges)
+    exact = np.stack([c.numpy() for c in dr.grad(out.position)], axis=-1)
+    exact_path = dr.grad(out.path).numpy()
+    h = {"c": 1e-6, "k": 1e-5, "A0": 1e-6}[name]
+    sides = []
+    for sign in (1, -1):
+        values = list(systems.values)
+        values[mirror] = {**values[mirror], name: values[mirror][name] + sign * h}
+        sides.append(columns(trace(backend, replace(systems, values=tuple(values)), make_rays(backend, *rays))))
+    np.testing.assert_allclose(exact, (sides[0][0][0] - sides[1][0][0]) / (2 * h), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
+
+
+def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> None:
+    """d(sum w . out)/d(parameters) of all four elements in one backward sweep."""
+    systems = assemble(bare, ["imaging"], [BASE])
+    weight = np.random.default_rng(1).normal(size=(len(rays[0]), 4))
+    uploaded = replace(systems.upload(backend), differentiable=True)
+    wanted = [(0, "c"), (0, "A1"), (1, "T1"), (1, "k"), (2, "c"), (2, "R12")]
+    for i, n in wanted:
+        dr.enable_grad(uploaded.values[i][n])
+
+    def loss(local):
+        terms = [c * backend.opaque(weight[:, j]) for j, c in enumerate((*local.position, local.path))]
+        return dr.sum(terms[0] + terms[1] + terms[2] + terms[3])
+
+    dr.backward(loss(trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local))
+    reverse = np.array([dr.grad(uploaded.values[i][n])[0] for i, n in wanted])
+    forward = []
+    for i, n in wanted:
+        fresh = replace(systems.upload(backend), differentiable=True)
+        dr.enable_grad(fresh.values[i][n])
+        dr.set_grad(fresh.values[i][n], backend.opaque([1.0]))
+        value = loss(trace(backend, fresh, make_rays(backend, *rays), evaluate=False).local)
+        dr.forward_to(value)
+        forward.append(dr.grad(value)[0])
+    assert np.all(np.isfinite(reverse))
+    assert np.all(np.abs(reverse) > 0.0)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
+
+
+def test_ray_matrix_against_neighbouring_rays(backend, gf7, bare) -> None:
+    systems = assemble(bare, ["imaging"])
+    direction = field_direction(gf7.spec, 0.0, 0.0)
+    to_stop = assemble(bare, [gf7.mirrors[:2]])
+    position = collimated(backend, to_stop, direction[None], np.zeros((1, 2)))[0]
+    axes = np.stack([[1.0, 0.0, 0.0], np.cross(direction, [1.0, 0.0, 0.0])])
+    matrix = ray_matrix(backend, systems, 1, position, direction[None], axes[None])
+    h = 1e-5
+    launches = [(position[0] + s * h * a, direction) for a in axes for s in (1, -1)]
+    launches += [(position[0], direction + s * h * a) for a in axes for s in (1, -1)]
+    # the direction's length is second order in h
+    launches = [(p, d / np.linalg.norm(d)) for p, d in launches]
+    traced = trace(backend, systems, make_rays(backend, *(np.array(c) for c in zip(*launches, strict=True))), keep=(1,))
+    image, leaving, _ = columns(traced)
+    for value, by_position, by_angle in (
+        (image, matrix.image_by_position, matrix.image_by_angle),
+        (leaving, matrix.direction_by_position, matrix.direction_by_angle),
+        (traced.hit(1), matrix.stop_by_position, matrix.stop_by_angle),
+    ):
+        slope = ((value[0, 0::2] - value[0, 1::2]) / (2 * h))[:, :2].T
+        np.testing.assert_allclose(by_position[0], slope[:, :2], atol=2e-8)
+        np.testing.assert_allclose(by_angle[0], slope[:, 2:], atol=2e-8)
+    assert first_order(matrix).focal_length[0] == pytest.approx(float(gf7.first_order.focal_length[0]), rel=1e-9)

@@ -1,0 +1,97 @@
+"""The matrix Fourier transform against what is known in closed form about a perfect pupil."""
+
+import numpy as np
+import pytest
+from scipy.integrate import simpson
+from scipy.special import j0, j1
+
+from optics import quadrature
+from optics.diffraction import Grid, PupilField, airy, image
+from optics.quadrature import PupilNodes
+
+WAVELENGTH, F_NUMBER = 650e-9, 9.2
+APERTURE = 0.5 / F_NUMBER
+NODES = quadrature.disk(24, 80)
+SMALL = Grid(-10e-6, 1e-6, 21)
+
+
+def shifted(grid: Grid, by: float) -> Grid:
+    return Grid(grid.start + by, grid.step, grid.count)
+
+
+def centred(count: int, step: float) -> Grid:
+    return Grid(-0.5 * (count - 1) * step, step, count)
+
+
+def perfect(u0: float = 0.0, v0: float = 0.0, apodisation: int = 0, nodes: PupilNodes = NODES) -> PupilField:
+    """Flat wavefront over a disk of direction cosines about (u0, v0), unit power."""
+    u, v = APERTURE * nodes.x, APERTURE * nodes.y
+    shape = (1.0 - nodes.x**2 - nodes.y**2) ** apodisation
+    power = np.sum(shape**2 * nodes.weight) * APERTURE**2
+    amplitude = shape * nodes.weight * APERTURE**2 / np.sqrt(power)
+    return PupilField(u[None] + u0, v[None] + v0, np.zeros((1, nodes.count)), amplitude[None], WAVELENGTH)
+
+
+def test_airy_disk() -> None:
+    axis = centred(161, 0.5e-6)  # 5.5 dark rings
+    got = image(perfect(), axis, axis)[0]
+    want = airy(np.hypot(*np.meshgrid(axis.points(), axis.points())), WAVELENGTH, F_NUMBER)
+    peak = np.pi * APERTURE**2 / WAVELENGTH**2
+    np.testing.assert_allclose(got / peak, want, rtol=0, atol=1e-10)
+    first_dark = 1.2196698912665045 * WAVELENGTH * F_NUMBER
+    assert image(perfect(), Grid(first_dark, 0.0, 1), Grid(0.0, 0.0, 1))[0, 0, 0] / peak < 1e-20
+
+
+@pytest.mark.parametrize("dark_rings", [0.4, 1.0, 2.0, 5.0])
+def test_encircled_energy(dark_rings: float) -> None:
+    """1 - J0^2 - J1^2 (Rayleigh), by Simpson's rule for r I(r) along the detector's x."""
+    radius = dark_rings * 1.22 * WAVELENGTH * F_NUMBER
+    r = Grid(0.0, radius / 800, 801)
+    profile = image(perfect(), r, Grid(0.0, 0.0, 1))[0, 0]
+    energy = simpson(2.0 * np.pi * r.points() * profile, x=r.points())
+    z = np.pi * radius / (WAVELENGTH * F_NUMBER)
+    assert energy == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=1e-8)
+
+
+def test_energy_in_pixels_of_a_square() -> None:
+    """The same on a detector: fine pixels inside the circle of the first dark ring hold 83.8 % of the light."""
+    step, n = 0.1e-6, 160
+    axis = centred(n, step)
+    pixels = image(perfect(), axis, axis)[0] * step**2
+    radius = 1.2196698912665045 * WAVELENGTH * F_NUMBER
+    inside = np.hypot(*np.meshgrid(axis.points(), axis.points())) <= radius
+    assert np.sum(pixels[inside]) == pytest.approx(0.83785, abs=1e-4)
+
+
+def test_plancherel() -> None:
+    """An image that fades fast enough for the detector holds exactly the pupil's power."""
+    step, n = 2e-6, 128  # below the critical sampling of lambda F / 2
+    axis = centred(n, step)
+    field = perfect(apodisation=5, nodes=quadrature.disk(40, 200))
+    assert np.sum(image(field, axis, axis)) * step**2 == pytest.approx(1.0, abs=1e-8)
+
+
+def test_images_of_a_batch() -> None:
+    fields = [perfect(0.001 * i, 0.0, apodisation=i) for i in range(6)]
+    together = PupilField(
+        *(np.concatenate([getattr(f, n) for f in fields]) for n in ("u", "v", "eikonal", "amplitude")), WAVELENGTH
+    )
+    batch = image(together, SMALL, shifted(SMALL, 1e-6))
+    assert batch.shape == (6, 21, 21)
+    for i, field in enumerate(fields):
+        np.testing.assert_allclose(batch[i], image(field, SMALL, shifted(SMALL, 1e-6))[0], rtol=1e-12)
+    np.testing.assert_allclose(image(together[2:4], SMALL, SMALL), image(together, SMALL, SMALL)[2:4], rtol=1e-12)
+
+
+def test_a_slanted_beam_makes_the_same_spot() -> None:
+    np.testing.assert_allclose(image(perfect(0.03, -0.05), SMALL, SMALL), image(perfect(), SMALL, SMALL), rtol=1e-9)
+
+
+def test_tilt_of_the_wavefront_moves_the_image() -> None:
+    """An eikonal that grows by u X0 is a wave that has to travel on: the image moves to -X0."""
+    field = perfect()
+    x0, y0 = 3.3e-6, -1.7e-6
+    tilted = PupilField(field.u, field.v, field.u * x0 + field.v * y0, field.amplitude, WAVELENGTH)
+    np.testing.assert_allclose(
+        image(tilted, shifted(SMALL, -x0), shifted(SMALL, -y0)), image(field, SMALL, SMALL), rtol=1e-9
+    )

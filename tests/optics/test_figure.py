@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from optics.aperture import Circle
+from optics.figure import GridFigure, ZernikeFigure
+from optics.surface import Surface, plane
+from optics.tree import Motion
+from optics.zernike import zernike
+from tests.optics.bench import Stage, beam, build, disk_points, run, unit
+
+Z = np.array([0.0, 0.0, 1.0])
+SLANTED = unit(0.1, -0.2, 1.0)
+
+
+def wavy_grid(amplitude: float) -> tuple[GridFigure, float]:
+    """amplitude * cos(kx) cos(ky): flat at its edges, as the spline is, so that the spline is accurate there."""
+    k = 2 * np.pi
+    x = np.linspace(-0.5, 0.5, 81)
+    y = np.linspace(-0.5, 0.5, 61)
+    return GridFigure(amplitude * np.outer(np.cos(k * y), np.cos(k * x)), (-0.5, 0.5, -0.5, 0.5)), k
+
+
+def test_piston_figure_shifts_a_plane(backend) -> None:
+    figure = ZernikeFigure(1.0, terms={1: 1e-4})
+    position, direction = beam(disk_points(20, 0.5), -1.0, SLANTED)
+    hit, _, path, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
+    assert valid.all()
+    np.testing.assert_allclose(hit[:, 2], 1e-4, atol=1e-18)
+    np.testing.assert_allclose(path, (1.0 + 1e-4) / SLANTED[2], rtol=1e-15)
+
+
+def test_tilt_figure_is_a_tilted_plane(backend) -> None:
+    slope = 1e-3  # Z2 = 2 x, so an amplitude of slope / 2
+    figure = ZernikeFigure(1.0, terms={2: slope / 2})
+    position, direction = beam(disk_points(20, 0.5), -1.0, Z)
+    hit, leaving, _, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
+    assert valid.all()
+    np.testing.assert_allclose(hit[:, 2], slope * position[:, 0], atol=1e-17)
+    angle = 2 * np.arctan(slope)
+    np.testing.assert_allclose(leaving, np.broadcast_to([np.sin(angle), 0, -np.cos(angle)], leaving.shape), atol=1e-15)
+
+
+def test_defocus_figure_is_a_paraboloid(backend) -> None:
+    amplitude, radius = 1e-4, 0.6
+    focal = radius**2 / (8 * np.sqrt(3) * amplitude)  # z = 2 sqrt(3) a r^2 / R^2 = r^2 / (4 f)
+    figure = ZernikeFigure(radius, terms={4: amplitude, 1: np.sqrt(3) * amplitude})
+    position, direction = beam(disk_points(50, 0.5), -1.0, Z)
+    hit, leaving, path, valid = run(backend, build(Stage(Surface(figure=figure))), position, direction)
+    assert valid.all()
+    # a mirror that bulges toward +z at its edge turns light of +z away from the axis, as if from the focus at +f
+    to_focus = np.array([0.0, 0.0, focal]) - hit
+    np.testing.assert_allclose(np.cross(to_focus, leaving) / focal, 0.0, atol=1e-14)
+    np.testing.assert_allclose(path - np.linalg.norm(to_focus, axis=-1), 1.0 - focal, rtol=1e-14)
+
+
+@pytest.mark.parametrize("base", [plane(), Surface(-0.2, -1.2), Surface(-0.2, -1.2, (-5e-5, 1e-6))])
+def test_figured_surfaces_meet_their_own_sag(backend, base: Surface) -> None:
+    grid, _ = wavy_grid(2e-6)
+    for figure in (ZernikeFigure(0.7, (0.1, -0.05), {4: 1e-6, 7: 2e-6, 11: -1e-6, 24: 5e-7}), grid):
+        surface = base.with_figure(figure)
+        position, direction = beam(disk_points(200, 0.4), -1.0, SLANTED)
+        hit, leaving, _, valid = run(backend, build(Stage(surface)), position, direction)
+        assert valid.all()
+        np.testing.assert_allclose(hit[:, 2], surface.sag(hit[:, 0], hit[:, 1]), rtol=0, atol=2e-16)
+        h = 1e-5
+        steps = ((h, 0.0), (0.0, h))
+        slope = [
+            (surface.sag(hit[:, 0] + dx, hit[:, 1] + dy) - surface.sag(hit[:, 0] - dx, hit[:, 1] - dy)) / (2 * h)
+            for dx, dy in steps
+        ]
+        normal = np.stack([-slope[0], -slope[1], np.ones(len(hit))], axis=-1)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        want = direction - 2 * np.sum(direction * normal, axis=-1, keepdims=True) * normal
+        np.testing.assert_allclose(leaving, want, atol=1e-9)
+
+
+def test_grid_figure_follows_the_function_it_samples(backend) -> None:
+    amplitude = 1e-6
+    grid, k = wavy_grid(amplitude)
+    position, direction = beam(disk_points(300, 0.45), -1.0, Z)
+    hit, leaving, _, valid = run(backend, build(Stage(Surface(figure=grid))), position, direction)
+    assert valid.all()
+    x, y = position[:, 0], position[:, 1]
+    np.testing.assert_allclose(hit[:, 2], amplitude * np.cos(k * x) * np.cos(k * y), atol=2e-6 * amplitude)
+    # light of +z leaves at twice the slope; (-2 sx, -2 sy) with z reversed
+    slope_x = -amplitude * k * np.sin(k * x) * np.cos(k * y)
+    np.testing.assert_allclose(leaving[:, 0], 2 * slope_x, atol=3e-4 * amplitude * k)
+    np.testing.assert_allclose(grid.sag(x, y), hit[:, 2], atol=2e-16)
+
+
+def test_a_state_adds_its_figure_on_the_aperture(backend) -> None:
+    aperture = Circle(0.5, (0.1, 0.0))
+    position, direction = beam(disk_points(50, 0.3), -1.0, Z)
+    bench = build(Stage(plane(), aperture=aperture))
+    hit, _, _, _ = run(backend, bench, position, direction, {"e0": Motion(figure={6: 3e-7})})
+    want = 3e-7 * zernike(6, (position[:, 0] - 0.1) / 0.5, position[:, 1] / 0.5)
+    np.testing.assert_allclose(hit[:, 2], want, atol=1e-19)
+
+
+def test_bad_figures_are_refused(backend) -> None:
+    with pytest.raises(ValueError, match="radius"):
+        ZernikeFigure(0.0)
+    with pytest.raises(ValueError, match="4 x 4"):
+        GridFigure(np.zeros((3, 9)), (0, 1, 0, 1))
+    with pytest.raises(ValueError, match="finite"):
+        GridFigure(np.full((5, 5), np.nan), (0, 1, 0, 1))
+    with pytest.raises(ValueError, match="x_min < x_max"):
+        GridFigure(np.zeros((5, 5)), (1, 0, 0, 1))
+    with pytest.raises(ValueError, match="needs an aperture"):
+        run(backend, build(Stage(plane())), np.zeros((1, 3)), Z[None], {"e0": Motion(figure={4: 1e-9})})

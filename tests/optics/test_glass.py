@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from optics.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
+
+D_LINE, E_LINE, F_LINE, C_LINE = 587.5618e-9, 546.074e-9, 486.1327e-9, 656.2725e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "nd", "abbe", "tolerance"),
+    [("N-BK7", 1.5168, 64.17, 5e-6), ("fused silica", 1.458464, 67.82, 5e-6), ("Zerodur", 1.5424, 56.1, 5e-5)],
+)
+def test_catalogue_index_and_abbe_number(name: str, nd: float, abbe: float, tolerance: float) -> None:
+    entry = glass(name)
+    assert entry.index(D_LINE) == pytest.approx(nd, abs=tolerance)
+    got = (entry.index(D_LINE) - 1) / (entry.index(F_LINE) - entry.index(C_LINE))
+    assert got == pytest.approx(abbe, rel=2e-3)
+
+
+def test_dn_dt_of_bk7_as_its_data_sheet_states_it() -> None:
+    # Schott, N-BK7: absolute dn/dT in 1e-6/K, mean over +20..+40 C, at 1060.0 nm, e and g lines
+    stated = {1060.0e-9: 1.1, E_LINE: 1.6, 435.8343e-9: 2.1}
+    for wavelength, want in stated.items():
+        mean = (N_BK7.index(wavelength, 313.15) - N_BK7.index(wavelength, 293.15)) / 20.0
+        assert mean * 1e6 == pytest.approx(want, abs=0.06)
+
+
+def test_dn_dt_of_fused_silica() -> None:
+    # absolute, Corning 7980 at 293 K: 8.74e-6/K in the visible, 8.16e-6/K at 1.55 um (Rego, Sensors 23, 6023 (2023));
+    # other makers' silica differs by some per cent
+    assert FUSED_SILICA.dn_dt(600e-9) == pytest.approx(8.74e-6, rel=0.06)
+    assert FUSED_SILICA.dn_dt(1550e-9) == pytest.approx(8.16e-6, rel=0.06)
+
+
+@pytest.mark.parametrize("entry", [N_BK7, FUSED_SILICA])
+def test_dn_dt_is_the_slope_of_the_index(entry) -> None:
+    for temperature in (250.0, 293.15, 330.0):
+        h = 0.01
+        difference = (entry.index(D_LINE, temperature + h) - entry.index(D_LINE, temperature - h)) / (2 * h)
+        assert entry.dn_dt(D_LINE, temperature) == pytest.approx(difference, rel=1e-7)
+
+
+def test_vacuum_index_is_that_of_the_glass_times_the_air() -> None:
+    assert air_index(D_LINE) - 1 == pytest.approx(2.724e-4, abs=5e-7)  # Edlen: 2.7240e-4 at 20 C, 1013.25 hPa
+    assert N_BK7.vacuum_index(D_LINE) == pytest.approx(N_BK7.index(D_LINE) * 1.00027236, abs=5e-7)
+    step = N_BK7.vacuum_index(D_LINE, 303.15) - N_BK7.vacuum_index(D_LINE)
+    assert step == pytest.approx(N_BK7.index(D_LINE, 303.15) - N_BK7.index(D_LINE), rel=1e-9)
+
+
+@pytest.mark.parametrize("entry", list(GLASSES.values()), ids=list(GLASSES))
+def test_outside_of_the_range_is_refused_by_name(entry) -> None:
+    for wavelength in (0.99 * entry.shortest, 1.01 * entry.longest, float("nan")):
+        with pytest.raises(ValueError, match=f"{entry.name}: wavelength .* nm is outside"):
+            entry.index(wavelength)
+    assert entry.index(entry.shortest) > entry.index(entry.longest)
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
+def test_no_temperature_below_absolute_zero(temperature: float) -> None:
+    with pytest.raises(ValueError, match="N-BK7: a temperature must be above 0 K"):
+        N_BK7.index(D_LINE, temperature)
+
+
+def test_a_glass_without_constants_says_so() -> None:
+    assert ZERODUR.index(D_LINE, 293.15) > 1.5
+    with pytest.raises(ValueError, match="Zerodur: no constants"):
+        ZERODUR.index(D_LINE, 300.0)
+
+
+def test_names() -> None:
+    assert glass("n-bk7") is N_BK7
+    with pytest.raises(KeyError, match="did you mean 'N-BK7'"):
+        glass("N-BK8")
+    assert all(entry.source for entry in GLASSES.values())
+    assert np.all(np.diff([N_BK7.index(w) for w in np.linspace(0.31e-6, 2.4e-6, 200)]) < 0)

@@ -1,0 +1,176 @@
+"""Images of a far point by the perturbed gf7 camera through its full aperture."""
+
+import numpy as np
+import pytest
+
+from optics import quadrature, zernike
+from optics.assembly import Assembly
+from optics.diffraction import Grid, PupilField, huygens, image
+from optics.imaging import aim_collimated, imaging_field
+from optics.quadrature import PupilNodes
+from optics.system import assemble
+from optics.trace import BeamMissedError, make_rays, trace
+from optics.tree import Motion, State
+from scenes.camera_model import IMAGE, field_direction
+from twin.monitor import MonitorPath
+
+ARCSEC = np.pi / 180 / 3600
+WAVELENGTH = 650e-9
+PERTURBED: State = {
+    "M2": Motion(rotate=(20 * ARCSEC, -15 * ARCSEC, 0.0), shift=(20e-6, -30e-6, 15e-6)),
+    "M3": Motion(rotate=(-5 * ARCSEC, 8 * ARCSEC, 0.0)),
+}
+FINE = quadrature.disk(16, 64)
+AXIS = Grid(-15.5 * 3e-6, 3e-6, 32)
+
+
+def shifted(grid: Grid, by: float) -> Grid:
+    return Grid(grid.start + by, grid.step, grid.count)
+
+
+class Camera:
+    """The camera in its prescription frame, looking at one point of the field's edge."""
+
+    def __init__(self, backend, gf7, state: State) -> None:
+        self.backend, self.stop = backend, gf7.apertures["M2"]
+        self.assembly: Assembly = gf7.bare_assembly()
+        self.systems = assemble(self.assembly, ["imaging"], [state])
+        self.to_stop = assemble(self.assembly, [gf7.mirrors[:2]], [state])
+        self.direction = field_direction(gf7.spec, np.radians(1.0), np.radians(0.05))
+        self.launch = -3.0 * self.direction
+        self.frame = self.assembly.place([state]).pose(IMAGE)
+        self.centre = trace(backend, self.systems, self.rays(np.zeros((1, 2)))[0]).numpy()[0][0, 0]
+
+    def rays(self, target: np.ndarray):
+        position, _ = aim_collimated(self.backend, self.to_stop, self.direction, self.launch, target)
+        return make_rays(self.backend, position[0], self.direction), position[0]
+
+    def field(self, nodes: PupilNodes, origin: np.ndarray | None = None) -> PupilField:
+        origin = self.centre if origin is None else origin
+        return imaging_field(
+            self.backend, self.systems, self.to_stop, self.direction, self.launch, self.stop, nodes, WAVELENGTH, origin
+        )
+
+
+def focal_plane_at(dz: float) -> State:
+    return {**PERTURBED, IMAGE: Motion(shift=(0.0, 0.0, dz))}
+
+
+@pytest.mark.parametrize("dz", [-100e-6, 0.0, 100e-6])
+@pytest.mark.parametrize("where", ["exit pupil", "behind M3"])
+def test_against_huygens(backend, gf7, dz: float, where: str) -> None:
+    """Wavelets from points of the reference sphere, where the traced rays really cross it, with the ray tube's area.
+
+    gf7's exit pupil lies 181 m behind its image (it is nearly telecentric): there the light has passed its focus and
+    the sum runs back in time. The second sphere stands between M3 and the image, where Debye's plane waves are good to
+    the order of 1 / Fresnel number, 1e-4.
+    """
+    camera = Camera(backend, gf7, focal_plane_at(dz))
+    got = image(camera.field(FINE), AXIS, AXIS)[0]
+
+    nodes = quadrature.disk(20, 72)
+    rays, launch = camera.rays(camera.stop.radius * np.stack([nodes.x, nodes.y], axis=-1))
+    traced = trace(backend, camera.systems, rays, world=True)
+    assert traced.world is not None
+    position, direction, path, valid = (a[0] for a in traced.numpy(traced.world))
+    assert valid.all()
+    focus = Camera(backend, gf7, PERTURBED).frame.apply(Camera(backend, gf7, PERTURBED).centre)
+    radius = float(gf7.first_order.exit_pupil_distance[0]) if where == "exit pupil" else 1.9
+    offset = position - focus
+    along = np.sum(offset * direction, axis=-1)
+    step = -along - np.sign(radius) * np.sqrt(along**2 - np.sum(offset**2, axis=-1) + radius**2)
+    points = position + step[:, None] * direction
+    np.testing.assert_allclose(np.linalg.norm(points - focus, axis=-1), abs(radius), rtol=1e-12)
+
+    basis = zernike.basis(45, nodes.x, nodes.y)
+    slopes = [zernike.gradient_basis(45, nodes.x, nodes.y, axis) for axis in (0, 1)]
+    root = np.sqrt(nodes.weight)[:, None]
+
+    def tube(surface: np.ndarray) -> np.ndarray:
+        """Area on a surface of points (N, 3) per area of the stop's unit disk."""
+        terms, *_ = np.linalg.lstsq(basis * root, surface * root, rcond=None)
+        return np.linalg.norm(np.cross(slopes[0] @ terms, slopes[1] @ terms), axis=-1)
+
+    entrance = tube(launch)
+    amplitude = np.sqrt(tube(points - focus) * entrance / np.sum(entrance * nodes.weight)) * nodes.weight
+    x, y = np.meshgrid(AXIS.points(), AXIS.points())
+    pixels = camera.frame.apply(camera.centre + np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3))
+    sense = np.sign(radius)
+    normal = camera.frame.rotation[:, 2]
+    want = huygens(points, sense * (path + step), sense * direction, amplitude, WAVELENGTH, pixels, normal)
+    error = np.max(np.abs(got.ravel() - want)) / np.max(want)
+    assert error < (2e-6 if where == "exit pupil" else 1e-4)
+    assert np.max(want) * (3e-6) ** 2 > 0.03  # there is an image on these pixels
+    assert np.sum(want) * (3e-6) ** 2 == pytest.approx(0.977, abs=0.005)
+
+
+@pytest.mark.parametrize("dz", [0.0, 100e-6])
+def test_independent_of_the_pupil_sampling(backend, gf7, dz: float) -> None:
+    camera = Camera(backend, gf7, focal_plane_at(dz))
+    images = [
+        image(camera.field(nodes), AXIS, AXIS)[0] for nodes in (quadrature.disk(14, 48), FINE, quadrature.disk(30, 96))
+    ]
+    peak = images[-1].max()
+    assert np.max(np.abs(images[1] - images[2])) < 1e-8 * peak
+    assert np.max(np.abs(images[0] - images[2])) < 1e-6 * peak
+
+
+def test_power_is_that_of_the_stop(backend, gf7) -> None:
+    """Plancherel over a wide detector: all but the far wings of the light, 1 - 2 / (pi^2 r / (lambda F))."""
+    camera = Camera(backend, gf7, PERTURBED)
+    n, step = 120, 2.5e-6
+    axis = Grid(-0.5 * (n - 1) * step, step, n)
+    total = np.sum(image(camera.field(quadrature.disk(40, 160)), axis, axis)) * step**2
+    assert 1.0 - total == pytest.approx(2 * WAVELENGTH * 9.2 / np.pi**2 / (0.5 * n * step) * 0.9, rel=0.2)
+
+
+def moved_by(reference: PupilField, other: PupilField, x: Grid, y: Grid, start: np.ndarray) -> np.ndarray:
+    """(x, y) by which the image of ``other`` lies beside that of ``reference``: least squares from a near start."""
+    got = image(other, x, y)[0]
+
+    def at(shift: np.ndarray) -> np.ndarray:
+        return image(reference, shifted(x, -shift[0]), shifted(y, -shift[1]))[0]
+
+    shift = start
+    h = 1e-8
+    for _ in range(8):
+        model = at(shift)
+        matrix = np.stack([(at(shift + h * e) - model).ravel() / h for e in np.eye(2)], axis=-1)
+        shift = shift + np.linalg.lstsq(matrix, (got - model).ravel(), rcond=None)[0]
+    return shift
+
+
+@pytest.mark.parametrize("pixels", [(0.3, -0.4), (1.37, 0.0), (0.0, 12.25)])
+def test_the_image_moves_when_the_detector_moves(backend, gf7, pixels: tuple[float, float]) -> None:
+    """The focal plane of the camera, 7 um pixels: the image moves the other way on it, to 1e-4 pixel."""
+    pitch = gf7.spec.line.pitch
+    still = Camera(backend, gf7, PERTURBED)
+    dx, dy = (p * pitch for p in pixels)
+    moved = Camera(backend, gf7, {**PERTURBED, IMAGE: Motion(shift=(dx, dy, 0.0))})
+    start = np.array([1e-6 - dx, 1e-6 - dy])
+    window = shifted(AXIS, -dx), shifted(AXIS, -dy)
+    shift = moved_by(still.field(FINE), moved.field(FINE, still.centre), *window, start) / pitch
+    np.testing.assert_allclose(shift, [-pixels[0], -pixels[1]], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("camera", ["forward", "backward"])
+def test_the_spot_moves_when_the_area_ccd_moves(backend, gf7_pair, camera: str) -> None:
+    path = MonitorPath(gf7_pair, backend)
+    body = f"base/{camera}/focal_plane/left/area_ccd"
+    pixels = np.array([0.3, -0.4])
+    state: State = {body: Motion(shift=(*(pixels * path.pitch), 0.0))}
+    fields = path.fields([{}, state])
+    checked = 0
+    for i, channel in enumerate(path.channels):
+        still, moved = fields[2 * i : 2 * i + 1], fields[2 * i + 1 : 2 * i + 2]
+        shift = moved_by(still, moved, path.grid(1), path.grid(0), np.zeros(2)) / path.pitch
+        want = -pixels if channel.ccd_body == body else np.zeros(2)
+        np.testing.assert_allclose(shift, want, rtol=0, atol=1e-4)
+        checked += 1
+    assert checked == 4
+
+
+def test_a_blocked_beam_is_an_explained_error(backend, gf7) -> None:
+    camera = Camera(backend, gf7, {"M3": Motion(shift=(2.0, 0.0, 0.0))})
+    with pytest.raises(BeamMissedError, match="imaging path"):
+        camera.field(FINE)

@@ -1,0 +1,181 @@
+"""The trace against closed forms. Light travels toward +z unless a test says otherwise."""
+
+import numpy as np
+import pytest
+
+from optics.aperture import Circle, Rectangle
+from optics.pose import Pose
+from optics.rotation import rotation_matrix
+from optics.surface import Surface, plane
+from optics.trace import BeamMissedError, require_some
+from tests.optics.bench import PASS, REFRACT, Stage, at, beam, build, disk_points, run, unit
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def test_plane_mirror(backend) -> None:
+    turn = rotation_matrix([0.5, -0.3, 0.2])
+    mirror = Pose(turn, np.array([0.1, 0.2, 3.0]))
+    position, direction = beam(disk_points(50, 0.5), 0.0, unit(0.1, 0.2, 1.0))
+    hit, leaving, path, valid = run(backend, build(Stage(plane(), pose=mirror)), position, direction)
+    normal = turn[:, 2]
+    assert valid.all()
+    np.testing.assert_allclose((hit - mirror.translation) @ normal, 0.0, atol=1e-15)
+    np.testing.assert_allclose(leaving, direction - 2 * np.outer(direction @ normal, normal), atol=1e-15)
+    np.testing.assert_allclose(path, np.linalg.norm(hit - position, axis=-1), rtol=1e-15)
+
+
+def test_paraboloid_focuses_the_axis_with_equal_paths(backend) -> None:
+    f = 2.0
+    bench = build(Stage(Surface(-1 / (2 * f), -1.0)), Stage(plane(), PASS, at(-f)))
+    position, direction = beam(disk_points(500, 0.9), -5.0, Z)
+    hit, leaving, path, valid = run(backend, bench, position, direction)
+    assert valid.all()
+    np.testing.assert_allclose(hit, np.broadcast_to([0, 0, -f], hit.shape), atol=2e-15)
+    np.testing.assert_allclose(path, 5.0 + f, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(leaving, axis=-1), 1.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("conic", [-0.3, -0.7])
+def test_ellipsoid_images_one_focus_on_the_other(backend, conic: float) -> None:
+    e, radius = np.sqrt(-conic), -2.0
+    near, far = radius / (1 + e), radius / (1 - e)
+    source = np.array([0.0, 0.0, near])
+    directions = np.column_stack([disk_points(200, 0.6), np.ones(200)])
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    bench = build(Stage(Surface(1 / radius, conic)), Stage(plane(), PASS, at(far)))
+    hit, _, path, valid = run(backend, bench, np.broadcast_to(source, directions.shape), directions)
+    assert valid.all()
+    np.testing.assert_allclose(hit, np.broadcast_to([0, 0, far], hit.shape), atol=3e-14)
+    np.testing.assert_allclose(path, abs(near + far), atol=3e-14)
+
+
+def test_sphere_returns_light_to_its_centre(backend) -> None:
+    radius = 3.0
+    directions = np.column_stack([disk_points(200, 0.9), np.full(200, -1.0)])
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    centre = np.broadcast_to([0.0, 0.0, radius], directions.shape)
+    hit, leaving, path, valid = run(backend, build(Stage(Surface(1 / radius))), centre, directions)
+    assert valid.all()
+    np.testing.assert_allclose(hit, centre + radius * directions, atol=2e-15)
+    np.testing.assert_allclose(leaving, -directions, atol=1e-15)
+    np.testing.assert_allclose(path, radius, atol=1e-15)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.0, 1.5), (1.5, 1.0), (1.5, 1.7), (1.4, 1.4)])
+def test_snell(backend, before: float, after: float) -> None:
+    incoming = np.array(
+        [unit(np.sin(a) * np.cos(3 * a), np.sin(a) * np.sin(3 * a), np.cos(a)) for a in np.linspace(0, 0.6, 30)]
+    )
+    bench = build(
+        Stage(plane(), PASS, index_after=before),
+        Stage(plane(), REFRACT, at(1.0), index_after=after),
+        Stage(plane(), PASS, at(2.0), index_after=after),
+    )
+    hit, leaving, path, valid = run(backend, bench, np.zeros_like(incoming), incoming)
+    assert valid.all()
+    np.testing.assert_allclose(after * leaving[:, :2], before * incoming[:, :2], atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(leaving, axis=-1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(path, before / incoming[:, 2] + after / leaving[:, 2], rtol=1e-15)
+    np.testing.assert_allclose(hit[:, 2], 2.0, atol=1e-15)
+
+
+def test_total_internal_reflection_is_invalid_and_finite(backend) -> None:
+    angle = np.radians([41.7, 41.9, 80.0])  # the critical angle of 1.5 is 41.81 deg
+    incoming = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=-1)
+    bench = build(Stage(plane(), PASS, index_after=1.5), Stage(plane(), REFRACT, at(1.0)))
+    hit, leaving, path, valid = run(backend, bench, np.zeros((3, 3)), incoming)
+    np.testing.assert_array_equal(valid, [True, False, False])
+    assert np.isfinite(hit).all()
+    assert np.isfinite(leaving).all()
+    assert np.isfinite(path).all()
+
+
+def test_aplanatic_sphere(backend) -> None:
+    """From r/n inside a sphere of glass to the virtual image at r n, free of aberration."""
+    n, radius = 1.5, -2.0
+    source = np.array([0.0, 0.0, radius - abs(radius) / n])
+    directions = np.column_stack([disk_points(200, 1.0), np.ones(200)])
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    bench = build(Stage(plane(), PASS, at(source[2]), index_after=n), Stage(Surface(1 / radius), REFRACT))
+    hit, leaving, path, valid = run(backend, bench, np.broadcast_to(source, directions.shape), directions)
+    assert valid.all()
+    # the images lie on the source's side of the centre: centre + r n toward the source
+    image = np.array([0.0, 0.0, radius + np.sign(source[2] - radius) * n * abs(radius)])
+    offset = hit - image
+    np.testing.assert_allclose(np.cross(offset, leaving), 0.0, atol=2e-15)
+    np.testing.assert_allclose(path, np.linalg.norm(offset, axis=-1), atol=5e-15)
+
+
+def test_even_asphere_meets_its_own_sag(backend) -> None:
+    surface = Surface(-1 / 6.7, -1.5, (-4.9e-5, -4.6e-6, 1e-6))
+    position, direction = beam(disk_points(500, 0.8), -3.0, unit(0.05, 0.1, 1.0))
+    hit, leaving, path, valid = run(backend, build(Stage(surface)), position, direction)
+    assert valid.all()
+    np.testing.assert_allclose(hit[:, 2], surface.sag(hit[:, 0], hit[:, 1]), rtol=0, atol=4e-16)
+    np.testing.assert_allclose(path, np.sum((hit - position) * direction, axis=-1), atol=2e-15)
+    h = 1e-6
+    slope = [
+        (surface.sag(hit[:, 0] + dx, hit[:, 1] + dy) - surface.sag(hit[:, 0] - dx, hit[:, 1] - dy)) / (2 * h)
+        for dx, dy in ((h, 0.0), (0.0, h))
+    ]
+    normal = np.stack([-slope[0], -slope[1], np.ones_like(slope[0])], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    want = direction - 2 * np.sum(direction * normal, axis=-1, keepdims=True) * normal
+    np.testing.assert_allclose(leaving, want, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("surface", "interaction"),
+    [
+        (plane(), REFRACT),
+        (Surface(0.5), REFRACT),
+        (Surface(-0.5, -2.5), REFRACT),
+        (Surface(0.5, 3.0), REFRACT),
+        (Surface(-0.15, -1.5, (-5e-5, -5e-6)), REFRACT),
+    ],
+)
+def test_whatever_comes_valid_rays_are_on_the_surface_and_the_rest_is_finite(backend, surface, interaction) -> None:
+    rng = np.random.default_rng(7)
+    position, direction = rng.normal(size=(2, 4000, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction[:5] = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1]]
+    hit, leaving, path, valid = run(backend, build(Stage(surface, interaction, index_after=1.5)), position, direction)
+    for name, array in {"hit": hit, "leaving": leaving, "path": path}.items():
+        assert np.isfinite(array).all(), name
+    assert valid.sum() > 400
+    np.testing.assert_allclose(hit[valid, 2], surface.sag(hit[valid, 0], hit[valid, 1]), rtol=1e-12, atol=2e-12)
+    np.testing.assert_allclose(np.linalg.norm(leaving[valid], axis=-1), 1.0, atol=1e-12)
+
+
+def test_a_ray_that_misses_is_invalid(backend) -> None:
+    position, direction = beam(np.array([[0.0, 0.0], [1.9, 0.0], [2.1, 0.0], [5.0, 5.0]]), -5.0, Z)
+    for surface in (Surface(-0.5), Surface(-0.5, 0.0, (1e-5,))):
+        _, _, _, valid = run(backend, build(Stage(surface)), position, direction)
+        np.testing.assert_array_equal(valid, [True, True, False, False])
+
+
+def test_apertures_stop_what_is_outside(backend) -> None:
+    points = np.array([[0.0, 0.0], [0.15, 0.0], [0.25, 0.0], [0.0, 0.45], [0.0, 0.55]])
+    position, direction = beam(points, -1.0, Z)
+    for aperture in (Circle(0.5, (0.0, 0.0), inner=0.2), Circle(0.2, (0.1, 0.0)), Rectangle(0.2, 0.5)):
+        valid = run(backend, build(Stage(plane(), aperture=aperture)), position, direction)[3]
+        np.testing.assert_array_equal(valid, aperture.contains(*points.T))
+        assert 0 < valid.sum() < len(points)
+
+
+def test_a_scaled_camera_scales_its_paths(backend) -> None:
+    from optics.tree import Motion
+
+    surface = Surface(-0.25, -1.0)
+    position, direction = beam(disk_points(50, 0.4), -3.0, Z)
+    state = {"e0": Motion(scale=0.01)}
+    hit, _, _, valid = run(backend, build(Stage(surface)), position, direction, state)
+    assert valid.all()
+    np.testing.assert_allclose(hit[:, 2], 1.01 * surface.sag(hit[:, 0] / 1.01, hit[:, 1] / 1.01), atol=1e-15)
+
+
+def test_a_beam_that_misses_everything_is_an_explained_error() -> None:
+    with pytest.raises(BeamMissedError, match="no ray gets through the test in 1 of 2 cases"):
+        require_some(np.array([[True, False], [False, False]]), "the test")
+    require_some(np.array([[True, False]]), "the test")

