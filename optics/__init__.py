@@ -4,7 +4,11 @@ units.
 This package knows nothing of YAML, commands or Mitsuba scenes.
 """
 
-from optics.llvm import ensure_llvm
+from contextlib import suppress
 
-# Before anything can import drjit: it looks for LLVM once, and on many systems finds one that kills the process.
-ensure_llvm()
+from optics.llvm import LibraryMissing, ensure_llvm
+
+# Before anything can import drjit: it looks for LLVM once, and on many systems finds one that kills the process. What
+# is missing is said by `load_backend`, where a command can tell its user, and not in the middle of an import.
+with suppress(LibraryMissing):
+    ensure_llvm()

@@ -105,7 +105,7 @@ def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: 
     done = 1
     while done < grid.count:
         more = min(done, grid.count - done)
-        turn = np.exp(1j * frequency * (done * grid.step)).astype(kind)
+        turn: np.ndarray = np.exp(1j * frequency * (done * grid.step)).astype(kind)
         np.multiply(out[:more], turn, out=out[done : done + more])
         done += more
     return out

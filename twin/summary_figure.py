@@ -46,8 +46,10 @@ def _draw(run: RenderRun) -> Figure:
     norm = stretch(before)
     positions = run.recovery.before[0], run.recovery.after[0]
     height = picture / sum(heights)
+    windows = [core_window(b, a, REACH * airy_radius(run) / 0.75) for b, a in zip(*positions, strict=True)]
+    half = max(window[2] for window in windows)  # one scale for all pictures
     for i, channel in enumerate(channels):
-        row, column, half = core_window(positions[0][i], positions[1][i], REACH * airy_radius(run) / 0.75)
+        row, column, _ = windows[i]
         for k, (image, when) in enumerate(((before[i], "before"), (after[i], "after"))):
             bottom = 1.0 - (k + 1) * height - 0.36 / sum(heights) + (0.02 * height)
             axes = figure.add_axes((i / columns + 0.004, bottom, 1.0 / columns - 0.008, 0.96 * height))

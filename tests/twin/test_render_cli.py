@@ -422,6 +422,16 @@ def test_no_gpu(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_missing_library_is_explained(tmp_path, monkeypatch):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nonexistent.so")
+    process = start(EXAMPLE, "--out", tmp_path / "run")
+    stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (1, "")
+    assert "/nonexistent.so" in stderr
+    assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     process = start(EXAMPLE, "--out", tmp_path / "new/run", "--quiet")

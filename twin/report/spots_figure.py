@@ -117,7 +117,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
     ticks = _dn_ticks(norm)
     bar.set_ticks(ticks, labels=[f"{t:.0f}" for t in ticks])
     bar.minorticks_off()
-    figure.colorbar(map_of, ax=list(grid[:, 3]), label="difference [DN]", aspect=13, **bars)
+    figure.colorbar(map_of, ax=list(grid[:, 3]), label="difference [DN]", aspect=13, ticks=MaxNLocator(4), **bars)
     for axes in grid.ravel():
         axes.tick_params(length=2.5, color=INK)
     return figure
