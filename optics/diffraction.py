@@ -45,6 +45,21 @@ class PupilField:
         """Some of the images."""
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
+    def repeated(self, count: int) -> PupilField:
+        """Every image ``count`` times in a row."""
+        u, v, eikonal, amplitude = (np.repeat(a, count, axis=0) for a in (self.u, self.v, self.eikonal, self.amplitude))
+        return PupilField(u, v, eikonal, amplitude, self.wavelength)
+
+
+@dataclass(frozen=True, eq=False)
+class PupilTangent:
+    """Derivatives of the arrays of a ``PupilField`` by one parameter, (B, N) each."""
+
+    u: np.ndarray
+    v: np.ndarray
+    eikonal: np.ndarray
+    amplitude: np.ndarray
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -88,6 +103,24 @@ def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarr
         list(pool.map(piece, range(0, count, _AT_ONCE)))
     out /= field.wavelength**2
     return out
+
+
+def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid) -> np.ndarray:
+    """Derivative of ``image`` by the parameter of ``tangent``, exact, (B, R, C)."""
+    k = 2.0 * np.pi / field.wavelength
+    out = np.empty((len(field.u), y.count, x.count))
+    for i in range(len(field.u)):
+        rows = _waves(k * field.v[i], y, 1.0, np.complex128)
+        phasor = np.exp(1j * k * field.eikonal[i])
+        amplitude = field.amplitude[i] * phasor
+        columns = _waves(k * field.u[i], x, 1.0, np.complex128).T
+        here = rows @ (amplitude[:, None] * columns)
+        own = (tangent.amplitude[i] + 1j * k * field.amplitude[i] * tangent.eikonal[i]) * phasor
+        step = rows @ (own[:, None] * columns)
+        step += 1j * k * x.points() * (rows @ ((amplitude * tangent.u[i])[:, None] * columns))
+        step += 1j * k * y.points()[:, None] * (rows @ ((amplitude * tangent.v[i])[:, None] * columns))
+        out[i] = 2.0 * np.real(np.conj(here) * step)
+    return out / field.wavelength**2
 
 
 _AT_ONCE = 4

@@ -12,6 +12,7 @@ from analysis import model_fit, monitoring
 from analysis.model_fit import ObservabilityReport
 from analysis.recovery import ESTIMATORS
 from twin.experiment import MonitorExperiment
+from twin.monitor_derivative import spot_jacobian
 from twin.motions import ARCSEC, ElementaryMotion, line_family, other_motions
 from twin.truth import truth_jacobian
 
@@ -129,7 +130,7 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
     every = [motion for motions in sets.values() for motion in motions]
-    all_spots = experiment.path.spot_jacobian(every)
+    all_spots = spot_jacobian(experiment.path, every)
     all_truth = truth_jacobian(instrument, experiment.backend, every)
     out = {}
     for k, (name, motions) in enumerate(sets.items()):

@@ -21,6 +21,7 @@ from scenes.job import JobSpec, noll
 from scenes.resolved import ResolvedJob
 from twin.detector import EmvaDetector, FixedPattern
 from twin.monitor import MonitorPath
+from twin.monitor_derivative import spot_jacobian
 from twin.motions import line_family
 from twin.truth import Truth, trace_truth, truth_jacobian
 
@@ -83,7 +84,7 @@ class MonitorExperiment:
     def calibration(self) -> MonitorCalibration:
         """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
         families = {name: line_family(name) for name in self.instrument.cameras}
-        spots = self.path.spot_jacobian([motion for family in families.values() for motion in family])
+        spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
         for k, (name, family) in enumerate(families.items()):
             cameras[name] = CameraCalibration(

@@ -23,10 +23,9 @@ from optics.pixel_response import PixelResponse
 from optics.quadrature import PupilNodes
 from optics.system import assemble
 from optics.trace import BeamMissedError, make_rays, require_some, trace
-from optics.tree import COMPLEX_STEP, PlacedBodies, State
+from optics.tree import PlacedBodies, State
 from optics.wavefront import eikonal
 from scenes.instrument_model import BASE, Channel, Instrument
-from twin.motions import ElementaryMotion, pivot_states
 
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
@@ -54,6 +53,16 @@ class Aimed:
     axes: np.ndarray
     parameters: np.ndarray
     jacobian: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CcdRays:
+    """Rays at the CCDs in each CCD's frame: position and direction (B, N, 3), optical path and validity (B, N)."""
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    valid: np.ndarray
 
 
 class MonitorPath:
@@ -96,17 +105,18 @@ class MonitorPath:
         return self._aim(self.instrument.assembly.place(), [{}], None)
 
     @cached_property
-    def _map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Operators that fit a smooth function on the nodes and give its value, d/dx and d/dy there, each (N, N)."""
+    def _slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Operators from values of a smooth function on the nodes to its d/dx and d/dy there, each (N, N)."""
         x, y = self.nodes.x, self.nodes.y
-        basis = zernike.basis(MAP_TERMS, x, y)
         root = np.sqrt(self.nodes.weight)
-        solve = np.linalg.pinv(basis * root[:, None]) * root
-        return (
-            basis @ solve,
-            zernike.gradient_basis(MAP_TERMS, x, y, 0) @ solve,
-            zernike.gradient_basis(MAP_TERMS, x, y, 1) @ solve,
-        )
+        solve = np.linalg.pinv(zernike.basis(MAP_TERMS, x, y) * root[:, None]) * root
+        dx, dy = (zernike.gradient_basis(MAP_TERMS, x, y, axis) for axis in (0, 1))
+        return dx @ solve, dy @ solve
+
+    def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N)."""
+        dx, dy = self._slopes
+        return np.asarray((u @ dx.T) * (v @ dy.T) - (u @ dy.T) * (v @ dx.T))
 
     def _aim(self, placed: PlacedBodies, states: Sequence[State], start: Aimed | None) -> Aimed:
         """Aim rays from each pinhole at the nodes of its return face."""
@@ -143,27 +153,39 @@ class MonitorPath:
         place, heading = fan.at(q)
         return Aimed(place, heading, axes, q, slope)
 
-    def fields(self, states: Sequence[State]) -> PupilField:
-        """Plane waves at the CCDs for C channels x S states, channel-major, in each CCD's x, y about its centre.
+    def rays(self, states: Sequence[State]) -> CcdRays:
+        """Rays at the CCDs for C channels x S states, channel-major.
 
         Raises:
-            BeamMissedError, AimError: a perturbation moves a beam off the mirrors, named in the message.
+            BeamMissedError, AimError: a perturbation moves a beam off the mirrors or a spot off its CCD, named in the
+                message.
         """
         placed = self.instrument.assembly.place(states)
         aimed = self._aim(placed, states, self.nominal)
         systems = assemble(self.instrument.assembly, [f"{c.key}/monitor" for c in self.channels], states, placed=placed)
         traced = trace(self.backend, systems, make_rays(self.backend, aimed.position, aimed.direction))
-        position, direction, path, valid = traced.numpy()
+        rays = CcdRays(*traced.numpy())
         for i, channel in enumerate(self.channels):
             own = slice(i * len(states), (i + 1) * len(states))
-            require_some(valid[own], f"the monitor channel {channel.key}")
-            self._require_on_ccd(channel, position[own])
-        _, dx, dy = self._map
+            require_some(rays.valid[own], f"the monitor channel {channel.key}")
+            self._require_on_ccd(channel, rays.position[own])
+        return rays
+
+    def fields(self, states: Sequence[State]) -> PupilField:
+        """Plane waves at the CCDs for C channels x S states, channel-major, in each CCD's x, y about its centre.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        return self.field_of(self.rays(states))
+
+    def field_of(self, rays: CcdRays) -> PupilField:
+        """Plane waves of traced rays."""
+        direction = rays.direction
         u, v = direction[..., 0], direction[..., 1]
-        determinant = np.abs((u @ dx.T) * (v @ dy.T) - (u @ dy.T) * (v @ dx.T))
         # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.diffraction, with A the face's area
-        amplitude = np.sqrt(determinant / np.pi) * self.nodes.weight * valid
-        phase = eikonal(position, direction, path, np.zeros(3))
+        amplitude = np.sqrt(np.abs(self.area_ratio(u, v)) / np.pi) * self.nodes.weight * rays.valid
+        phase = eikonal(rays.position, direction, rays.path, np.zeros(3))
         phase = phase - phase[:, :1]
         return PupilField(u, v, phase, amplitude, self.wavelength)
 
@@ -208,15 +230,19 @@ class MonitorPath:
         response = self.response
         border = margin + response.reach
         y, x = (self.grid(axis, border) for axis in (0, 1))
-        light = self.instrument.spec.monitor.reticle.photons_per_frame * self.pitch**2
         for start in range(0, len(states), chunk):
             some = states[start : start + chunk]
             irradiance = image(self.fields(some), x, y, single=True)
-            photons = light * response.apply(irradiance)
+            photons = self.light_per_pixel * response.apply(irradiance)
             yield (
                 slice(start, start + len(some)),
                 np.swapaxes(photons.reshape(len(self.channels), len(some), *photons.shape[1:]), 0, 1),
             )
+
+    @property
+    def light_per_pixel(self) -> float:
+        """Photons per frame times the pixel's area, m^2: what turns an image of unit power into photons per pixel."""
+        return float(self.instrument.spec.monitor.reticle.photons_per_frame * self.pitch**2)
 
     def grid(self, axis: int, margin: int = 0) -> Grid:
         """Pixel centres of the rows (0) or columns (1) in detector coordinates from the CCD's centre."""
@@ -226,50 +252,3 @@ class MonitorPath:
     def axis(self, axis: int) -> np.ndarray:
         """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
         return self.grid(axis).points()
-
-    def spot_jacobian(self, motions: Sequence[ElementaryMotion]) -> np.ndarray:
-        """Derivative of every spot's position by elementary motions, by forward-mode AD through the whole path.
-
-        The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.
-
-        Args:
-            motions: M elementary motions.
-
-        Returns:
-            (C, 2, M): row and column, pixels per radian, metre or unit.
-        """
-        import drjit as dr
-
-        states = pivot_states(motions)
-        steps = [motion.step for motion in motions]
-        placed = self.instrument.assembly.place(states, steps)
-        step = np.concatenate([placed.translation[:, placed.index[c.reticle_body]].imag for c in self.channels])
-        step = step[:, None] / COMPLEX_STEP
-        nominal = self.nominal
-        n, m, c = self.nodes.count, len(motions), len(self.channels)
-        position = np.repeat(nominal.position, m, axis=0)
-        direction = np.repeat(nominal.direction, m, axis=0)
-        position = np.broadcast_to(position, direction.shape)
-
-        def push(sequence: str, direction_step: np.ndarray) -> np.ndarray:
-            """Derivative of the hit on the last element, (C*M, N, 2)."""
-            systems = assemble(
-                self.instrument.assembly, [f"{ch.key}/{sequence}" for ch in self.channels], states, steps, placed
-            )
-            rays = make_rays(self.backend, position, direction)
-            dr.enable_grad(rays.position, rays.direction)
-            dr.set_grad(rays.position, self.backend.vector(np.broadcast_to(step, direction.shape).reshape(-1, 3)))
-            dr.set_grad(rays.direction, self.backend.vector(direction_step.reshape(-1, 3)))
-            out = trace(self.backend, systems, rays, evaluate=False)
-            dr.forward_to(out.local.position)
-            gradient = dr.grad(out.local.position)
-            return np.stack([gradient.x.numpy(), gradient.y.numpy()], axis=-1).reshape(c * m, n, 2)
-
-        # rays stay on their aperture nodes: the launch direction follows the motion
-        drift = push("outgoing", np.zeros_like(direction))
-        q_step = -np.linalg.solve(np.repeat(nominal.jacobian, m, axis=0), drift[..., None])[..., 0]
-        turn = np.einsum("bnk,bnkx->bnx", q_step, np.broadcast_to(np.repeat(nominal.axes, m, axis=0), (c * m, n, 2, 3)))
-        turn = turn - direction * np.sum(turn * direction, axis=-1, keepdims=True)
-        moved = push("monitor", turn)
-        mean = np.einsum("n,bnk->bk", self.nodes.weight / np.sum(self.nodes.weight), moved)
-        return np.asarray(mean.reshape(c, m, 2)[..., ::-1].swapaxes(1, 2)) / self.pitch

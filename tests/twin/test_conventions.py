@@ -15,6 +15,7 @@ from optics.tree import Body, Motion, RigidTree
 from optics.wavefront import path_difference
 from scenes.camera_model import collimated, field_direction
 from twin.monitor import MonitorPath
+from twin.monitor_derivative import spot_jacobian
 from twin.motions import ElementaryMotion, line_family
 from twin.truth import trace_truth, truth_jacobian
 
@@ -51,7 +52,7 @@ def truth(gf7_pair, backend, motions):
 @pytest.fixture(scope="module")
 def spots(path, motions):
     """Motion -> (2 sides, 2 (row, column)) px per radian, metre or unit of scale, for the camera's own spots."""
-    jacobian = path.spot_jacobian(list(motions.values()))[:2]
+    jacobian = spot_jacobian(path, list(motions.values()))[:2]
     return {name: jacobian[..., k] for k, name in enumerate(motions)}
 
 

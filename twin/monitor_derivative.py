@@ -1,0 +1,112 @@
+"""Derivatives of the monitor's spots and images by motions of any body, by forward-mode AD through the whole path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.diffraction import PupilTangent, image_derivative
+from optics.system import assemble
+from optics.trace import make_rays, trace
+from optics.tree import COMPLEX_STEP
+from twin.monitor import MonitorPath
+from twin.motions import ElementaryMotion, pivot_states
+
+
+@dataclass(frozen=True, eq=False)
+class RayTangents:
+    """Derivatives of the rays at the CCDs for C channels x M motions (channel-major), in each CCD's frame.
+
+    Attributes:
+        position, direction: (C*M, N, 3), metres and 1 per radian, metre or unit.
+        path: optical path, (C*M, N).
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+
+
+def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayTangents:
+    """Push motions forward through the traced path, about the unperturbed instrument; rays stay on their nodes.
+
+    The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
+    """
+    states, steps = pivot_states(motions), [motion.step for motion in motions]
+    placed = path.instrument.assembly.place(states, steps)
+    source = np.concatenate([placed.translation[:, placed.index[c.reticle_body]].imag for c in path.channels])
+    nominal, m = path.nominal, len(motions)
+    direction = np.repeat(nominal.direction, m, axis=0)
+    position = np.broadcast_to(np.repeat(nominal.position, m, axis=0), direction.shape)
+    position_step = np.broadcast_to(source[:, None] / COMPLEX_STEP, direction.shape)
+
+    def push(sequence: str, direction_step: np.ndarray) -> RayTangents:
+        import drjit as dr
+
+        names = [f"{channel.key}/{sequence}" for channel in path.channels]
+        systems = assemble(path.instrument.assembly, names, states, steps, placed)
+        rays = make_rays(path.backend, position, direction)
+        dr.enable_grad(rays.position, rays.direction)
+        dr.set_grad(rays.position, path.backend.vector(position_step.reshape(-1, 3)))
+        dr.set_grad(rays.direction, path.backend.vector(direction_step.reshape(-1, 3)))
+        out = trace(path.backend, systems, rays, evaluate=False).local
+        dr.forward_to(out.position, out.direction, out.path, flags=dr.ADFlag.ClearEdges)
+        vectors = [np.stack([c.numpy() for c in dr.grad(v)], axis=-1) for v in (out.position, out.direction)]
+        shape = direction.shape
+        return RayTangents(
+            vectors[0].reshape(shape), vectors[1].reshape(shape), dr.grad(out.path).numpy().reshape(shape[:2])
+        )
+
+    drift = push("outgoing", np.zeros_like(direction)).position[..., :2]
+    q_step = -np.linalg.solve(np.repeat(nominal.jacobian, m, axis=0), drift[..., None])[..., 0]
+    axes = np.broadcast_to(np.repeat(nominal.axes, m, axis=0), (*direction.shape[:2], 2, 3))
+    turn = np.einsum("bnk,bnkx->bnx", q_step, axes)
+    return push("monitor", turn - direction * np.sum(turn * direction, axis=-1, keepdims=True))
+
+
+def spot_jacobian(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.ndarray:
+    """Derivative of every spot's position by elementary motions.
+
+    The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.
+
+    Args:
+        path: the monitor.
+        motions: M elementary motions.
+
+    Returns:
+        (C, 2, M): row and column, pixels per radian, metre or unit.
+    """
+    share = path.nodes.weight / np.sum(path.nodes.weight)
+    mean = np.einsum("n,bnk->bk", share, ray_tangents(path, motions).position[..., 1::-1])
+    return np.asarray(mean.reshape(len(path.channels), len(motions), 2).swapaxes(1, 2)) / path.pitch
+
+
+def photon_derivative(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.ndarray:
+    """Derivative of the expected photons per pixel and frame by elementary motions: AD from the YAML to the pixels.
+
+    Args:
+        path: the monitor.
+        motions: M elementary motions.
+
+    Returns:
+        (M, C, rows, columns), photons per radian, metre or unit.
+    """
+    tangents = ray_tangents(path, motions)
+    count = len(motions)
+    rays = path.rays([{}])
+    field = path.field_of(rays)
+    u_step, v_step = tangents.direction[..., 0], tangents.direction[..., 1]
+    # eikonal = path - d . position with the CCD's centre as the origin
+    position, direction = (np.repeat(a, count, axis=0) for a in (rays.position, rays.direction))
+    eikonal_step = tangents.path - np.sum(tangents.direction * position + direction * tangents.position, axis=-1)
+    u, v, amplitude = (np.repeat(a, count, axis=0) for a in (field.u, field.v, field.amplitude))
+    ratio = path.area_ratio(u, v)
+    ratio_step = path.area_ratio(u_step, v) + path.area_ratio(u, v_step)
+    step = PupilTangent(u_step, v_step, eikonal_step, amplitude * 0.5 * ratio_step / ratio)
+    reach = path.response.reach
+    y, x = (path.grid(axis, reach) for axis in (0, 1))
+    derivative = image_derivative(field.repeated(count), step, x, y)
+    photons = path.light_per_pixel * path.response.apply(derivative)
+    return np.asarray(photons.reshape(len(path.channels), count, *photons.shape[1:]).swapaxes(0, 1))
