@@ -48,7 +48,7 @@ def main(
     job: Annotated[Path, typer.Argument(help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="Run folder to make. Default: runs/<name of the job>-<number>, the first that is free."),
+        typer.Option(help="Run folder to make. Default: runs/JOB-001, -002, ... (the first that is free)."),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise; overrides the file's.")
@@ -192,7 +192,8 @@ def _table(run: RenderRun) -> Table:
     def add(label: str, key: str, decimals: int, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
         model, sigma = estimators["model"][key], estimators["model"][f"{key}_sigma"]
         values = [true, *(estimators[name][key] for name in ESTIMATORS), sigma]
-        cells = [f"{value:.{decimals}f}" for value in values]
+        # adding 0.0 after rounding leaves no minus before a zero
+        cells = [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in values]
         table.add_row(label, *cells, f"{model - true:+.{decimals}f}", f"{(model - true) / sigma:+.1f}")
 
     for camera, estimators in recovered["cameras"].items():
