@@ -45,10 +45,15 @@ app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exce
 
 @app.command()
 def main(
-    job: Annotated[Path, typer.Argument(help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")],
+    # readable=False: our own loader says what is wrong with a file, in the same words for all files
+    job: Annotated[
+        Path, typer.Argument(readable=False, help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")
+    ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Run folder to make. Default: runs/JOB-001, -002, ... (the first that is free)."),
+        typer.Option(
+            readable=False, help="Run folder to make. Default: runs/JOB-001, -002, ... (the first that is free)."
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise; overrides the file's.")
