@@ -18,7 +18,7 @@ from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
 from optics.figure import GridFigure, ZernikeFigure
-from optics.tree import COMPLEX_STEP, Motion, PlacedBodies, State
+from optics.tree import COMPLEX_STEP, FIGURE, Motion, PlacedBodies, State
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,8 @@ def assemble(
         assembly: the instrument.
         sequences: names of sequences, or element-name tuples, all of the same structure.
         states: S perturbed states.
-        step: optional derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale``.
+        step: optional derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale`` or ``figure``
+            (the axis is then a Noll index that the state's figure names, with 0 if there is none).
         placed: the bodies of these states, when already placed.
 
     Returns:
@@ -131,7 +132,9 @@ def assemble(
     if len(lengths) != 1:
         raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
     structures = [_structures([chain[i] for chain in chains], states) for i in range(len(chains[0]))]
-    per_chain = [[_numbers(chain, i, structures[i], states, placed) for i in range(len(chain))] for chain in chains]
+    per_chain = [
+        [_numbers(chain, i, structures[i], states, placed, step) for i in range(len(chain))] for chain in chains
+    ]
     values = []
     tangents = []
     for i in range(len(chains[0])):
@@ -191,7 +194,12 @@ def _grid(element: Element) -> np.ndarray | None:
 
 
 def _numbers(
-    chain: Sequence[Element], i: int, structure: Structure, states: Sequence[State], placed: PlacedBodies
+    chain: Sequence[Element],
+    i: int,
+    structure: Structure,
+    states: Sequence[State],
+    placed: PlacedBodies,
+    step: Sequence[tuple[str, str, int]] | None,
 ) -> dict[str, np.ndarray]:
     """Parameters of element i of a chain, each of shape (S,), complex when a derivative is carried."""
     element = chain[i]
@@ -220,7 +228,7 @@ def _numbers(
         for n, term in enumerate(surface.even):
             out[f"A{n}"] = term / scale ** (2 * n + 3)
     if structure.figure_order >= 0:
-        out.update(_figure_numbers(element, structure.figure_order, states))
+        out.update(_figure_numbers(element, structure.figure_order, states, step))
     if isinstance(surface.figure, GridFigure):
         x0, _, y0, _ = surface.figure.bounds
         dx, dy = surface.figure.spacing
@@ -242,7 +250,9 @@ def _numbers(
     return out
 
 
-def _figure_numbers(element: Element, order: int, states: Sequence[State]) -> dict[str, np.ndarray]:
+def _figure_numbers(
+    element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
+) -> dict[str, np.ndarray]:
     """Monomial coefficients of the Zernike figure of each state, named F0, F1, ...; centre fx, fy."""
     figure = element.surface.figure
     if isinstance(figure, ZernikeFigure):
@@ -257,12 +267,15 @@ def _figure_numbers(element: Element, order: int, states: Sequence[State]) -> di
         )
     else:
         raise ValueError(f"element {element.name!r} needs an aperture to carry a figure: it sets the disk")
-    table = np.empty((len(states), zernike.triangle_size(order)))
+    kind = np.float64 if step is None else np.complex128
+    table = np.empty((len(states), zernike.triangle_size(order)), kind)
     nothing = Motion()
     for s, state in enumerate(states):
-        terms = dict(base)
+        terms: dict[int, Any] = dict(base)
         for j, amplitude in state.get(element.body, nothing).figure.items():
             terms[j] = terms.get(j, 0.0) + amplitude
+        if step is not None and step[s][:2] == (element.body, FIGURE):
+            terms[step[s][2]] = terms.get(step[s][2], 0.0) + 1j * COMPLEX_STEP
         table[s] = zernike.monomials(terms, order, radius)
     out = {f"F{m}": table[:, m] for m in range(table.shape[1])}
     out["fx"] = np.full(len(states), centre[0])

@@ -129,8 +129,9 @@ class RigidTree:
 
         Args:
             states: S perturbed states.
-            step: optional, one (path, kind, axis) per state with kind ``rotate``, ``shift`` or ``scale``: adds an
-                imaginary step of ``COMPLEX_STEP`` to that component, so that imag/COMPLEX_STEP is the exact derivative.
+            step: optional, one (path, kind, axis) per state with kind ``rotate``, ``shift``, ``scale`` or ``figure``
+                (the axis is then the Noll index): adds an imaginary step of ``COMPLEX_STEP`` to that component, so that
+                imag/COMPLEX_STEP is the exact derivative.
 
         Raises:
             KeyError: a state names an unknown body or pivot.
@@ -169,6 +170,7 @@ class RigidTree:
         return PlacedBodies(FrozenMap(index), rotation, translation, scale)
 
 
+FIGURE = "figure"
 COMPLEX_STEP = 1e-40
 """Imaginary step of the complex-step derivative; products of two steps vanish in float64, so it is exact."""
 
@@ -197,7 +199,7 @@ def _local_motion(
                 shift[s, axis] += 1j * COMPLEX_STEP
             elif kind == "scale":
                 growth[s] += 1j * COMPLEX_STEP
-            else:
+            elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.system``
                 raise ValueError(f"unknown kind of motion {kind!r}")
     turned = rotation_matrix(rotate)
     offset = pivot + shift - growth[:, None] * np.einsum("sij,sj->si", turned, pivot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from math import comb, factorial, sqrt
 from typing import Any
@@ -107,11 +108,11 @@ def triangle_index(a: int, b: int) -> int:
     return d * (d + 1) // 2 + b
 
 
-def monomials(coefficients: dict[int, float], order: int, radius: float) -> np.ndarray:
+def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.ndarray:
     """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape
     (triangle_size(order),).
     """
-    out = np.zeros(triangle_size(order))
+    out = np.zeros(triangle_size(order), np.result_type(float, *coefficients.values()))
     for j, amplitude in coefficients.items():
         for a, b, c in cartesian_terms(j):
             out[triangle_index(a, b)] += amplitude * c / radius ** (a + b)

@@ -11,8 +11,10 @@ from optics.tree import ORIGIN, Motion, State
 from scenes.instrument_model import BASE, CENTRAL_PRISM, Instrument
 
 ARCSEC = np.pi / 180.0 / 3600.0
-_UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6)}
+_UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"
+FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "coma"}
+"""Figure terms in the tables, by Noll index."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +23,8 @@ class ElementaryMotion:
 
     Attributes:
         body: its path.
-        kind: ``rotate``, ``shift`` or ``scale``.
-        axis: 0, 1, 2 of the body's own frame (0 for a scale).
+        kind: ``rotate``, ``shift``, ``scale`` or ``figure``.
+        axis: 0, 1, 2 of the body's own frame (0 for a scale); the Noll index of a figure term.
         pivot: point that a rotation or a scale leaves in place.
         label: short name for tables.
     """
@@ -35,7 +37,7 @@ class ElementaryMotion:
 
     @property
     def unit(self) -> str:
-        """Name of the table unit: arcsec, um or ppm."""
+        """Name of the table unit: arcsec, um, ppm or nm."""
         return _UNITS[self.kind][0]
 
     @property
@@ -50,6 +52,8 @@ class ElementaryMotion:
 
     def motion(self, amount: float) -> Motion:
         """The motion of this size, SI."""
+        if self.kind == "figure":
+            return Motion(figure={self.axis: amount}, pivot=self.pivot)
         vector = [0.0, 0.0, 0.0]
         vector[self.axis] = amount
         triple = (vector[0], vector[1], vector[2])
@@ -81,8 +85,8 @@ def line_family(camera: str) -> tuple[ElementaryMotion, ...]:
 
 
 def other_motions(instrument: Instrument, camera: str) -> tuple[ElementaryMotion, ...]:
-    """All other rigid motions that can reach this camera's spots: focal plane, each mirror, the camera, the
-    reference.
+    """All other motions that can reach this camera's spots: focal plane, each mirror and its low figure terms, the
+    camera, the reference.
     """
     model = instrument.cameras[camera]
     root = f"{BASE}/{camera}"
@@ -93,6 +97,10 @@ def other_motions(instrument: Instrument, camera: str) -> tuple[ElementaryMotion
     ]
     for mirror in model.mirrors:
         out += _six(f"{root}/{mirror}", mirror, "centre")
+        out += [
+            ElementaryMotion(f"{root}/{mirror}", "figure", j, label=f"{mirror} figure Z{j} ({name})")
+            for j, name in FIGURE_TERMS.items()
+        ]
     out += _six(root, "camera", ORIGIN)
     out += _six(CENTRAL_PRISM, "central prism", ORIGIN)[3:]
     return tuple(out)
@@ -104,5 +112,5 @@ def _six(body: str, name: str, pivot: str) -> list[ElementaryMotion]:
 
 
 def pivot_states(motions: Sequence[ElementaryMotion]) -> list[State]:
-    """Unperturbed states that name each motion's pivot, for derivatives about it."""
-    return [{m.body: Motion(pivot=m.pivot)} for m in motions]
+    """Unperturbed states that name each motion's pivot and figure term, for derivatives about it."""
+    return [m.state(0.0) for m in motions]

@@ -37,9 +37,11 @@ def test_table_is_what_the_images_say(table, backend):
         shift = (position - first)[:, 2 * k : 2 * k + 2].reshape(-1, 4).T / units
         change = trace_truth(setup.instrument, backend, states).cameras[name]
         true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f]) * TO_TABLE[:, None] / units
-        assert len(states) == 34
-        # second order of a motion: 1% of its own effect; 2e-5 px: interpolation of the template, over the units
-        assert np.all(np.abs(shift - found.spot_shift) < 0.01 * strongest + 2e-5 / units)
+        assert len(states) == 49
+        # second order of a motion: 1% of its own effect; 2e-5 px: interpolation of the template, over the units. Coma
+        # in the monitor's aperture changes the spot's shape, and a fit of the calibrated shape is not the mean ray: 3%
+        share = np.array([0.03 if m.kind == "figure" else 0.01 for m in found.motions])
+        assert np.all(np.abs(shift - found.spot_shift) < share * strongest + 2e-5 / units)
         camera = setup.calibration.cameras[name]
         per_pixel = np.abs(camera.parameter_jacobian @ np.linalg.inv(camera.spot_jacobian)).sum(axis=1) * TO_TABLE
         floor = 0.01 * per_pixel[:, None] * strongest + 2e-8  # um or arcsec: rounding of the differenced truth
@@ -100,6 +102,6 @@ def test_table_as_plain_data(table):
     _, cameras = table
     for found in cameras.values():
         plain = found.to_dict()
-        assert len(plain["motions"]) == 34
+        assert len(plain["motions"]) == 49
         assert set(plain["motions"][0]["model"]) == set(PARAMETERS)
         assert len(plain["factors"]) == 8

@@ -55,6 +55,8 @@ def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
         value = motion.rotate[elementary.axis]
     elif elementary.kind == "scale":
         value = motion.scale
+    elif elementary.kind == "figure":
+        value = motion.figure.get(elementary.axis, 0.0)
     else:
         value = _shift_at(run, elementary.body, motion, elementary.pivot)[elementary.axis]
     return float(value) / elementary.unit_size
@@ -78,8 +80,10 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
             continue
         if path not in bodies and path not in ideal and (any(motion.rotate) or any(motion.shift) or motion.scale):
             out.append(path)
-        if any(motion.figure.values()):
-            out.append(f"{path} (figure)")
+        covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
+        missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]
+        if missing:
+            out.append(f"{path} (figure {', '.join(missing)})")
     return tuple(out)
 
 
