@@ -33,6 +33,9 @@ MAP_TERMS = 15
 SPOT_RANGE = 0.8
 """Share of the CCD's half size up to which a spot may be off its middle; farther out the estimators refuse it."""
 
+COARSE_RINGS = 6
+"""Rings of the quadrature for means: exact for polynomials to degree 23."""
+
 AIM_TOLERANCE = 1e-9
 """Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
 radius."""
@@ -98,6 +101,11 @@ class MonitorPath:
         """Of the returned beam at the CCD, the largest among the cameras."""
         scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
         return self.face_radius / float(np.min(scales))
+
+    @cached_property
+    def coarse(self) -> MonitorPath:
+        """The same with few nodes: enough for means over the aperture, which is a smooth function's integral."""
+        return MonitorPath(self.instrument, self.backend, quadrature.disk(COARSE_RINGS))
 
     @cached_property
     def nominal(self) -> Aimed:
