@@ -76,9 +76,9 @@ def _row(table: CameraCrosstalk, k: int, columns: list[list[tuple[str, str]]], f
 
 def _short(label: str) -> str:
     """A motion's label without its body, which stands above the rows."""
-    for word in ("along ", "about "):
+    for word in ("figure ", "along ", "about "):
         if word in label:
-            return word + label.partition(word)[2]
+            return (word + label.partition(word)[2]).removeprefix("figure ")
     return label.removeprefix("whole camera ")
 
 
