@@ -43,7 +43,7 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
             stem = f"images/{channel.camera}_{channel.side}_{when}"
             folder.write_bytes(f"{stem}.tiff", _tiff(frames))
             folder.write_with(f"{stem}.png", partial(_write_preview, frames))
-    folder.write_bytes("irradiance.nc", _irradiance(run).to_netcdf(engine="h5netcdf"))
+    folder.write_bytes("irradiance.nc", _netcdf(_irradiance(run)))
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
@@ -82,6 +82,16 @@ def _write_preview(frames: np.ndarray, place: Path) -> None:
     if not ok:
         raise OSError(f"cannot encode {place.name}")
     place.write_bytes(encoded.tobytes())
+
+
+def _netcdf(data: xr.Dataset) -> bytes:
+    """A data set as the contents of a netCDF-4 file."""
+    view = data.to_netcdf(engine="h5netcdf")
+    content = bytes(view)
+    # xarray hands out a window on its buffer, which complains when it is thrown away with the window still open
+    if isinstance(view, memoryview):
+        view.release()
+    return content
 
 
 def _irradiance(run: RenderRun) -> xr.Dataset:
