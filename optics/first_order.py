@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.backend import Backend
+from optics.push_forward import push_forward
 from optics.system import SystemBatch
-from optics.trace import make_rays, trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,29 +61,18 @@ def ray_matrix(
         direction: unit directions, (B, 3).
         axes: two launch axes square to the direction, (B, 2, 3).
     """
-    import drjit as dr
-
-    count = systems.count
     zero = np.zeros_like(axes)
-    base_position = np.repeat(position[:, None], 4, axis=1)
-    base_direction = np.repeat(direction[:, None], 4, axis=1)
-    rays = make_rays(backend, base_position, base_direction)
-    moves = np.concatenate([axes, zero], axis=1)
-    turns = np.concatenate([zero, axes], axis=1)
-    for variable, tangent in ((rays.position, moves), (rays.direction, turns)):
-        dr.enable_grad(variable)
-        dr.set_grad(variable, backend.vector(tangent.reshape(-1, 3)))
-    out = trace(backend, systems, rays, keep=(stop,), evaluate=False)
-    local, at_stop = out.local, out.hits[stop]
-    # interior gradients are kept: the hit on the stop lies on the way to the image
-    dr.forward_to(local.position, local.direction, at_stop, flags=dr.ADFlag.ClearEdges)
-
-    def columns(vector: object) -> np.ndarray:
-        gradient = dr.grad(vector)
-        rows = np.stack([gradient.x.numpy(), gradient.y.numpy()], axis=-1).reshape(count, 4, 2)
-        return np.swapaxes(rows, 1, 2)
-
-    image, angle, hit = columns(local.position), columns(local.direction), columns(at_stop)
+    out = push_forward(
+        backend,
+        systems,
+        np.repeat(position[:, None], 4, axis=1),
+        np.repeat(direction[:, None], 4, axis=1),
+        np.concatenate([axes, zero], axis=1),
+        np.concatenate([zero, axes], axis=1),
+        keep=(stop,),
+    )
+    # columns are launch steps, rows x and y
+    image, angle, hit = (np.swapaxes(step[..., :2], 1, 2) for step in (out.position, out.direction, out.hits[stop]))
     return RayMatrix(image[..., :2], image[..., 2:], angle[..., :2], angle[..., 2:], hit[..., :2], hit[..., 2:])
 
 

@@ -11,20 +11,19 @@ with both Jacobians by forward-mode AD through the trace. Paths count from the i
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from optics.aim import RayFan, aim, transverse_axes
 from optics.aperture import Circle
 from optics.backend import Backend
 from optics.diffraction import PupilField
+from optics.push_forward import push_forward
 from optics.quadrature import PupilNodes
 from optics.system import SystemBatch
-from optics.trace import make_rays, require_some, trace
+from optics.trace import require_some
 from optics.wavefront import eikonal
 
-AIM_TOLERANCE = 1e-11
+AIM_TOLERANCE = 1e-12
 """Distance of a ray from its node on the stop, metres."""
 
 
@@ -95,36 +94,19 @@ def imaging_field(
     position, axes = aim_collimated(backend, to_stop, direction, launch, target)
     count = len(position)
     heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], position.shape)
-    traced, hit, turn = _differentiate(backend, systems, len(to_stop.structure) - 1, position, heading, axes)
-    place, leaving, path, valid = traced
+    stop_index = len(to_stop.structure) - 1
+    # every ray twice, once for each axis of the wavefront along which its launch point is moved
+    twice, heading = (np.repeat(array, 2, axis=1) for array in (position, heading))
+    moves = np.broadcast_to(axes[:, None], (*position.shape[:2], 2, 3)).reshape(twice.shape)
+    out = push_forward(backend, systems, twice, heading, moves, keep=(stop_index,))
+    hit, turn = (
+        np.swapaxes(step[..., :2].reshape(*position.shape[:2], 2, 2), -1, -2)
+        for step in (out.hits[stop_index], out.direction)
+    )
+    place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
     require_some(valid, "the imaging path")
     launch_area = stop.radius**2 * nodes.weight / np.abs(np.linalg.det(hit))
     amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (count, 3))[:, None]
     phase = eikonal(place, leaving, path, centre)
     return PupilField(leaving[..., 0], leaving[..., 1], phase - phase[:, :1], amplitude, wavelength)
-
-
-def _differentiate(
-    backend: Backend, systems: SystemBatch, stop: int, position: np.ndarray, direction: np.ndarray, axes: np.ndarray
-) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Trace, and differentiate the hit on the stop and the final direction by the launch point: (B, N, 2, 2) each."""
-    import drjit as dr
-
-    count, n = position.shape[:2]
-    rays = make_rays(backend, np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1))
-    dr.enable_grad(rays.position)
-    tangent = np.broadcast_to(axes[:, None], (count, n, 2, 3))
-    dr.set_grad(rays.position, backend.vector(tangent.reshape(-1, 3)))
-    out = trace(backend, systems, rays, keep=(stop,), evaluate=False)
-    at_stop = out.hits[stop]
-    dr.forward_to(out.local.direction, at_stop, flags=dr.ADFlag.ClearEdges)
-
-    def columns(vector: Any) -> np.ndarray:
-        gradient = dr.grad(vector)
-        rows = np.stack([gradient.x.numpy(), gradient.y.numpy()], axis=-1).reshape(count, n, 2, 2)
-        return np.swapaxes(rows, -1, -2)
-
-    hit, turn = columns(at_stop), columns(out.local.direction)
-    plain = tuple(a[:, ::2] for a in out.numpy())
-    return plain, hit, turn

@@ -63,18 +63,19 @@ class Traced:
         """Position (B, N, 3), direction (B, N, 3), path (B, N), valid (B, N) of ``local`` (default) or ``world``."""
         rays = self.local if rays is None else rays
         return (
-            _rows(rays.position, self.count),
-            _rows(rays.direction, self.count),
+            rows(rays.position, self.count),
+            rows(rays.direction, self.count),
             rays.path.numpy().reshape(self.count, -1),
             rays.valid.numpy().reshape(self.count, -1),
         )
 
     def hit(self, element: int) -> np.ndarray:
         """Local positions (B, N, 3) on an element that was kept, metres."""
-        return _rows(self.hits[element], self.count)
+        return rows(self.hits[element], self.count)
 
 
-def _rows(vector: Any, count: int) -> np.ndarray:
+def rows(vector: Any, count: int) -> np.ndarray:
+    """Components of a ``Vector3`` of B * N rays as an array (B, N, 3)."""
     return np.stack([c.numpy() for c in vector], axis=-1).reshape(count, -1, 3)
 
 

@@ -3,34 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from optics.diffraction import PupilTangent, image_derivative
+from optics.push_forward import RayTangents, push_forward
 from optics.system import assemble
-from optics.trace import make_rays, trace
 from optics.tree import COMPLEX_STEP
 from twin.monitor import MonitorPath
 from twin.motions import ElementaryMotion, pivot_states
 
 
-@dataclass(frozen=True, eq=False)
-class RayTangents:
-    """Derivatives of the rays at the CCDs for C channels x M motions (channel-major), in each CCD's frame.
-
-    Attributes:
-        position, direction: (C*M, N, 3), metres and 1 per radian, metre or unit.
-        path: optical path, (C*M, N).
-    """
-
-    position: np.ndarray
-    direction: np.ndarray
-    path: np.ndarray
-
-
 def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayTangents:
     """Push motions forward through the traced path, about the unperturbed instrument; rays stay on their nodes.
+
+    The result is for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit.
 
     The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
     """
@@ -40,26 +27,14 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayT
     nominal, m = path.nominal, len(motions)
     direction = np.repeat(nominal.direction, m, axis=0)
     position = np.broadcast_to(np.repeat(nominal.position, m, axis=0), direction.shape)
-    position_step = np.broadcast_to(source[:, None] / COMPLEX_STEP, direction.shape)
+    position_step = source[:, None] / COMPLEX_STEP
 
-    def push(sequence: str, direction_step: np.ndarray) -> RayTangents:
-        import drjit as dr
-
+    def push(sequence: str, direction_step: np.ndarray | float) -> RayTangents:
         names = [f"{channel.key}/{sequence}" for channel in path.channels]
         systems = assemble(path.instrument.assembly, names, states, steps, placed)
-        rays = make_rays(path.backend, position, direction)
-        dr.enable_grad(rays.position, rays.direction)
-        dr.set_grad(rays.position, path.backend.vector(position_step.reshape(-1, 3)))
-        dr.set_grad(rays.direction, path.backend.vector(direction_step.reshape(-1, 3)))
-        out = trace(path.backend, systems, rays, evaluate=False).local
-        dr.forward_to(out.position, out.direction, out.path, flags=dr.ADFlag.ClearEdges)
-        vectors = [np.stack([c.numpy() for c in dr.grad(v)], axis=-1) for v in (out.position, out.direction)]
-        shape = direction.shape
-        return RayTangents(
-            vectors[0].reshape(shape), vectors[1].reshape(shape), dr.grad(out.path).numpy().reshape(shape[:2])
-        )
+        return push_forward(path.backend, systems, position, direction, position_step, direction_step)
 
-    drift = push("outgoing", np.zeros_like(direction)).position[..., :2]
+    drift = push("outgoing", 0.0).position[..., :2]
     q_step = -np.linalg.solve(np.repeat(nominal.jacobian, m, axis=0), drift[..., None])[..., 0]
     axes = np.broadcast_to(np.repeat(nominal.axes, m, axis=0), (*direction.shape[:2], 2, 3))
     turn = np.einsum("bnk,bnkx->bnx", q_step, axes)
