@@ -31,7 +31,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "ARCSEC",
     "ESTIMATORS",
+    "PARAMETERS",
+    "PER_SI",
     "CameraParameters",
     "MonitorGeometry",
     "coefficients",
@@ -44,13 +47,10 @@ __all__ = [
 Array = NDArray[np.float64]
 ARCSEC = math.pi / 180 / 3600
 ESTIMATORS = ("paper_single", "paper_joint", "derived")
-# key in recovered.json, and how many of its units make one SI unit
-_KEYS = (
-    ("d_alpha_arcsec", 1 / ARCSEC),
-    ("d_beta_arcsec", 1 / ARCSEC),
-    ("d_gamma_arcsec", 1 / ARCSEC),
-    ("d_f_um", 1e6),
-)
+PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+"""Keys of the parameters in results, which end in their unit."""
+PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, 1e6])
+"""How many of these units make one SI unit (rad, m)."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class CameraParameters:
         """d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec, d_f_um and <key>_sigma: floats, or nested lists for arrays."""
         values, sigma = self.vector, self.sigma
         out: dict[str, Any] = {}
-        for k, (key, scale) in enumerate(_KEYS):
+        for k, (key, scale) in enumerate(zip(PARAMETERS, PER_SI, strict=True)):
             out[key] = (values[..., k] * scale).tolist()
             out[f"{key}_sigma"] = (sigma[..., k] * scale).tolist()
         return out

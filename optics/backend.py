@@ -27,7 +27,6 @@ class Backend:
         UInt: 32-bit unsigned index array.
         Bool: mask array.
         Vector3: three ``Float`` components.
-        TensorF: float64 tensor.
     """
 
     name: str
@@ -35,7 +34,6 @@ class Backend:
     UInt: Any
     Bool: Any
     Vector3: Any
-    TensorF: Any
 
     def opaque(self, values: Any) -> Any:
         """Upload numbers as kernel *inputs*: shape (n,) or scalar -> ``Float`` of width n.
@@ -97,5 +95,4 @@ def load_backend(name: str = "llvm") -> Backend:
         UInt=types.UInt32,
         Bool=types.Bool,
         Vector3=types.Array3f64,
-        TensorF=types.TensorXf64,
     )

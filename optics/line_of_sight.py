@@ -19,9 +19,7 @@ def chief_directions(
     points: np.ndarray,
     guess: np.ndarray,
     transverse: np.ndarray,
-    start: np.ndarray | None = None,
-    jacobian: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Chief rays of image points, traced backward from the image through the centre of the stop.
 
     Args:
@@ -31,21 +29,19 @@ def chief_directions(
         points: image points, world, (B, M, 3).
         guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
         transverse: direction near which the first transverse axis is taken, (3,).
-        start: aim parameters of a near state to start from (see ``aim``).
-        jacobian: their Jacobian.
 
     Returns:
-        Object-space directions toward the scene, world, (B, M, 3); aim parameters and their Jacobian.
+        Object-space directions toward the scene, world, (B, M, 3).
     """
     direction = np.broadcast_to(guess, points.shape)
     fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
-    q, slope = aim(backend, to_stop, fan, np.zeros(2), start, jacobian)
+    q, _ = aim(backend, to_stop, fan, np.zeros(2))
     position, direction = fan.at(q)
     out = trace(backend, to_object, make_rays(backend, position, direction), world=True)
     assert out.world is not None
     _, leaving, _, valid = out.numpy(out.world)
     require_some(valid, "the imaging path")
-    return leaving, q, slope
+    return leaving
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,11 @@ class PupilNodes:
     weight: np.ndarray
 
     @property
+    def share(self) -> np.ndarray:
+        """Weights of a mean over the pupil: they sum to 1, shape (N,)."""
+        return np.asarray(self.weight / np.sum(self.weight))
+
+    @property
     def count(self) -> int:
         """Number of nodes."""
         return len(self.x)

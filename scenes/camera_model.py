@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.aim import RayFan, aim, transverse_axes
+from optics.aim import transverse_axes
 from optics.aperture import Aperture, Circle, Rectangle
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
 from optics.first_order import FirstOrder, first_order, ray_matrix
+from optics.imaging import aim_collimated
 from optics.pose import Pose
 from optics.surface import Surface, plane
 from optics.system import SystemBatch, assemble
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 IMAGE = "image"
 REFERENCE = "reference"
 LINE_AXIS = np.array([1.0, 0.0, 0.0])
+LAUNCH_DISTANCE = 3.0
+"""How far before the prescription's origin beams from the scene are launched, metres."""
+
 _RIM_POINTS = 24
 
 
@@ -69,11 +73,6 @@ class CameraModel:
         """Focal length along the line about the centre's chief ray, metres (the papers' f)."""
         return float(abs(self.first_order.scale[0, 0, 0]))
 
-    @property
-    def cross_focal_length(self) -> float:
-        """Focal length across the line; a field-biased camera is anamorphic, metres."""
-        return float(abs(self.first_order.scale[0, 1, 1]))
-
     def vertex(self, mirror: str) -> np.ndarray:
         """Vertex of a mirror's parent surface in the prescription frame, metres."""
         return np.array([0.0, 0.0, self.spec.mirrors[mirror].z])
@@ -98,19 +97,13 @@ def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, t
         backend: where to trace.
         to_stop: one system, from the scene to the stop.
         directions: (F, 3) beam directions.
-        targets: (F, N, 2) or (N, 2) stop coordinates, metres.
+        targets: (N, 2) stop coordinates, metres, the same for every beam.
 
     Returns:
         (F, N, 3) points on a plane before the first mirror, prescription frame.
     """
-    fields = len(directions)
-    n = np.shape(targets)[-2]
-    direction = np.repeat(directions, n, axis=0)[None]
-    axes = transverse_axes(direction, np.broadcast_to(LINE_AXIS, direction.shape))
-    fan = RayFan(np.broadcast_to(-3.0 * direction, direction.shape), direction, axes, moves_position=True)
-    goal = np.broadcast_to(targets, (fields, n, 2)).reshape(1, -1, 2)
-    q, _ = aim(backend, to_stop, fan, goal, tolerance=1e-12)
-    return fan.at(q)[0].reshape(fields, n, 3)
+    every = to_stop.take(np.zeros(len(directions), dtype=int))
+    return aim_collimated(backend, every, directions, -LAUNCH_DISTANCE * directions, targets)[0]
 
 
 def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:

@@ -21,8 +21,9 @@ from optics.rotation import about_axis
 from optics.surface import plane
 from optics.system import assemble
 from optics.trace import make_rays, require_some, trace
-from optics.tree import Body, RigidTree
+from optics.tree import Body, PlacedBodies, RigidTree
 from scenes.camera_model import LINE_AXIS, REFERENCE, CameraModel, derive_camera
+from scenes.job import NodeInfo
 
 if TYPE_CHECKING:
     from scenes.instrument import InstrumentSpec
@@ -69,15 +70,6 @@ class Channel:
         return f"{CENTRAL_PRISM}/{self.camera}_{self.side}"
 
 
-@dataclass(frozen=True)
-class NodeUse:
-    """What may be done to a body: names of pivots and kinds of motion; ``ideal``: it moves no light yet."""
-
-    pivots: tuple[str, ...]
-    allows: frozenset[str]
-    ideal: bool = False
-
-
 @dataclass(frozen=True, eq=False)
 class Instrument:
     """An instrument ready to be perturbed and traced.
@@ -94,11 +86,20 @@ class Instrument:
     assembly: Assembly
     cameras: Mapping[str, CameraModel]
     channels: tuple[Channel, ...]
-    nodes: Mapping[str, NodeUse]
+    nodes: Mapping[str, NodeInfo]
 
     def camera_axes(self, camera: str) -> np.ndarray:
         """Nominal camera X, Y, Z in the base frame as columns, (3, 3)."""
         return self.assembly.nominal_pose(f"{BASE}/{camera}").rotation
+
+    def toward_optics(self, placed: PlacedBodies, camera: str) -> np.ndarray:
+        """Direction from the line's centre along its chief ray, upstream, in each state, world, (S, 3).
+
+        Where rays that start at the focal plane are first sent; it rides on the focal plane.
+        """
+        model = self.cameras[camera]
+        local = model.focal_plane.rotation.T @ -model.image_direction
+        return np.asarray(placed.rotation[:, placed.index[f"{BASE}/{camera}/focal_plane"]].real @ local)
 
     @property
     def separation(self) -> Mapping[str, float]:
@@ -266,7 +267,7 @@ def _camera_sequences(name: str, model: CameraModel, channels: list[Channel]) ->
     return out
 
 
-def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], ideal: set[str]) -> dict[str, NodeUse]:
+def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], ideal: set[str]) -> dict[str, NodeInfo]:
     """Which motions each body takes; the base itself is the frame of everything and is not moved."""
     out = {}
     mirrors = {f"{BASE}/{name}/{mirror}" for name, model in cameras.items() for mirror in model.mirrors}
@@ -279,5 +280,5 @@ def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], ideal: set[str])
             allows.add("figure")
         if body.path in roots:
             allows.add("scale")
-        out[body.path] = NodeUse(tuple(body.pivots), frozenset(allows), body.path in ideal)
+        out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows), body.path in ideal)
     return out

@@ -5,7 +5,7 @@ main input.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, WithJsonSchema
 
@@ -125,25 +125,15 @@ class NodeInfo:
     Attributes:
         pivots: names of its pivots.
         allows: which of "rotate", "shift", "figure" and "scale".
+        ideal: whether the body is taken as perfect, so that its motion moves no light yet.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
     allows: frozenset[str] = frozenset({"rotate", "shift"})
+    ideal: bool = False
 
 
-class Node(Protocol):
-    """Anything that says of a body what `NodeInfo` does."""
-
-    @property
-    def pivots(self) -> tuple[str, ...]:
-        """Names of its pivots."""
-
-    @property
-    def allows(self) -> frozenset[str]:
-        """Which of "rotate", "shift", "figure" and "scale" may be done to it."""
-
-
-def check_nodes(job: JobSpec, nodes: Mapping[str, Node]) -> None:
+def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
     """Check that every perturbed node exists, has the named pivot and allows what is done to it.
 
     Args:
@@ -158,7 +148,7 @@ def check_nodes(job: JobSpec, nodes: Mapping[str, Node]) -> None:
         raise InputError(*issues)
 
 
-def _node_issues(job: JobSpec, nodes: Mapping[str, Node], path: str, what: PerturbationSpec) -> list[Issue]:
+def _node_issues(job: JobSpec, nodes: Mapping[str, NodeInfo], path: str, what: PerturbationSpec) -> list[Issue]:
     if path not in nodes:
         meant = nearest(path, nodes)
         return [

@@ -10,15 +10,12 @@ import numpy as np
 
 from analysis import model_fit, monitoring
 from analysis.model_fit import ObservabilityReport
+from analysis.monitoring import PARAMETERS, PER_SI
 from analysis.recovery import ESTIMATORS
 from twin.experiment import MonitorExperiment
 from twin.monitor_derivative import spot_jacobian
-from twin.motions import ARCSEC, ElementaryMotion, line_family, other_motions
+from twin.motions import ElementaryMotion, line_family, other_motions
 from twin.truth import truth_jacobian
-
-PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-TO_TABLE = np.array([1.0 / ARCSEC, 1.0 / ARCSEC, 1.0 / ARCSEC, 1e6])
-"""From SI (rad, m) to the units of PARAMETERS."""
 
 SEEN_WITHIN = 0.1
 """Relative error up to which the words say that a change is seen."""
@@ -142,10 +139,10 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
         camera = experiment.calibration.cameras[name]
         gains["model"] = camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian, rcond=1e-14)
         size = np.array([motion.unit_size for motion in motions])
-        readings = {e: (TO_TABLE[:, None] * (gains[e] @ spots)) * size for e in ESTIMATORS}
-        true = TO_TABLE[:, None] * truth * size
+        readings = {e: (PER_SI[:, None] * (gains[e] @ spots)) * size for e in ESTIMATORS}
+        true = PER_SI[:, None] * truth * size
         f = geometry.focal_length_m
-        ideal = TO_TABLE * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]
+        ideal = PER_SI * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]
         factors = tuple(
             FormulaFactor(
                 where, e, PARAMETERS[p], motions[p].label, readings[e][p, p] / ideal[p], readings[e][p, p] / true[p, p]

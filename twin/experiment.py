@@ -5,6 +5,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from functools import cached_property
 
 import numpy as np
@@ -28,18 +29,6 @@ from twin.truth import Truth, trace_truth, truth_jacobian
 TEMPLATE_MARGIN = 40
 """Pixels by which the calibrated spot shape is larger than the CCD, so that it can be shifted over it."""
 
-EMVA_KEYS = (
-    "quantum_efficiency",
-    "system_gain_dn_per_e",
-    "dark_noise_e",
-    "dark_current_e_per_s",
-    "full_well_e",
-    "prnu",
-    "dsnu_e",
-    "bit_depth",
-    "offset_dn",
-)
-
 
 class MonitorExperiment:
     """An instrument with its detectors and its nominal calibration; whatever is derived is worked out once, on demand.
@@ -52,7 +41,7 @@ class MonitorExperiment:
     def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
         self.backend = backend
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
-        self.detector = EmvaDetector(**{key: getattr(resolved.detector, key) for key in EMVA_KEYS})
+        self.detector = EmvaDetector(**{f.name: getattr(resolved.detector, f.name) for f in fields(EmvaDetector)})
         self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
         self.path = MonitorPath(self.instrument, backend)
 

@@ -101,7 +101,7 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
         half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
         ends = points_to_world(placed, f"{plane}/line", np.array([[0.0, y, 0.0] for y in (half, 0.0, -half)]))[0]
         points.append(np.repeat(ends, rays, axis=0))
-        guesses.append(_toward_optics(instrument, placed, camera))
+        guesses.append(instrument.toward_optics(placed, camera)[0])
         stop = assembly.elements[f"{camera}/{model.spec.stop}"].aperture
         targets.append(np.tile(_circle(_radius(stop)), (len(FIELDS), 1)))
     to_stop = assemble(assembly, [f"{camera}/image_to_stop" for camera in names], [state], placed=placed)
@@ -129,7 +129,7 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
 def _monitor(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies) -> list[Beam]:
     """From every pinhole through the edge of its return face and back to the area CCD; all channels at once."""
     assembly, channels = instrument.assembly, instrument.channels
-    guess = np.array([_toward_optics(instrument, placed, c.camera) for c in channels])[:, None]
+    guess = np.array([instrument.toward_optics(placed, c.camera)[0] for c in channels])[:, None]
     start = np.array([placed.pose(c.reticle_body).translation for c in channels])[:, None]
     outgoing = assemble(assembly, [f"{c.key}/outgoing" for c in channels], [state], placed=placed)
     target = np.array([_circle(_radius(assembly.elements[f"{c.key}/return_face"].aperture)) for c in channels])
@@ -149,13 +149,6 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
                 prints[mirror, int((mirror, 0) in prints)] = hits[k][i][:, :2]
         out.append(Beam(channel.camera, f"monitor/{channel.side}", np.stack(path, axis=1), prints))
     return out
-
-
-def _toward_optics(instrument: Instrument, placed: PlacedBodies, camera: str) -> np.ndarray:
-    """Direction from the line's centre to the last mirror, world."""
-    model = instrument.cameras[camera]
-    turned: np.ndarray = placed.pose(f"{BASE}/{camera}/focal_plane").rotation @ model.focal_plane.rotation.T
-    return np.asarray(turned @ -model.image_direction)
 
 
 def _aimed(

@@ -25,7 +25,7 @@ from optics.system import assemble
 from optics.trace import BeamMissedError, make_rays, require_some, trace
 from optics.tree import PlacedBodies, State
 from optics.wavefront import eikonal
-from scenes.instrument_model import BASE, Channel, Instrument
+from scenes.instrument_model import Channel, Instrument
 
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
@@ -131,12 +131,10 @@ class MonitorPath:
         count = len(states)
         position, direction = [], []
         for channel in self.channels:
-            model = self.instrument.cameras[channel.camera]
             position.append(placed.translation[:, placed.index[channel.reticle_body]])
-            local = model.focal_plane.rotation.T @ -model.image_direction
-            direction.append(placed.rotation[:, placed.index[f"{BASE}/{channel.camera}/focal_plane"]] @ local)
+            direction.append(self.instrument.toward_optics(placed, channel.camera))
         origin = np.concatenate(position)[:, None].real
-        guess = np.concatenate(direction)[:, None].real
+        guess = np.concatenate(direction)[:, None]
         axes = transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape))
         fan = RayFan(origin, guess, axes)
         outgoing = assemble(
@@ -199,8 +197,9 @@ class MonitorPath:
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
         """Raise BeamMissedError when the middle of a spot (rays (S, N, 3) at the CCD) is outside its CCD."""
-        share = self.nodes.weight / np.sum(self.nodes.weight)
-        place = np.einsum("n,snk->sk", share, position[..., 1::-1]) / self.pitch + 0.5 * (np.array(self.shape) - 1)
+        place = np.einsum("n,snk->sk", self.nodes.share, position[..., 1::-1]) / self.pitch + 0.5 * (
+            np.array(self.shape) - 1
+        )
         outside = np.any((place < 0.0) | (place > np.array(self.shape) - 1), axis=-1)
         if np.any(outside):
             row, column = place[np.argmax(outside)]

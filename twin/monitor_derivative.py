@@ -53,9 +53,7 @@ def spot_jacobian(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.
     Returns:
         (C, 2, M): row and column, pixels per radian, metre or unit.
     """
-    nodes = path.coarse.nodes
-    share = nodes.weight / np.sum(nodes.weight)
-    mean = np.einsum("n,bnk->bk", share, ray_tangents(path.coarse, motions).position[..., 1::-1])
+    mean = np.einsum("n,bnk->bk", path.coarse.nodes.share, ray_tangents(path.coarse, motions).position[..., 1::-1])
     return np.asarray(mean.reshape(len(path.channels), len(motions), 2).swapaxes(1, 2)) / path.pitch
 
 

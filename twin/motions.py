@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
+from analysis.monitoring import ARCSEC
 from optics.tree import ORIGIN, Motion, State
 from scenes.instrument_model import BASE, CENTRAL_PRISM, Instrument
 
-ARCSEC = np.pi / 180.0 / 3600.0
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"
 FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "coma"}

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
 from analysis.recovery import Recovery
 from optics.tree import State
 from scenes.resolved import ResolvedJob
-from twin.crosstalk import PARAMETERS, TO_TABLE, CameraCrosstalk
+from twin.crosstalk import CameraCrosstalk
 from twin.experiment import MonitorExperiment
-from twin.motions import ARCSEC
 from twin.truth import Truth
 
 
@@ -51,7 +51,7 @@ class RenderRun:
     def true_parameters(self, camera: str) -> dict[str, float]:
         """True change of a camera in the units of the keys."""
         change = self.truth.cameras[camera]
-        values = np.array([change.d_alpha[0], change.d_beta[0], change.d_gamma[0], change.d_f[0]]) * TO_TABLE
+        values = np.array([change.d_alpha[0], change.d_beta[0], change.d_gamma[0], change.d_f[0]]) * PER_SI
         # adding 0.0 turns a negative zero into a plain one
         return {key: float(value) + 0.0 for key, value in zip(PARAMETERS, values, strict=True)}
 

@@ -54,10 +54,9 @@ def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State
         body = f"{BASE}/{name}/focal_plane/line"
         line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
         points.append(points_to_world(placed, body, line))
-        local = model.focal_plane.rotation.T @ -model.image_direction
-        guesses.append(placed.rotation[:, placed.index[f"{BASE}/{name}/focal_plane"]] @ local)
+        guesses.append(instrument.toward_optics(placed, name))
         positions.append(position)
-    sight, _, _ = chief_directions(
+    sight = chief_directions(
         backend,
         assemble(assembly, [f"{name}/image_to_stop" for name in names], every, placed=placed),
         assemble(assembly, [f"{name}/image_to_object" for name in names], every, placed=placed),

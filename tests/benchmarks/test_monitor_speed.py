@@ -9,9 +9,9 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from optics.tree import Motion
 from scenes.instrument_model import BASE
-from twin.motions import ARCSEC
 from twin.truth import trace_truth
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -61,7 +61,7 @@ def line_geometry(backend, model: CameraModel, states: list[State]) -> LineChang
         model.spec.image.z,
     ]
     backward = model.mirrors[::-1]
-    sight, _, _ = chief_directions(
+    sight = chief_directions(
         backend,
         assemble(bare, [backward[:2]], states, placed=placed),
         assemble(bare, [backward], states, placed=placed),

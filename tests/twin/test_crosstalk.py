@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
 from analysis.recovery import measure_spots
-from twin.crosstalk import PARAMETERS, TO_TABLE, crosstalk
-from twin.motions import ARCSEC
+from twin.crosstalk import crosstalk
 from twin.truth import trace_truth
 
 PIXEL_NOISE = (1e-3) ** 2 * np.eye(4)  # px^2, weighs the four coordinates alike
@@ -36,14 +36,14 @@ def test_table_is_what_the_images_say(table, backend):
         position = measure_spots(images, 9, calibration, threads=2).position.reshape(len(states), -1, 2)
         shift = (position - first)[:, 2 * k : 2 * k + 2].reshape(-1, 4).T / units
         change = trace_truth(setup.instrument, backend, states).cameras[name]
-        true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f]) * TO_TABLE[:, None] / units
+        true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f]) * PER_SI[:, None] / units
         assert len(states) == 49
         # second order of a motion: 1% of its own effect; 2e-5 px: interpolation of the template, over the units. Coma
         # in the monitor's aperture changes the spot's shape, and a fit of the calibrated shape is not the mean ray: 3%
         share = np.array([0.03 if m.kind == "figure" else 0.01 for m in found.motions])
         assert np.all(np.abs(shift - found.spot_shift) < share * strongest + 2e-5 / units)
         camera = setup.calibration.cameras[name]
-        per_pixel = np.abs(camera.parameter_jacobian @ np.linalg.inv(camera.spot_jacobian)).sum(axis=1) * TO_TABLE
+        per_pixel = np.abs(camera.parameter_jacobian @ np.linalg.inv(camera.spot_jacobian)).sum(axis=1) * PER_SI
         floor = 0.01 * per_pixel[:, None] * strongest + 2e-8  # um or arcsec: rounding of the differenced truth
         assert np.all(np.abs(true - found.true) < 0.01 * np.abs(found.true) + floor)
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from analysis import model_fit, monitoring
+from analysis.monitoring import ARCSEC, PER_SI
 from analysis.recovery import measure_spots
 from optics.tree import Motion
 from scenes.instrument_model import BASE
-from twin.crosstalk import TO_TABLE
-from twin.motions import ARCSEC
 from twin.truth import trace_truth
 
 SHIFT, TURN, SCALE = 50e-6, 20 * ARCSEC, 20e-6  # the largest motions that are claimed
@@ -45,7 +44,7 @@ def measured(request, experiment, backend):
     out = {}
     for k, name in enumerate(cameras):
         change = truth.cameras[name]
-        true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1) * TO_TABLE
+        true = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1) * PER_SI
         out[name] = (true, shift[:, 2 * k : 2 * k + 2].reshape(-1, 4), calibration.cameras[name])
     return np.array(signs), out
 
@@ -57,7 +56,7 @@ def test_model_recovers_the_family(measured):
         fitted = model_fit.fit(
             shift, np.zeros((len(shift), 4, 4)), calibration.spot_jacobian, calibration.parameter_jacobian
         )
-        worst = np.maximum(worst, np.max(np.abs(fitted.vector * TO_TABLE - true), axis=0))
+        worst = np.maximum(worst, np.max(np.abs(fitted.vector * PER_SI - true), axis=0))
         assert np.max(np.abs(true), axis=0) == pytest.approx([1.5, 1.5, 20, 150], rel=0.3)  # not a test of nothing
     assert len(signs) == 24
     assert np.all(worst < MODEL_LIMIT), worst
@@ -67,7 +66,7 @@ def test_derived_formulas_are_good_to_one_percent(measured):
     signs, cameras = measured
     checked = 0
     for true, shift, calibration in cameras.values():
-        reading = shift @ monitoring.coefficients("derived", calibration.geometry).T * TO_TABLE
+        reading = shift @ monitoring.coefficients("derived", calibration.geometry).T * PER_SI
         moved = signs != 0  # alone: the parameter that is moved; together: all four
         error = np.abs(reading / np.where(moved, true, 1.0) - 1.0)[moved]
         assert np.max(error) < DERIVED_LIMIT, np.max(error)

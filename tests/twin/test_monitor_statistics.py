@@ -6,10 +6,10 @@ from scipy import stats
 
 from analysis.centroid import mean_frames
 from analysis.likelihood import cramer_rao_bound
+from analysis.monitoring import ARCSEC
 from analysis.recovery import measure_spots, recover
 from optics.tree import Motion
 from scenes.instrument_model import BASE
-from twin.motions import ARCSEC
 
 SEEDS = 200
 FRAMES = 9
