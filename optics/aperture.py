@@ -75,4 +75,35 @@ class Rectangle:
         return np.concatenate([*sides, corners[:1]])
 
 
-Aperture = Circle | Rectangle
+@dataclass(frozen=True)
+class Ellipse:
+    """Ellipse of half axes ``half_x``, ``half_y`` about ``centre`` (metres): a round beam on a slanted face."""
+
+    half_x: float
+    half_y: float
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if not (self.half_x > 0.0 and self.half_y > 0.0):
+            raise ValueError(f"an elliptical aperture needs positive half axes, found {self.half_x} and {self.half_y}")
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside; NumPy or Dr.Jit arrays."""
+        u, v = (x - self.centre[0]) / self.half_x, (y - self.centre[1]) / self.half_y
+        return u * u + v * v <= 1.0
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, x_max, y_min, y_max, metres."""
+        (cx, cy) = self.centre
+        return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    def outline(self, points: int = 96) -> np.ndarray:
+        """Closed outline, shape (points, 2), metres."""
+        t = np.linspace(0.0, 2.0 * np.pi, points)
+        x, y = self.centre
+        return np.stack([x + self.half_x * np.cos(t), y + self.half_y * np.sin(t)], axis=-1)
+
+
+Aperture = Circle | Rectangle | Ellipse

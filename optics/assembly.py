@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,11 +21,13 @@ class Assembly:
         tree: where everything stands.
         elements: name -> element.
         sequences: name -> element names in the order in which light meets them (an element may come twice).
+        media: path of a glass body -> its refractive index in vacuum.
     """
 
     tree: RigidTree
     elements: Mapping[str, Element]
     sequences: Mapping[str, tuple[str, ...]]
+    media: Mapping[str, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         """Freeze and check that every name exists."""
@@ -35,11 +37,17 @@ class Assembly:
                 raise ValueError(f"element {element.name!r} is filed under {name!r}")
             if element.body not in paths:
                 raise ValueError(f"element {name!r} stands on unknown body {element.body!r}")
+            if element.solid is not None and element.solid not in self.media:
+                raise ValueError(f"element {name!r} is a face of {element.solid!r}, which has no refractive index")
+        for path in self.media:
+            if path not in paths:
+                raise ValueError(f"a refractive index is given for unknown body {path!r}")
         for sequence, names in self.sequences.items():
             for name in names:
                 if name not in self.elements:
                     raise ValueError(f"sequence {sequence!r} names unknown element {name!r}")
         object.__setattr__(self, "elements", FrozenMap(self.elements))
+        object.__setattr__(self, "media", FrozenMap(self.media))
         object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
 
     def sequence(self, name: str) -> tuple[Element, ...]:

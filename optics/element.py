@@ -15,6 +15,8 @@ class Interaction(Enum):
     REFLECT = "reflect"
     REFRACT = "refract"
     PASS = "pass"
+    TOTAL = "total"
+    """Total reflection inside glass; a ray that is not beyond the critical angle is lost."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,10 @@ class Element:
         surface: its shape.
         interaction: reflect, refract or pass.
         aperture: clear aperture in the surface's x, y; None is unlimited.
-        index_after: refractive index on the side the light goes to, for REFRACT (the index before is that of the
-            element before it).
+        index_after: refractive index on the side the light goes to (the index before is that of the element before
+            it); for surfaces that are not faces of a solid.
+        solid: path of the glass body whose face this is, behind it (on its -z side). A refracted ray enters it when it
+            comes from outside and leaves it when it comes from inside; the index is the assembly's for that solid.
     """
 
     name: str
@@ -37,6 +41,7 @@ class Element:
     interaction: Interaction
     aperture: Aperture | None = None
     index_after: float = 1.0
+    solid: str | None = None
 
     def with_aperture(self, aperture: Aperture | None) -> Element:
         """The same element with another aperture."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from optics import zernike
-from optics.aperture import Circle
+from optics.aperture import Circle, Ellipse
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
@@ -30,7 +30,8 @@ class Structure:
     even: int
     figure_order: int  # radial order of the Zernike figure, -1 for none
     grid: bool
-    aperture: str  # "", "circle", "ring" or "rectangle"
+    aperture: str  # "", "circle", "ring", "rectangle" or "ellipse"
+    graded: tuple[bool, bool] = (False, False)  # whether the medium before and the one after has an index gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +132,26 @@ def assemble(
     lengths = {len(chain) for chain in chains}
     if len(lengths) != 1:
         raise ValueError(f"sequences of different lengths cannot be batched: {sorted(lengths)}")
-    structures = [_structures([chain[i] for chain in chains], states) for i in range(len(chains[0]))]
-    per_chain = [
-        [_numbers(chain, i, structures[i], states, placed, step) for i in range(len(chain))] for chain in chains
-    ]
+    media = [media_along(chain) for chain in chains]
+    graded = {path for state in states for path, motion in state.items() if any(motion.index_gradient)}
+    structures = []
+    for i in range(len(chains[0])):
+        gradients = (
+            any(m[i].solid in graded for m in media),
+            any(m[i + 1].solid in graded for m in media),
+        )
+        structures.append(_structures([chain[i] for chain in chains], states, gradients))
+    per_chain = []
+    for chain, along in zip(chains, media, strict=True):
+        per_chain.append(
+            [
+                {
+                    **_numbers(chain, i, structures[i], states, placed, step),
+                    **_media_numbers(assembly, chain[i], along[i : i + 2], structures[i], states, placed),
+                }
+                for i in range(len(chain))
+            ]
+        )
     values = []
     tangents = []
     for i in range(len(chains[0])):
@@ -152,7 +169,63 @@ def assemble(
     )
 
 
-def _structures(elements: Sequence[Element], states: Sequence[State]) -> Structure:
+@dataclass(frozen=True)
+class Medium:
+    """What light travels in: a glass body of the assembly, or something homogeneous of a given index."""
+
+    solid: str | None = None
+    index: float = 1.0
+
+
+def media_along(chain: Sequence[Element]) -> list[Medium]:
+    """The medium before the first element, between the elements and after the last one."""
+    out = [Medium()]
+    for element in chain:
+        before = out[-1]
+        if element.interaction is Interaction.REFRACT and element.solid is not None:
+            out.append(Medium() if before.solid == element.solid else Medium(element.solid))
+        elif element.solid is not None or before.solid is not None:
+            out.append(before)
+        else:
+            out.append(Medium(None, element.index_after))
+    return out
+
+
+def _media_numbers(
+    assembly: Assembly,
+    element: Element,
+    media: Sequence[Medium],
+    structure: Structure,
+    states: Sequence[State],
+    placed: PlacedBodies,
+) -> dict[str, np.ndarray]:
+    """Indices before (n) and after (n_after) an element, (S,) each.
+
+    Where the medium is graded the index is n + (nx, ny, nz) . p at p in the element's frame, likewise after it.
+    """
+    out = {}
+    here = placed.index[element.body]
+    turn, origin = placed.rotation[:, here], placed.translation[:, here]
+    for name, medium, graded in zip(("n", "n_after"), media, structure.graded, strict=True):
+        if medium.solid is None:
+            index = np.full(len(states), medium.index)
+            gradient = np.zeros((len(states), 3))
+        else:
+            motions = [state.get(medium.solid, Motion()) for state in states]
+            index = assembly.media[medium.solid] + np.array([m.index for m in motions])
+            glass = placed.index[medium.solid]
+            own = np.array([m.index_gradient for m in motions])
+            world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
+            gradient = np.einsum("sji,sj->si", turn, world)
+            if graded:
+                index = index + np.einsum("si,si->s", world, origin - placed.translation[:, glass])
+        out[name] = index
+        if graded:
+            out.update({f"{name}{axis}": gradient[:, a] for a, axis in enumerate("xyz")})
+    return out
+
+
+def _structures(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
     """Common structure of the i-th elements of all chains."""
     kinds = {
         (
@@ -177,7 +250,7 @@ def _structures(elements: Sequence[Element], states: Sequence[State]) -> Structu
             motion = state.get(e.body)
             if motion is not None and motion.figure:
                 order = max(order, zernike.order_of(motion.figure))
-    return Structure(interaction, is_plane, even, order, grid, aperture)
+    return Structure(interaction, is_plane, even, order, grid, aperture, graded)
 
 
 def _aperture_kind(element: Element) -> str:
@@ -185,7 +258,7 @@ def _aperture_kind(element: Element) -> str:
         return ""
     if isinstance(element.aperture, Circle):
         return "ring" if element.aperture.inner else "circle"
-    return "rectangle"
+    return "ellipse" if isinstance(element.aperture, Ellipse) else "rectangle"
 
 
 def _grid(element: Element) -> np.ndarray | None:
@@ -235,8 +308,6 @@ def _numbers(
         rows, columns = surface.figure.values.shape
         grid = {"gx0": x0, "gy0": y0, "gix": 1.0 / dx, "giy": 1.0 / dy, "gnx": float(columns), "gny": float(rows)}
         out.update({name: np.full(count, value) for name, value in grid.items()})
-    out["n"] = np.full(count, chain[i - 1].index_after if i else 1.0)
-    out["n_after"] = np.full(count, element.index_after)
     aperture = element.aperture
     if aperture is not None:
         out["ax"] = np.full(count, aperture.centre[0])

@@ -11,6 +11,7 @@ import numpy as np
 from optics.backend import Backend
 from optics.element import Interaction
 from optics.figure_kernel import grid_figure, polynomial_figure
+from optics.graded_ray import GradedRay
 from optics.system import Structure, SystemBatch, UploadedSystems
 from optics.zernike import triangle_size
 
@@ -130,8 +131,14 @@ def trace(
         g = {name: lookup(array) for name, array in uploaded.values[i].items() if name[0] not in "WP"}
         p, d = _into_frame(backend, p, d, g)
         t, ok = _distance(backend, p, d, g, structure, uploaded.grids[i], differentiable)
-        p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
-        path = dr.fma(g["n"], t, path)
+        if structure.graded[0]:
+            curve = GradedRay.start(p, d, g["n"], (g["nx"], g["ny"], g["nz"]))
+            tau = _solve(curve, t / curve.index, g, structure, uploaded.grids[i], differentiable)
+            p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
+            ok = _reached(p, g, structure, uploaded.grids[i])
+        else:
+            p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
+            path = dr.fma(g["n"], t, path)
         valid = valid & ok & _inside(p, g, structure)
         if structure.interaction is not Interaction.PASS:
             d, ok = _redirect(backend, p, d, g, structure, uploaded.grids[i])
@@ -247,6 +254,32 @@ def _distance(
     return t, ok & (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
 
 
+def _solve(curve: GradedRay, tau: Any, g: Mapping[str, Any], structure: Structure, grid: Any, attached: bool) -> Any:
+    """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
+    import drjit as dr
+
+    def step(ray: GradedRay, tau: Any, numbers: Mapping[str, Any]) -> Any:
+        p, slope = ray.position(tau), ray.slope(tau)
+        level, nx, ny, nz = _level(p.x, p.y, p.z, numbers, structure, grid)
+        return tau - level / dr.fma(nx, slope.x, dr.fma(ny, slope.y, nz * slope.z))
+
+    numbers, ray = g, curve
+    if attached:
+        numbers = {name: dr.detach(value) for name, value in g.items()}
+        ray, tau = curve.detached(), dr.detach(tau)
+    for _ in range(NEWTON_STEPS):
+        tau = step(ray, tau, numbers)
+    return step(curve, tau, g) if attached else tau
+
+
+def _reached(p: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> Any:
+    """Whether p lies on the surface's sheet through the vertex."""
+    import drjit as dr
+
+    level, _, _, nz = _level(p.x, p.y, p.z, g, structure, grid)
+    return (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
+
+
 def _along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
     import drjit as dr
 
@@ -314,6 +347,9 @@ def _inside(p: Any, g: Mapping[str, Any], structure: Structure) -> Any:
         r2 = x * x + y * y
         inside = r2 <= g["ar2"]
         return inside & (r2 >= g["ai2"]) if structure.aperture == "ring" else inside
+    if structure.aperture == "ellipse":
+        u, v = (p.x - g["ax"]) / g["ahx"], (p.y - g["ay"]) / g["ahy"]
+        return u * u + v * v <= 1.0
     if structure.aperture == "rectangle":
         return (dr.abs(p.x - g["ax"]) <= g["ahx"]) & (dr.abs(p.y - g["ay"]) <= g["ahy"])
     return True
@@ -328,14 +364,27 @@ def _redirect(
     _, nx, ny, nz = _level(p.x, p.y, p.z, g, structure, grid)
     square = dr.fma(nx, nx, dr.fma(ny, ny, nz * nz))
     along = dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
-    if structure.interaction is Interaction.REFLECT:
+    before, after = (_index_at(p, g, name, graded) for name, graded in zip(("n", "n_after"), structure.graded))
+    if structure.interaction in (Interaction.REFLECT, Interaction.TOTAL):
+        beyond: Any = True
+        if structure.interaction is Interaction.TOTAL:
+            beyond = before * before * (1.0 - along * along / square) > 1.0
         f = -2.0 * along / square
-        return backend.Vector3(dr.fma(f, nx, d.x), dr.fma(f, ny, d.y), dr.fma(f, nz, d.z)), True
+        return backend.Vector3(dr.fma(f, nx, d.x), dr.fma(f, ny, d.y), dr.fma(f, nz, d.z)), beyond
     norm = dr.rsqrt(square)
     cosine = along * norm
-    ratio = g["n"] / g["n_after"]
+    ratio = before / after
     sine2 = ratio * ratio * (1.0 - cosine * cosine)
     ok = sine2 <= 1.0
-    after = dr.copysign(dr.sqrt(dr.select(ok, 1.0 - sine2, 0.0)), cosine)
-    f = (after - ratio * cosine) * norm
+    cosine_after = dr.copysign(dr.sqrt(dr.select(ok, 1.0 - sine2, 0.0)), cosine)
+    f = (cosine_after - ratio * cosine) * norm
     return backend.Vector3(dr.fma(f, nx, ratio * d.x), dr.fma(f, ny, ratio * d.y), dr.fma(f, nz, ratio * d.z)), ok
+
+
+def _index_at(p: Any, g: Mapping[str, Any], name: str, graded: bool) -> Any:
+    """Refractive index at a point of the surface, before (``n``) or after it (``n_after``)."""
+    import drjit as dr
+
+    if not graded:
+        return g[name]
+    return dr.fma(g[f"{name}x"], p.x, dr.fma(g[f"{name}y"], p.y, dr.fma(g[f"{name}z"], p.z, g[name])))

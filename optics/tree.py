@@ -55,7 +55,11 @@ class Motion:
         shift: metres.
         pivot: name of one of the body's pivots.
         scale: relative growth of the body and all it carries about the pivot (isotropic expansion), e.g. 20e-6.
-        figure: surface error of a mirror, Noll index -> amplitude in metres of sag (see ``optics.figure``).
+        figure: surface error of a mirror or face, Noll index -> amplitude in metres of sag (see ``optics.figure``).
+        stretch: relative growth of the body itself about the pivot: its surface, and the distances to what it carries;
+            unlike ``scale`` it does not enlarge the bodies that it carries (each has a temperature of its own).
+        index: change of the refractive index of a glass body.
+        index_gradient: gradient of that change in the body's frame, zero at its origin, 1/m.
     """
 
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -63,6 +67,9 @@ class Motion:
     pivot: str = ORIGIN
     scale: float = 0.0
     figure: Mapping[int, float] = field(default_factory=FrozenMap)
+    stretch: float = 0.0
+    index: float = 0.0
+    index_gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Freeze the figure."""
@@ -80,7 +87,7 @@ class PlacedBodies:
     Attributes:
         index: body path -> position along the second axis.
         rotation: (S, bodies, 3, 3); translation: (S, bodies, 3), metres.
-        scale: (S, bodies), size of the body's interior relative to nominal.
+        scale: (S, bodies), size of the body itself relative to nominal.
     """
 
     index: Mapping[str, int]
@@ -147,26 +154,28 @@ class RigidTree:
         rotation = np.empty((count, len(index), 3, 3), dtype)
         translation = np.empty((count, len(index), 3), dtype)
         scale = np.ones((count, len(index)), dtype)
+        passed_on = np.ones((count, len(index)), dtype)
         for i, body in enumerate(self.bodies):
-            motion, offset, growth = _local_motion(body, states, step, dtype)
+            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
             position = body.pose.translation
             if body.parent:
                 p = index[body.parent]
                 base_rotation, base_translation = rotation[:, p], translation[:, p]
-                inherited = scale[:, p]
+                inherited, distances = passed_on[:, p], scale[:, p]
             else:
                 base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3))
                 base_translation = np.zeros((count, 3), dtype)
-                inherited = np.ones(count, dtype)
+                inherited = distances = np.ones(count, dtype)
             here = base_rotation @ body.pose.rotation
             inner = inherited if body.scales else np.ones(count, dtype)
             rotation[:, i] = here @ motion
             translation[:, i] = (
-                np.einsum("sij,sj->si", base_rotation, inherited[:, None] * position)
+                np.einsum("sij,sj->si", base_rotation, distances[:, None] * position)
                 + base_translation
                 + np.einsum("sij,sj->si", here, offset)
             )
-            scale[:, i] = inner * growth
+            passed_on[:, i] = inner * growth
+            scale[:, i] = inner * growth * stretch
         return PlacedBodies(FrozenMap(index), rotation, translation, scale)
 
 
@@ -177,17 +186,19 @@ COMPLEX_STEP = 1e-40
 
 def _local_motion(
     body: Body, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, dtype: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (S,3,3), translation (S,3) in the body's frame and growth (S,) of one body's motion."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation (S,3,3), translation (S,3) in the body's frame, growth (S,) and stretch (S,) of one body's motion."""
     count = len(states)
     rotate = np.zeros((count, 3), dtype)
     shift = np.zeros((count, 3), dtype)
     growth = np.ones(count, dtype)
+    stretch = np.ones(count, dtype)
     pivot = np.zeros((count, 3))
     for s, state in enumerate(states):
         motion = state.get(body.path)
         if motion is not None:
             rotate[s], shift[s], growth[s] = motion.rotate, motion.shift, 1.0 + motion.scale
+            stretch[s] = 1.0 + motion.stretch
             if motion.pivot not in body.pivots:
                 raise KeyError(f"{body.path}: pivot {motion.pivot!r}")
             pivot[s] = body.pivots[motion.pivot]
@@ -202,5 +213,5 @@ def _local_motion(
             elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.system``
                 raise ValueError(f"unknown kind of motion {kind!r}")
     turned = rotation_matrix(rotate)
-    offset = pivot + shift - growth[:, None] * np.einsum("sij,sj->si", turned, pivot)
-    return turned, offset, growth
+    offset = pivot + shift - (growth * stretch)[:, None] * np.einsum("sij,sj->si", turned, pivot)
+    return turned, offset, growth, stretch

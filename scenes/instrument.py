@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from scenes.prism import CentralPrismSpec, Prism0Spec, Prism180Spec
 from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
 from scenes.spec import Name, Named, Number, Spec, Text, Whole
 from scenes.units import ANGLE, TIME
@@ -34,12 +35,6 @@ class MountedCameraSpec(Spec):
     look: LookAngle
     position: Vector3
     pupil_offset: Vector2
-
-
-class CentralPrismSpec(Spec):
-    """The central prism, the common reference of all cameras: its position in the base frame, metres."""
-
-    position: Vector3
 
 
 class ReticleSpec(Spec):
@@ -75,11 +70,10 @@ class AreaCcdSpec(Spec):
 
 
 class ReturnFaceSpec(Spec):
-    """The flat face that returns the monitor's beam: distance from the camera's origin along the beam and diameter,
+    """The mirror coating of a central prism's facet, which returns the monitor's beam and limits it: diameter,
     metres.
     """
 
-    distance: PositiveLength
     aperture: PositiveLength
 
 
@@ -91,6 +85,8 @@ class MonitorSpec(Spec):
         field: angle from the visual axis at which the area CCDs stand, left at +Y and right at -Y, radians.
         reticle: light source.
         area_ccd: detector.
+        prism_180: the lateral-transfer prism of every channel.
+        prism_0: the rhomboid of every channel.
         return_face: what sends the light back.
         frames: number of frames in one measurement.
     """
@@ -99,6 +95,8 @@ class MonitorSpec(Spec):
     field: MonitorField
     reticle: ReticleSpec
     area_ccd: AreaCcdSpec
+    prism_180: Prism180Spec
+    prism_0: Prism0Spec
     return_face: ReturnFaceSpec
     frames: Frames = 9
 

@@ -11,63 +11,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.aim import RayFan, aim, transverse_axes
-from optics.aperture import Circle
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
+from optics.glass import glass
 from optics.pose import Pose
 from optics.rotation import about_axis
+from optics.solid import Solid
 from optics.surface import plane
-from optics.system import assemble
-from optics.trace import make_rays, require_some, trace
 from optics.tree import Body, PlacedBodies, RigidTree
-from scenes.camera_model import LINE_AXIS, REFERENCE, CameraModel, derive_camera
+from scenes.camera_model import CameraModel, derive_camera
+from scenes.channel import BASE, CENTRAL_PRISM, SIDES, Channel
 from scenes.job import NodeInfo
+from scenes.monitor_chain import MonitorChain, check_solids, leaving_beams, monitor_chain, square_facets
+from scenes.prism_model import facet_block
 
 if TYPE_CHECKING:
     from scenes.instrument import InstrumentSpec
 
-BASE = "base"
-SIDES = ("left", "right")
-CENTRAL_PRISM = f"{BASE}/central_prism"
-IDEAL_PRISMS = ("prism_180", "prism_0")
 _FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along -X, rows along +Y, facing the light
-
-
-@dataclass(frozen=True)
-class Channel:
-    """One monitor channel of one camera.
-
-    Attributes:
-        camera, side: e.g. ``forward``, ``left`` (left = the +Y end of the line).
-        pinhole, ccd: positions in the focal plane's X, Y, metres.
-    """
-
-    camera: str
-    side: str
-    pinhole: tuple[float, float]
-    ccd: tuple[float, float]
-
-    @property
-    def key(self) -> str:
-        """``<camera>/<side>``, the prefix of the channel's elements and sequences."""
-        return f"{self.camera}/{self.side}"
-
-    @property
-    def reticle_body(self) -> str:
-        """Body path of the pinhole."""
-        return f"{BASE}/{self.camera}/focal_plane/{self.side}/reticle"
-
-    @property
-    def ccd_body(self) -> str:
-        """Body path of the area CCD."""
-        return f"{BASE}/{self.camera}/focal_plane/{self.side}/area_ccd"
-
-    @property
-    def face_body(self) -> str:
-        """Body path of the return face."""
-        return f"{CENTRAL_PRISM}/{self.camera}_{self.side}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +42,8 @@ class Instrument:
         cameras: name -> model.
         channels: all monitor channels, camera by camera, left before right.
         nodes: body path -> what may be done to it.
+        solids: the prisms of all channels, camera by camera, and the central prism.
+        glass_path: channel key -> prism -> length of the beam inside its glass, one way, metres.
     """
 
     spec: InstrumentSpec
@@ -87,6 +51,8 @@ class Instrument:
     cameras: Mapping[str, CameraModel]
     channels: tuple[Channel, ...]
     nodes: Mapping[str, NodeInfo]
+    solids: tuple[Solid, ...]
+    glass_path: Mapping[str, Mapping[str, float]]
 
     def camera_axes(self, camera: str) -> np.ndarray:
         """Nominal camera X, Y, Z in the base frame as columns, (3, 3)."""
@@ -118,6 +84,9 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
         spec: the instrument.
         camera_specs: camera file stem -> CameraSpec, for every stem the instrument names.
         backend: where to trace while the geometry is worked out.
+
+    Raises:
+        InputError: prisms or central prism cannot stand as the file says.
     """
     derived: dict[str, CameraModel] = {}
     for site in spec.cameras.values():
@@ -127,30 +96,44 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     elements: dict[str, Element] = {}
     sequences: dict[str, tuple[str, ...]] = {}
     channels: list[Channel] = []
-    ideal: set[str] = set()
+    chains: dict[str, MonitorChain] = {}
     for name, site in spec.cameras.items():
         model = derived[site.camera]
         root = f"{BASE}/{name}"
         to_base = Pose(about_axis(1, site.look), np.array(site.position))
-        camera_channels = _channels(spec, name, model)
-        bodies += _camera_bodies(root, to_base, model, camera_channels)
-        bodies += [Body(f"{root}/monitor")]
-        for channel in camera_channels:
-            bodies += [Body(f"{root}/monitor/{channel.side}")]
-            bodies += [Body(f"{root}/monitor/{channel.side}/{prism}") for prism in IDEAL_PRISMS]
-            ideal |= {f"{root}/monitor/{channel.side}/{prism}" for prism in IDEAL_PRISMS}
-        ideal |= {f"{root}/monitor", *(f"{root}/monitor/{c.side}" for c in camera_channels)}
-        faces = _return_faces(spec, model, camera_channels, np.array(site.pupil_offset), backend)
-        in_camera = to_base @ model.camera_frame.inverse()
-        prism = Pose(np.eye(3), np.array(spec.central_prism.position)).inverse()
-        bodies += [Body(c.face_body, prism @ in_camera @ face) for c, face in zip(camera_channels, faces, strict=True)]
-        channels += camera_channels
-        elements.update(_camera_elements(name, root, model, camera_channels, 0.5 * spec.monitor.return_face.aperture))
-        sequences.update(_camera_sequences(name, model, camera_channels))
-    tree = RigidTree(tuple(bodies))
-    assembly = Assembly(tree, elements, sequences)
+        own = _channels(spec, name, model)
+        bodies += _camera_bodies(root, to_base, model, own)
+        elements.update(_camera_elements(name, root, model, own))
+        sequences.update(_camera_sequences(name, model))
+        bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.side}") for channel in own)]
+        beams = leaving_beams(spec.monitor, model, own, np.array(site.pupil_offset), to_base, backend)
+        for channel, beam in zip(own, beams, strict=True):
+            chain = monitor_chain(spec, channel, beam, to_base)
+            bodies += chain.bodies
+            elements.update({e.name: e for e in chain.elements})
+            way = tuple(e.name for e in chain.elements)
+            forward = tuple(f"{name}/{m}" for m in model.mirrors)
+            sequences[f"{channel.key}/outgoing"] = (*forward[::-1], *way)
+            sequences[f"{channel.key}/monitor"] = (
+                *forward[::-1], *way, *way[-2::-1], *forward, f"{channel.key}/area_ccd"
+            )
+            chains[channel.key] = chain
+        channels += own
+    solids = tuple(solid for chain in chains.values() for solid in chain.solids)
+    facets = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
+    block = spec.central_prism
+    solids = (*solids, facet_block(CENTRAL_PRISM, block.material, facets, block.spread, block.height))
+    index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
+    assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
+    assembly = square_facets(assembly, channels, chains, backend)
     cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
-    return Instrument(spec, assembly, cameras, tuple(channels), MappingProxyType(_nodes(tree, cameras, ideal)))
+    nodes = _nodes(assembly.tree, cameras, solids)
+    lengths = {key: chain.glass for key, chain in chains.items()}
+    instrument = Instrument(
+        spec, assembly, cameras, tuple(channels), MappingProxyType(nodes), solids, MappingProxyType(lengths)
+    )
+    check_solids(instrument.assembly, solids)
+    return instrument
 
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
@@ -186,55 +169,7 @@ def _camera_bodies(root: str, to_base: Pose, model: CameraModel, channels: list[
     return bodies
 
 
-def _return_faces(
-    spec: InstrumentSpec, model: CameraModel, channels: list[Channel], pupil_offset: np.ndarray, backend: Backend
-) -> list[Pose]:
-    """Poses, in the prescription frame, of the faces that send each pinhole's beam to the middle of its area CCD.
-
-    The face stands at the given distance along the line of sight, where the pinhole's chief ray passes, displaced by
-    the sub-aperture's offset in the pupil. Its normal halves the angle between the outgoing beam and the beam that
-    would come from the CCD's middle, both taken through the face's centre, so that pupil aberration does not shift
-    the spot.
-    """
-    frame = model.camera_frame
-    distance = spec.monitor.return_face.distance
-    reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
-    bare = model.bare_assembly(apertures=False)
-    tree = RigidTree((*bare.tree.bodies, Body(REFERENCE, reference)))
-    element = Element(REFERENCE, REFERENCE, plane(), Interaction.PASS)
-    bare = Assembly(tree, {**bare.elements, REFERENCE: element}, {})
-    backward = tuple(reversed(model.mirrors))
-    stop = backward.index(model.spec.stop)
-    to_stop = assemble(bare, [backward[: stop + 1]])
-    outgoing = assemble(bare, [(*backward, REFERENCE)])
-
-    spots = np.array([[*p, 0.0] for c in channels for p in (c.pinhole, c.ccd)])
-    points = model.focal_plane.apply(spots)[None]
-    guess = np.broadcast_to(-model.image_direction, points.shape)
-    fan = RayFan(points, guess, transverse_axes(guess, np.broadcast_to(LINE_AXIS, guess.shape)))
-    q, _ = aim(backend, to_stop, fan, np.zeros(2))
-    position, direction = fan.at(q)
-    chief = trace(backend, outgoing, make_rays(backend, position, direction)).numpy()
-    require_some(chief[3], "the monitor's outgoing path")
-    centres = chief[0][0, 0::2, :2] + pupil_offset
-    q, _ = aim(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], start=q)
-    position, direction = fan.at(q)
-    traced = trace(backend, outgoing, make_rays(backend, position, direction), world=True)
-    assert traced.world is not None
-    leaving = traced.numpy(traced.world)[1][0]
-    faces = []
-    for i, centre in enumerate(centres):
-        normal = -(leaving[2 * i] + leaving[2 * i + 1])  # toward the camera
-        normal = normal / np.linalg.norm(normal)
-        x_axis = transverse_axes(normal, -LINE_AXIS)[0]
-        rotation = np.stack([x_axis, np.cross(normal, x_axis), normal], axis=-1)
-        faces.append(Pose(rotation, reference.apply(np.array([*centre, 0.0]))))
-    return faces
-
-
-def _camera_elements(
-    name: str, root: str, model: CameraModel, channels: list[Channel], face_radius: float
-) -> dict[str, Element]:
+def _camera_elements(name: str, root: str, model: CameraModel, channels: list[Channel]) -> dict[str, Element]:
     out = {}
     for mirror in model.mirrors:
         key = f"{name}/{mirror}"
@@ -244,41 +179,35 @@ def _camera_elements(
     key = f"{name}/focal_plane"
     out[key] = Element(key, f"{root}/focal_plane", plane(), Interaction.PASS)
     for channel in channels:
-        key = f"{channel.key}/return_face"
-        out[key] = Element(key, channel.face_body, plane(), Interaction.REFLECT, Circle(face_radius))
         key = f"{channel.key}/area_ccd"
         out[key] = Element(key, channel.ccd_body, plane(), Interaction.PASS)
     return out
 
 
-def _camera_sequences(name: str, model: CameraModel, channels: list[Channel]) -> dict[str, tuple[str, ...]]:
+def _camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]]:
     forward = tuple(f"{name}/{m}" for m in model.mirrors)
     backward = forward[::-1]
     stop = backward.index(f"{name}/{model.spec.stop}")
-    out = {
+    return {
         f"{name}/imaging": (*forward, f"{name}/focal_plane"),
         f"{name}/image_to_stop": backward[: stop + 1],
         f"{name}/image_to_object": backward,
     }
-    for channel in channels:
-        face = f"{channel.key}/return_face"
-        out[f"{channel.key}/outgoing"] = (*backward, face)
-        out[f"{channel.key}/monitor"] = (*backward, face, *forward, f"{channel.key}/area_ccd")
-    return out
 
 
-def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], ideal: set[str]) -> dict[str, NodeInfo]:
-    """Which motions each body takes; the base itself is the frame of everything and is not moved."""
-    out = {}
+def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
+    """What may be done to each body; the base itself is the frame of everything and is not moved."""
     mirrors = {f"{BASE}/{name}/{mirror}" for name, model in cameras.items() for mirror in model.mirrors}
     roots = {f"{BASE}/{name}" for name in cameras}
+    faces = {face.body for solid in solids for face in solid.faces if face.body != solid.path}
+    out = {}
     for body in tree.bodies:
         if body.path == BASE:
             continue
         allows = {"rotate", "shift"}
-        if body.path in mirrors:
+        if body.path in mirrors | faces:
             allows.add("figure")
         if body.path in roots:
             allows.add("scale")
-        out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows), body.path in ideal)
+        out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows))
     return out

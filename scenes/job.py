@@ -125,12 +125,10 @@ class NodeInfo:
     Attributes:
         pivots: names of its pivots.
         allows: which of "rotate", "shift", "figure" and "scale".
-        ideal: whether the body is taken as perfect, so that its motion moves no light yet.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
     allows: frozenset[str] = frozenset({"rotate", "shift"})
-    ideal: bool = False
 
 
 def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:

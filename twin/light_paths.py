@@ -14,7 +14,8 @@ from optics.backend import Backend
 from optics.system import SystemBatch, assemble
 from optics.trace import make_rays, trace
 from optics.tree import PlacedBodies, State
-from scenes.instrument_model import BASE, Instrument
+from scenes.channel import BASE
+from scenes.instrument_model import Instrument
 
 RIM = 48
 """Rays around the edge of a beam; the first is at +x of the stop or face, then counterclockwise."""
@@ -69,10 +70,10 @@ def trace_light_paths(instrument: Instrument, backend: Backend, state: State, re
         backend: where to trace.
         state: what is perturbed.
         reach: how far the imaging beams are drawn beyond the first mirror toward the scene, metres; 0 takes the
-            distance of the return faces.
+            distance of the 180-deg prisms.
     """
     placed = instrument.assembly.place([state])
-    reach = reach or float(instrument.spec.monitor.return_face.distance)
+    reach = reach or float(instrument.spec.monitor.prism_180.distance)
     beams = _imaging(instrument, backend, state, placed, reach) + _monitor(instrument, backend, state, placed)
     return LightPaths(tuple(beams), placed)
 

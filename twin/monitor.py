@@ -25,7 +25,8 @@ from optics.system import assemble
 from optics.trace import BeamMissedError, make_rays, require_some, trace
 from optics.tree import PlacedBodies, State
 from optics.wavefront import eikonal
-from scenes.instrument_model import Channel, Instrument
+from scenes.channel import Channel
+from scenes.instrument_model import Instrument
 
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""

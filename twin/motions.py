@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from analysis.monitoring import ARCSEC
 from optics.tree import ORIGIN, Motion, State
-from scenes.instrument_model import BASE, CENTRAL_PRISM, Instrument
+from scenes.channel import BASE, CENTRAL_PRISM
+from scenes.instrument_model import Instrument
 
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"

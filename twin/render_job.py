@@ -129,7 +129,4 @@ def _warnings(
         share = float(photons[i].sum() / nominal[i].sum())
         if share < MIN_LIGHT:
             out.append(f"{channel.key}: only {100 * share:.0f}% of the nominal light reaches the CCD")
-    ideal = [path for path in resolved.job.perturb if experiment.instrument.nodes[path].ideal]
-    if ideal:
-        out.append(f"{', '.join(ideal)}: the lateral prisms are taken as perfect here, so their motion moves no spot")
     return tuple(out)

@@ -3,7 +3,7 @@
 The scene is in the base frame, in metres (X = flight direction, Y = along the line CCDs, Z toward the scene). Every
 body of the tree is a node whose name is the body's path; a viewer shows the tree as the twin has it. Mirrors have their
 true shape and clear aperture; figure errors, far too small to be seen, are left out. What has no size of its own
-(board, reticle, central prism) is given one that is easy to see; the light-sensitive faces are to scale.
+(board, reticle) is given one that is easy to see; the light-sensitive faces are to scale.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 
 from optics.aperture import Aperture, Circle
+from optics.solid import solid_mesh
 from optics.surface import Surface
 from optics.tree import State
-from scenes.instrument_model import BASE, CENTRAL_PRISM, Channel, Instrument
+from scenes.channel import BASE, Channel
+from scenes.instrument_model import Instrument
 from twin.experiment import MonitorExperiment
 from twin.light_paths import RIM, Beam, LightPaths, trace_light_paths
 
@@ -30,8 +32,6 @@ CHIP = 0.0005
 LINE_WIDTH = 0.002
 RETICLE = 0.0005
 """Thickness of chips, width of the line CCD and radius of the reticle as drawn, metres."""
-PRISM = 0.08
-"""Edge of the cube that marks the central prism, metres."""
 TUBE = 0.0015
 TUBE_SIDES = 5
 """Radius of drawn rays, metres, and their number of sides."""
@@ -55,7 +55,8 @@ MIRROR = _metal(205, 208, 214)
 DARK = _metal(60, 64, 72, 0.2, 0.7)
 SILICON = _metal(40, 60, 130, 0.3, 0.3)
 BRASS = _metal(200, 160, 60)
-GLASS = _metal(120, 190, 210, 0.1, 0.1, 170)
+GLASS = _metal(120, 190, 210, 0.1, 0.1, 110)
+BLOCK = _metal(150, 170, 185, 0.2, 0.3)
 IMAGING = (_metal(0, 114, 178, 0.0, 0.8), _metal(86, 180, 233, 0.0, 0.8))
 MONITOR = (_metal(213, 94, 0, 0.0, 0.8), _metal(230, 159, 0, 0.0, 0.8))
 
@@ -116,7 +117,8 @@ def body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.
         out[f"{plane}/line"] = _painted(_box((LINE_WIDTH, line, CHIP), 0.5 * CHIP), SILICON)
         for channel in channels:
             out.update(_channel_meshes(instrument, channel))
-    out[CENTRAL_PRISM] = _painted(_box((PRISM, PRISM, PRISM), 0.0), GLASS)
+    for solid in instrument.solids:
+        out[solid.path] = _painted(solid_mesh(solid, paths.placed).mesh, GLASS if solid.transparent else BLOCK)
     return out
 
 
@@ -124,15 +126,15 @@ def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trime
     ccd = instrument.spec.monitor.area_ccd
     face = instrument.assembly.elements[f"{channel.key}/return_face"].aperture
     assert isinstance(face, Circle)
-    disc = trimesh.creation.cylinder(radius=face.radius, height=0.2 * face.radius, sections=48)
-    disc.apply_translation([0.0, 0.0, -0.1 * face.radius])  # its normal is toward the camera; glass behind it
+    disc = trimesh.creation.cylinder(radius=face.radius, height=CHIP, sections=48)  # a coating, as thick as can be seen
+    disc.apply_translation([0.0, 0.0, 0.5 * CHIP])
     reticle = trimesh.creation.cylinder(radius=RETICLE, height=CHIP, sections=24)
     reticle.apply_translation([0.0, 0.0, 0.5 * CHIP])
     size = (ccd.columns * ccd.pitch, ccd.rows * ccd.pitch, CHIP)
     return {
         channel.ccd_body: _painted(_box(size, -0.5 * CHIP), SILICON),  # faces the light along its own +Z
         channel.reticle_body: _painted(reticle, BRASS),
-        channel.face_body: _painted(disc, GLASS),
+        channel.face_body: _painted(disc, MIRROR),
     }
 
 

@@ -12,7 +12,8 @@ from optics.backend import Backend
 from optics.line_of_sight import LineChange, chief_directions, line_change
 from optics.system import assemble
 from optics.tree import State
-from scenes.instrument_model import BASE, Instrument
+from scenes.channel import BASE
+from scenes.instrument_model import Instrument
 from twin.motions import ElementaryMotion
 
 LINE_POINTS = 41

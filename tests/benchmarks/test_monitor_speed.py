@@ -11,7 +11,7 @@ import numpy as np
 
 from analysis.monitoring import ARCSEC
 from optics.tree import Motion
-from scenes.instrument_model import BASE
+from scenes.channel import BASE
 from twin.truth import trace_truth
 
 ROOT = Path(__file__).resolve().parents[2]

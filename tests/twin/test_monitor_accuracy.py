@@ -9,7 +9,7 @@ from analysis import model_fit, monitoring
 from analysis.monitoring import ARCSEC, PER_SI
 from analysis.recovery import measure_spots
 from optics.tree import Motion
-from scenes.instrument_model import BASE
+from scenes.channel import BASE
 from twin.truth import trace_truth
 
 SHIFT, TURN, SCALE = 50e-6, 20 * ARCSEC, 20e-6  # the largest motions that are claimed

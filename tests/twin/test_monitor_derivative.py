@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes.instrument_model import BASE
+from scenes.channel import BASE
 from twin.monitor import MonitorPath
 from twin.monitor_derivative import photon_derivative, spot_jacobian
 from twin.motions import ElementaryMotion, line_family

@@ -9,7 +9,7 @@ from analysis.likelihood import cramer_rao_bound
 from analysis.monitoring import ARCSEC
 from analysis.recovery import measure_spots, recover
 from optics.tree import Motion
-from scenes.instrument_model import BASE
+from scenes.channel import BASE
 
 SEEDS = 200
 FRAMES = 9

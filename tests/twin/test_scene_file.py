@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from optics.tree import Motion
-from scenes.instrument_model import BASE
+from scenes.channel import BASE
 from twin.light_paths import FIELDS, trace_light_paths
 from twin.scene_file import BOARD, build_scene, mirror_mesh
 

@@ -9,7 +9,7 @@ import numpy as np
 from analysis.monitoring import ARCSEC
 from analysis.recovery import ESTIMATORS
 from optics.tree import Motion
-from scenes.instrument_model import BASE
+from scenes.channel import BASE
 from twin.report.labels import CENTROID_NOTES, PARAMETERS
 from twin.report.numbers import FAR, decimals_for, fixed, plain, residual, residual_text
 from twin.report.systematics import joined, systematics

@@ -8,7 +8,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
 from scenes.camera_model import CameraModel
-from scenes.instrument_model import BASE, CENTRAL_PRISM, Instrument
+from scenes.channel import BASE, CENTRAL_PRISM
+from scenes.instrument_model import Instrument
 from twin.light_paths import RIM, Beam, LightPaths
 from twin.report.svg import (
     BLUE,

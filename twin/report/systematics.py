@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.recovery import ESTIMATORS
 from optics.tree import Motion
-from scenes.instrument_model import BASE, CENTRAL_PRISM
+from scenes.channel import BASE, CENTRAL_PRISM
 from twin.crosstalk import CameraCrosstalk
 from twin.motions import ElementaryMotion
 from twin.report.numbers import plain
@@ -73,12 +73,11 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
     """Bodies that moved, reach this camera and have no row in the table."""
     own = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
-    ideal = {path for path, use in run.experiment.instrument.nodes.items() if use.ideal}
     out = []
     for path, motion in run.state.items():
         if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
             continue
-        if path not in bodies and path not in ideal and (any(motion.rotate) or any(motion.shift) or motion.scale):
+        if path not in bodies and (any(motion.rotate) or any(motion.shift) or motion.scale):
             out.append(path)
         covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
         missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]

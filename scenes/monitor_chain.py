@@ -1,0 +1,302 @@
+"""Where the monitor's prisms stand: from the beam that leaves a camera, over both prisms, to a facet of the central
+prism.
+
+The beam leaves the camera through a part of the pupil. The 180-deg prism takes it at a given distance, turns it back
+and over to the central prism's side; the rhomboid displaces it by a given amount in the same direction; how far the
+180-deg prism has to transfer it follows from where the facet is. The facet stands square to the beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.aim import RayFan, aim, transverse_axes
+from optics.aperture import Circle
+from optics.assembly import Assembly
+from optics.backend import Backend
+from optics.element import Element, Interaction
+from optics.pose import Pose
+from optics.solid import Solid, SolidError, face_plane, solid_mesh
+from optics.surface import plane
+from optics.system import assemble
+from optics.trace import make_rays, require_some, trace
+from optics.tree import Body, RigidTree
+from scenes.camera_model import LINE_AXIS, REFERENCE, CameraModel
+from scenes.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.prism_model import prism_0, prism_180, roof_offset
+
+if TYPE_CHECKING:
+    from scenes.instrument import InstrumentSpec, MonitorSpec
+
+
+@dataclass(frozen=True, eq=False)
+class LeavingBeam:
+    """A channel's beam in front of its camera, base frame.
+
+    Attributes:
+        middle: where it meets the 180-deg prism's window, metres.
+        direction: of its middle ray, halfway between the beam from the pinhole and the one that would come from the
+            middle of the area CCD; unit vector.
+    """
+
+    middle: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorChain:
+    """What a channel's beam meets outside the camera.
+
+    Attributes:
+        bodies: of the prisms and their faces, and of the facet.
+        elements: in the order in which the leaving beam meets them; the last one is the return face.
+        solids: the two prisms.
+        glass: prism -> length of the beam inside it, one way, metres.
+    """
+
+    bodies: tuple[Body, ...]
+    elements: tuple[Element, ...]
+    solids: tuple[Solid, ...]
+    glass: Mapping[str, float]
+
+
+def leaving_beams(
+    spec: MonitorSpec,
+    model: CameraModel,
+    channels: Sequence[Channel],
+    pupil_offset: np.ndarray,
+    to_base: Pose,
+    backend: Backend,
+) -> list[LeavingBeam]:
+    """Trace the channels' beams out of a camera.
+
+    The beam's middle is where the pinhole's chief ray passes, displaced by the sub-aperture's offset in the pupil.
+    """
+    frame = model.camera_frame
+    reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, spec.prism_180.distance])))
+    bare = model.bare_assembly(apertures=False)
+    tree = RigidTree((*bare.tree.bodies, Body(REFERENCE, reference)))
+    element = Element(REFERENCE, REFERENCE, plane(), Interaction.PASS)
+    bare = Assembly(tree, {**bare.elements, REFERENCE: element}, {})
+    backward = tuple(reversed(model.mirrors))
+    stop = backward.index(model.spec.stop)
+    to_stop = assemble(bare, [backward[: stop + 1]])
+    outgoing = assemble(bare, [(*backward, REFERENCE)])
+
+    spots = np.array([[*p, 0.0] for c in channels for p in (c.pinhole, c.ccd)])
+    points = model.focal_plane.apply(spots)[None]
+    guess = np.broadcast_to(-model.image_direction, points.shape)
+    fan = RayFan(points, guess, transverse_axes(guess, np.broadcast_to(LINE_AXIS, guess.shape)))
+    q, _ = aim(backend, to_stop, fan, np.zeros(2))
+    position, direction = fan.at(q)
+    chief = trace(backend, outgoing, make_rays(backend, position, direction)).numpy()
+    require_some(chief[3], "the monitor's outgoing path")
+    centres = chief[0][0, 0::2, :2] + pupil_offset
+    q, _ = aim(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], start=q)
+    position, direction = fan.at(q)
+    traced = trace(backend, outgoing, make_rays(backend, position, direction), world=True)
+    assert traced.world is not None
+    leaving = traced.numpy(traced.world)[1][0]
+    in_base = to_base @ frame.inverse()
+    beams = []
+    for i, centre in enumerate(centres):
+        along = leaving[2 * i] + leaving[2 * i + 1]
+        along = in_base.rotation @ (along / np.linalg.norm(along))
+        beams.append(LeavingBeam(in_base.apply(reference.apply(np.array([*centre, 0.0]))), along))
+    return beams
+
+
+def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_base: Pose) -> MonitorChain:
+    """Place both prisms and the facet of a channel.
+
+    Args:
+        spec: the instrument.
+        channel: which.
+        beam: as it leaves the camera.
+        to_base: the camera's pose in the base.
+
+    Raises:
+        InputError: the central prism is too near the camera's beam for the rhomboid's displacement.
+    """
+    monitor, up = spec.monitor, beam.direction
+    apex = np.array(spec.central_prism.position)
+    spread = np.array(spec.central_prism.spread)
+    # facets lean to where their beams come from, so that each is the lowest of all planes through the apex there
+    side = np.sign(up[:2])
+    offset = side * spread
+    centre = apex + np.array([*offset, -(offset @ up[:2]) / up[2]])
+    across = centre - beam.middle
+    across = across - (across @ up) * up
+    whole = float(np.linalg.norm(across))
+    toward = across / whole
+    transfer = whole - monitor.prism_0.shift
+    off = roof_offset(monitor.prism_180.width)
+    shortest = 2.0 * off + monitor.prism_180.width
+    if transfer < shortest:
+        raise spec.error(
+            f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism; less the "
+            f"rhomboid's displacement this leaves {1e3 * transfer:.4g} mm for the 180-deg prism",
+            ("central_prism", "position"),
+            allowed=f"places that leave it at least {1e3 * shortest:.4g} mm",
+        )
+    root = f"{BASE}/{channel.camera}/monitor/{channel.side}"
+    into_camera = to_base.inverse()
+    length = sqrt(transfer**2 - (2.0 * off) ** 2)
+    turned = np.cross(up, toward)
+    # of the two mirror-image prisms the one that lies more nearly across the line
+    x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
+    hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
+    pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
+    made = monitor.prism_180
+    first = prism_180(
+        channel.prism_body("prism_180"),
+        into_camera @ pose,
+        f"{channel.key}/prism_180",
+        made.material,
+        length,
+        made.width,
+        hand,
+        made.angle_errors,
+    )
+    pose = Pose(_columns(toward, -up), centre + monitor.prism_0.distance * up - 0.5 * monitor.prism_0.shift * toward)
+    small = monitor.prism_0
+    try:
+        second = prism_0(
+            channel.prism_body("prism_0"),
+            into_camera @ pose,
+            f"{channel.key}/prism_0",
+            small.material,
+            small.shift,
+            small.width,
+            small.angle_errors,
+        )
+    except ValueError as error:
+        raise spec.error(str(error), ("monitor", "prism_0")) from error
+    face = Element(
+        f"{channel.key}/return_face",
+        channel.face_body,
+        plane(),
+        Interaction.REFLECT,
+        Circle(0.5 * monitor.return_face.aperture),
+    )
+    facet = Body(channel.face_body, Pose(_facet_axes(up), centre - apex))
+    assert first.bodies[0].parent == root
+    return MonitorChain(
+        (*first.bodies, *second.bodies, facet),
+        (*first.elements, *second.elements, face),
+        (first.solid, second.solid),
+        MappingProxyType({"prism_180": first.path_length, "prism_0": second.path_length}),
+    )
+
+
+def square_facets(
+    assembly: Assembly, channels: Sequence[Channel], chains: Mapping[str, MonitorChain], backend: Backend
+) -> Assembly:
+    """Turn every facet so that it sends the pinhole's beam to the middle of its area CCD, as found by tracing.
+
+    The normal halves the angle between the beam that arrives and the one that would come from the CCD's middle, both
+    through the facet's centre, after all prisms with their angle errors.
+
+    Raises:
+        BeamMissedError: a beam misses a prism; the message names the element.
+    """
+    poses = {}
+    placed = assembly.place()
+    for channel in channels:
+        root = f"{BASE}/{channel.camera}/focal_plane"
+        names = assembly.sequences[f"{channel.key}/outgoing"]
+        start = np.array(
+            [placed.translation[0, placed.index[b]] for b in (channel.reticle_body, channel.ccd_body)]
+        )[None]
+        guess = _toward_optics(assembly, channel, root)
+        guess = np.broadcast_to(guess, start.shape)
+        fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
+        arriving = assembly.with_element(
+            Element("arriving", channel.face_body, plane(), Interaction.PASS)
+        )
+        systems = assemble(arriving, [(*names[:-1], "arriving")])
+        q, _ = aim(backend, systems, fan, np.zeros(2))
+        position, direction = fan.at(q)
+        traced = trace(backend, systems, make_rays(backend, position, direction), world=True)
+        assert traced.world is not None
+        _, leaving, _, valid = traced.numpy(traced.world)
+        if not valid.all():
+            require_some(np.zeros((1, 1), bool), first_missed(assembly, channel, backend, position, direction))
+        normal = -leaving[0].sum(axis=0)
+        block = placed.pose(CENTRAL_PRISM)
+        local = block.rotation.T @ (normal / np.linalg.norm(normal))
+        poses[channel.face_body] = Pose(_facet_axes(local), assembly.tree[channel.face_body].pose.translation)
+    bodies = tuple(
+        Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies
+    )
+    return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media)
+
+
+def first_missed(
+    assembly: Assembly, channel: Channel, backend: Backend, position: np.ndarray, direction: np.ndarray
+) -> str:
+    """Which element of a channel's way out the rays (1, N, 3) miss first, in words."""
+    names = assembly.sequences[f"{channel.key}/outgoing"]
+    for count in range(1, len(names) + 1):
+        traced = trace(backend, assemble(assembly, [names[:count]]), make_rays(backend, position, direction))
+        if not traced.numpy()[3].any():
+            element = assembly.elements[names[count - 1]]
+            return f"{element.name} on {element.body}"
+    return f"the monitor channel {channel.key}"
+
+
+def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
+    """Check that every solid is closed and that clear apertures lie on their faces.
+
+    Raises:
+        SolidError: names the body and the face.
+    """
+    placed = assembly.place()
+    for solid in solids:
+        mesh = solid_mesh(solid, placed)
+        own = placed.pose(solid.path)
+        for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
+            for element in assembly.elements.values():
+                if element.body == face.body != solid.path and element.aperture is not None:
+                    _check_inside(element, placed.pose(face.body), own.apply(polygon), solid.path)
+
+
+def _check_inside(element: Element, frame: Pose, polygon: np.ndarray, path: str) -> None:
+    """Check that an element's clear aperture lies inside the polygon (K, 3), world, of its face."""
+    assert element.aperture is not None
+    corners = frame.inverse().apply(polygon)[:, :2]
+    rim = element.aperture.outline()
+    edge = np.roll(corners, -1, axis=0) - corners
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
+    room = float(np.min((rim[:, None] - corners) * inward @ np.ones(2)))
+    if room < 0.0:
+        raise SolidError(
+            f"{path}: the clear aperture of {element.name} reaches {-1e3 * room:.3g} mm over the edge of its face"
+        )
+
+
+def _toward_optics(assembly: Assembly, channel: Channel, focal_plane: str) -> np.ndarray:
+    """Rough direction from the focal plane to the last mirror, world."""
+    last = assembly.elements[assembly.sequences[f"{channel.key}/outgoing"][0]]
+    assert last.aperture is not None
+    x, y = last.aperture.centre
+    frame = assembly.nominal_pose(last.body)
+    way = frame.apply(np.array([x, y, float(last.surface.sag(x, y))])) - assembly.nominal_pose(focal_plane).translation
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Rotation with these x and z axes."""
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _facet_axes(normal: np.ndarray) -> np.ndarray:
+    """Frame of a facet: z along its normal, x across the line (as the camera's X)."""
+    x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
+    return _columns(x_axis, normal)
