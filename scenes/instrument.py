@@ -4,13 +4,24 @@ it.
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from optics.material import MATERIALS, material
+from scenes.errors import Problem, names_text, nearest, shown
 from scenes.prism import CentralPrismSpec, Prism0Spec, Prism180Spec
 from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
-from scenes.spec import Name, Named, Number, Spec, Text, Whole
-from scenes.units import ANGLE, TIME
+from scenes.spec import Name, Named, NothingIsEmpty, Number, Spec, Text, Whole
+from scenes.units import ANGLE, TEMPERATURE, TIME
 
+
+def _known_material(name: str) -> str:
+    try:
+        return material(name).name
+    except KeyError:
+        raise Problem("no such material", shown(name), names_text(MATERIALS), nearest(name, MATERIALS)) from None
+
+
+MaterialName = Annotated[str, Field(strict=True), AfterValidator(_known_material)]
 Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
 MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
@@ -77,6 +88,24 @@ class ReturnFaceSpec(Spec):
     aperture: PositiveLength
 
 
+class MaterialsSpec(Spec):
+    """What the parts are made of, by name in the catalogue of optics/material.py; prisms name their own glass.
+
+    Attributes:
+        base: the common structure.
+        camera: each camera's structure, with the monitor's brackets.
+        mirror: all mirrors.
+        focal_plane: what carries the line CCD.
+        board: what carries reticle and area CCD at each end of it.
+    """
+
+    base: MaterialName = "CFRP"
+    camera: MaterialName = "CFRP"
+    mirror: MaterialName = "Zerodur"
+    focal_plane: MaterialName = "SiC"
+    board: MaterialName = "AlN"
+
+
 class MonitorSpec(Spec):
     """The autocollimation monitor, alike in all cameras and in both channels of each.
 
@@ -110,6 +139,8 @@ class InstrumentSpec(Spec):
         cameras: by name; the first is the reference for the change of the intersection angle.
         central_prism: common reference.
         monitor: of every camera.
+        temperature: at which everything has its nominal shape, kelvin.
+        materials: what the parts are made of.
     """
 
     name: Name
@@ -117,3 +148,5 @@ class InstrumentSpec(Spec):
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
     central_prism: CentralPrismSpec
     monitor: MonitorSpec
+    temperature: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="1000 K")] = 293.15
+    materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec()

@@ -203,8 +203,11 @@ def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], solids: tuple[So
     out = {}
     for body in tree.bodies:
         if body.path == BASE:
+            out[BASE] = NodeInfo(allows=frozenset({"temperature"}))
             continue
         allows = {"rotate", "shift"}
+        if body.path not in faces:
+            allows.add("temperature")
         if body.path in mirrors | faces:
             allows.add("figure")
         if body.path in roots:

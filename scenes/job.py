@@ -5,22 +5,26 @@ main input.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from optics.frozen_map import FrozenMap
+from optics.heat import Temperature
 from optics.zernike import MAX_NOLL
 from scenes.errors import InputError, Issue, Problem, names_text, nearest, shown
 from scenes.instrument import Frames, Reference
 from scenes.quantity import Quantity, Vector
 from scenes.spec import Name, NothingIsEmpty, Paths, Spec, Whole
-from scenes.units import ANGLE, LENGTH, SCALE
+from scenes.units import ANGLE, LENGTH, SCALE, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT
 
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
 Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
 ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
+
+TemperatureChange = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="1000 K")]
+TemperatureGradient = Annotated[tuple[float, float, float], Vector(Quantity(TEMPERATURE_GRADIENT, largest="1000 K/m"))]
 
 NO_MOTION = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
@@ -47,9 +51,31 @@ def _is_term(term: str) -> str:
 Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
 
 
+class TemperatureSpec(Spec):
+    """A change of a body's temperature, and of all it carries that has no temperature of its own: change + gradient . r.
+
+    Attributes:
+        change: at the body's origin, kelvin.
+        gradient: in the body's own frame, K/m.
+    """
+
+    change: TemperatureChange = 0.0
+    gradient: TemperatureGradient = NO_MOTION
+
+    @property
+    def field(self) -> Temperature:
+        """The field."""
+        return Temperature(self.change, self.gradient)
+
+
+def _uniform(value: Any) -> Any:
+    """`temperature: 2 K` means a uniform change."""
+    return {"change": value} if isinstance(value, str) else value
+
+
 class PerturbationSpec(Spec):
-    """What happens to one body of the instrument: a small rigid motion, a scale change, and for a mirror a figure
-    error.
+    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and for
+    a mirror or a prism's face a figure error.
 
     Attributes:
         rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
@@ -57,6 +83,7 @@ class PerturbationSpec(Spec):
         pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
         figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
         scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
+        temperature: uniform change as `2 K`, or with a gradient.
     """
 
     rotate: Rotation = NO_MOTION
@@ -64,14 +91,16 @@ class PerturbationSpec(Spec):
     pivot: Name = DEFAULT_PIVOT
     figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     scale: ScaleChange = 0.0
+    temperature: Annotated[TemperatureSpec, BeforeValidator(_uniform)] = TemperatureSpec()
 
     def uses(self) -> tuple[str, ...]:
-        """Which of rotate, shift, figure and scale do something."""
+        """Which of rotate, shift, figure, scale and temperature do something."""
         done = {
             "rotate": any(self.rotate),
             "shift": any(self.shift),
             "figure": any(self.figure.values()),
             "scale": self.scale != 0.0,
+            "temperature": self.temperature != TemperatureSpec(),
         }
         return tuple(name for name, does in done.items() if does)
 
@@ -124,11 +153,11 @@ class NodeInfo:
 
     Attributes:
         pivots: names of its pivots.
-        allows: which of "rotate", "shift", "figure" and "scale".
+        allows: which of "rotate", "shift", "figure", "scale" and "temperature".
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
-    allows: frozenset[str] = frozenset({"rotate", "shift"})
+    allows: frozenset[str] = frozenset({"rotate", "shift", "temperature"})
 
 
 def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:

@@ -16,19 +16,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.aim import RayFan, aim, transverse_axes
+from optics.aim import AimError, RayFan, aim, transverse_axes
 from optics.aperture import Circle
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
 from optics.pose import Pose
-from optics.solid import Solid, SolidError, face_plane, solid_mesh
+from optics.solid import Solid, SolidError, solid_mesh
 from optics.surface import plane
-from optics.system import assemble
-from optics.trace import make_rays, require_some, trace
+from optics.system import SystemBatch, assemble
+from optics.trace import make_rays, trace
 from optics.tree import Body, RigidTree
 from scenes.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.errors import KeyPath
+from scenes.misplaced import MisplacedError, key_of
 from scenes.prism_model import prism_0, prism_180, roof_offset
 
 if TYPE_CHECKING:
@@ -77,6 +79,9 @@ def leaving_beams(
     """Trace the channels' beams out of a camera.
 
     The beam's middle is where the pinhole's chief ray passes, displaced by the sub-aperture's offset in the pupil.
+
+    Raises:
+        MisplacedError: light from the pinholes or the area CCDs misses a mirror's surface.
     """
     frame = model.camera_frame
     reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, spec.prism_180.distance])))
@@ -93,12 +98,14 @@ def leaving_beams(
     points = model.focal_plane.apply(spots)[None]
     guess = np.broadcast_to(-model.image_direction, points.shape)
     fan = RayFan(points, guess, transverse_axes(guess, np.broadcast_to(LINE_AXIS, guess.shape)))
-    q, _ = aim(backend, to_stop, fan, np.zeros(2))
+    where = " and ".join(c.key for c in channels)
+    q = _aimed(backend, to_stop, fan, np.zeros(2), where, ("monitor", "field"))
     position, direction = fan.at(q)
     chief = trace(backend, outgoing, make_rays(backend, position, direction)).numpy()
-    require_some(chief[3], "the monitor's outgoing path")
+    if not chief[3].all():
+        raise MisplacedError(f"light of the monitor channels {where} misses a mirror", ("monitor", "field"))
     centres = chief[0][0, 0::2, :2] + pupil_offset
-    q, _ = aim(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], start=q)
+    q = _aimed(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], where, ("monitor", "field"), start=q)
     position, direction = fan.at(q)
     traced = trace(backend, outgoing, make_rays(backend, position, direction), world=True)
     assert traced.world is not None
@@ -122,7 +129,8 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         to_base: the camera's pose in the base.
 
     Raises:
-        InputError: the central prism is too near the camera's beam for the rhomboid's displacement.
+        InputError, MisplacedError: the central prism is too near the camera's beam for the rhomboid's displacement, or
+            that is too small for the rhomboid's width.
     """
     monitor, up = spec.monitor, beam.direction
     apex = np.array(spec.central_prism.position)
@@ -177,7 +185,7 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
             small.angle_errors,
         )
     except ValueError as error:
-        raise spec.error(str(error), ("monitor", "prism_0")) from error
+        raise MisplacedError(str(error), ("monitor", "prism_0", "shift")) from error
     face = Element(
         f"{channel.key}/return_face",
         channel.face_body,
@@ -204,67 +212,85 @@ def square_facets(
     through the facet's centre, after all prisms with their angle errors.
 
     Raises:
-        BeamMissedError: a beam misses a prism; the message names the element.
+        MisplacedError: a beam misses a mirror or a prism; the message names the element.
     """
     poses = {}
     placed = assembly.place()
     for channel in channels:
         root = f"{BASE}/{channel.camera}/focal_plane"
         names = assembly.sequences[f"{channel.key}/outgoing"]
-        start = np.array(
-            [placed.translation[0, placed.index[b]] for b in (channel.reticle_body, channel.ccd_body)]
-        )[None]
+        start = np.array([placed.translation[0, placed.index[b]] for b in (channel.reticle_body, channel.ccd_body)])[
+            None
+        ]
         guess = _toward_optics(assembly, channel, root)
         guess = np.broadcast_to(guess, start.shape)
         fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
-        arriving = assembly.with_element(
-            Element("arriving", channel.face_body, plane(), Interaction.PASS)
-        )
+        arriving = assembly.with_element(Element("arriving", channel.face_body, plane(), Interaction.PASS))
         systems = assemble(arriving, [(*names[:-1], "arriving")])
-        q, _ = aim(backend, systems, fan, np.zeros(2))
+        q = _aimed(backend, systems, fan, np.zeros(2), channel.key, ("central_prism", "position"))
         position, direction = fan.at(q)
         traced = trace(backend, systems, make_rays(backend, position, direction), world=True)
         assert traced.world is not None
         _, leaving, _, valid = traced.numpy(traced.world)
         if not valid.all():
-            require_some(np.zeros((1, 1), bool), first_missed(assembly, channel, backend, position, direction))
+            raise _missed(assembly, channel, backend, position, direction)
         normal = -leaving[0].sum(axis=0)
         block = placed.pose(CENTRAL_PRISM)
         local = block.rotation.T @ (normal / np.linalg.norm(normal))
         poses[channel.face_body] = Pose(_facet_axes(local), assembly.tree[channel.face_body].pose.translation)
-    bodies = tuple(
-        Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies
-    )
+    bodies = tuple(Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies)
     return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media)
 
 
-def first_missed(
+def _aimed(
+    backend: Backend,
+    systems: SystemBatch,
+    fan: RayFan,
+    target: np.ndarray,
+    channels: str,
+    key: KeyPath,
+    start: np.ndarray | None = None,
+) -> np.ndarray:
+    """Parameters of ``aim``; MisplacedError at ``key`` when it finds no ray."""
+    try:
+        return aim(backend, systems, fan, target, start)[0]
+    except AimError as error:
+        raise MisplacedError(f"no light of {channels} gets to where it has to go: {error}", key) from error
+
+
+def _missed(
     assembly: Assembly, channel: Channel, backend: Backend, position: np.ndarray, direction: np.ndarray
-) -> str:
-    """Which element of a channel's way out the rays (1, N, 3) miss first, in words."""
+) -> MisplacedError:
+    """Which element of a channel's way out rays (1, N, 3) from the pinhole and from the CCD miss first."""
     names = assembly.sequences[f"{channel.key}/outgoing"]
     for count in range(1, len(names) + 1):
         traced = trace(backend, assemble(assembly, [names[:count]]), make_rays(backend, position, direction))
-        if not traced.numpy()[3].any():
+        if not traced.numpy()[3].all():
             element = assembly.elements[names[count - 1]]
-            return f"{element.name} on {element.body}"
-    return f"the monitor channel {channel.key}"
+            what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
+            if element.interaction is Interaction.TOTAL:
+                what += ", or is not totally reflected there"
+            return MisplacedError(what, key_of(element.body))
+    return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
 
 
 def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
     """Check that every solid is closed and that clear apertures lie on their faces.
 
     Raises:
-        SolidError: names the body and the face.
+        MisplacedError: names the body and the face.
     """
     placed = assembly.place()
     for solid in solids:
-        mesh = solid_mesh(solid, placed)
+        try:
+            mesh = solid_mesh(solid, placed)
+        except SolidError as error:
+            raise MisplacedError(str(error), key_of(solid.path)) from error
         own = placed.pose(solid.path)
         for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
             for element in assembly.elements.values():
-                if element.body == face.body != solid.path and element.aperture is not None:
-                    _check_inside(element, placed.pose(face.body), own.apply(polygon), solid.path)
+                if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
+                    _check_inside(element, placed.pose(element.body), own.apply(polygon), solid.path)
 
 
 def _check_inside(element: Element, frame: Pose, polygon: np.ndarray, path: str) -> None:
@@ -276,8 +302,9 @@ def _check_inside(element: Element, frame: Pose, polygon: np.ndarray, path: str)
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
     room = float(np.min((rim[:, None] - corners) * inward @ np.ones(2)))
     if room < 0.0:
-        raise SolidError(
-            f"{path}: the clear aperture of {element.name} reaches {-1e3 * room:.3g} mm over the edge of its face"
+        key = ("monitor", "return_face", "aperture") if path == CENTRAL_PRISM else key_of(path)
+        raise MisplacedError(
+            f"{path}: the clear aperture of {element.name} reaches {-1e3 * room:.3g} mm over the edge of its face", key
         )
 
 

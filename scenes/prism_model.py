@@ -41,7 +41,7 @@ class Passage:
 
     Attributes:
         name: of the element within the prism, e.g. ``entry``.
-        face: which face (its body is ``<solid>/<face>``).
+        face: which face (its body is ``<solid>/<face>``, with a child for each passage if there are several).
         interaction: refract, reflect or total.
         place: of the beam's middle on the face, in the solid's frame, metres.
         direction: of the beam when it arrives, in the solid's frame.
@@ -189,6 +189,7 @@ def _parts(
     share.
     """
     used = {p.face: p for p in reversed(passages)}
+    shared = {face for face in used if sum(p.face == face for p in passages) > 1}
     unknown = set(errors) - set(used)
     if unknown:
         raise ValueError(f"{path}: no such face: {', '.join(sorted(unknown))}; faces are {', '.join(used)}")
@@ -205,16 +206,22 @@ def _parts(
         bodies.append(Body(f"{path}/{name}", tilted))
         faces.append(Face(name, f"{path}/{name}", coating))
         frames[name] = frame
+        # two footprints far apart on one face tilt differently when it bends: each has a body of its own
+        bodies += [
+            Body(_footprint(path, p, shared), Pose(np.eye(3), frame.inverse().apply(p.place)))
+            for p in passages
+            if p.face == name and name in shared
+        ]
     elements = []
     for passage in passages:
         frame = frames[passage.face]
-        centre = frame.inverse().apply(passage.place)
+        centre = np.zeros(3) if passage.face in shared else frame.inverse().apply(passage.place)
         cosine = abs(float(frame.rotation[:, 2] @ passage.direction))
         aperture = Ellipse(0.5 * width / cosine, 0.5 * width, (float(centre[0]), float(centre[1])))
         elements.append(
             Element(
                 f"{key}/{passage.name}",
-                f"{path}/{passage.face}",
+                _footprint(path, passage, shared),
                 plane(),
                 passage.interaction,
                 aperture,
@@ -225,6 +232,12 @@ def _parts(
         float(np.linalg.norm(b.place - a.place)) for a, b in zip(passages[:-1], passages[1:], strict=True)
     )
     return PrismParts(tuple(bodies), tuple(elements), Solid(path, material, tuple(faces)), inside, apex)
+
+
+def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
+    """Body on which a passage's element stands: the face's, or a child of it when the beam meets the face twice."""
+    own = f"{path}/{passage.face}"
+    return f"{own}/{passage.name}" if passage.face in shared else own
 
 
 def _centre(passages: list[Passage]) -> tuple[float, float, float]:

@@ -4,7 +4,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from optics.tree import Motion, State
 from scenes.instrument_model import Instrument, build_instrument
 from scenes.job import JobSpec, noll
 from scenes.resolved import ResolvedJob
+from scenes.thermal_model import TemperatureError, ThermalModel
 from twin.detector import EmvaDetector, FixedPattern
 from twin.monitor import MonitorPath
 from twin.monitor_derivative import spot_jacobian
@@ -49,6 +50,28 @@ class MonitorExperiment:
     def wide_photons(self) -> np.ndarray:
         """Expected photons of the unperturbed instrument with the template's margin, (C, rows + 2m, columns + 2m)."""
         return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN)[0]
+
+    @cached_property
+    def thermal(self) -> ThermalModel:
+        """What temperatures do to the instrument."""
+        return ThermalModel(self.instrument)
+
+    def state(self, job: JobSpec, progress: Callable[[str], None] = lambda path: None) -> State:
+        """The perturbed state that a job describes.
+
+        Args:
+            job: its perturbation, checked by ``scenes.job.check_nodes``.
+            progress: called with the path of each body whose thermo-elastic solution begins.
+
+        Raises:
+            InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
+        """
+        fields = {path: p.temperature.field for path, p in job.perturb.items() if "temperature" in p.uses()}
+        try:
+            self.thermal.check(fields)
+            return self.thermal.state(fields, motions_of(job), progress)
+        except TemperatureError as error:
+            raise job.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
 
     @property
     def nominal_photons(self) -> np.ndarray:
@@ -160,8 +183,8 @@ def _stream(seed: int, *number: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed, spawn_key=number)
 
 
-def state_of(job: JobSpec) -> State:
-    """The perturbed state that a job describes."""
+def motions_of(job: JobSpec) -> State:
+    """The rigid motions, scales and figures that a job asks for; its temperatures come on top of them."""
     return {
         path: Motion(p.rotate, p.shift, p.pivot, p.scale, {noll(term): value for term, value in p.figure.items()})
         for path, p in job.perturb.items()

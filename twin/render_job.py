@@ -15,11 +15,20 @@ from scenes.errors import InputError
 from scenes.job import check_nodes
 from scenes.resolved import ResolvedJob
 from twin.crosstalk import crosstalk
-from twin.experiment import MonitorExperiment, state_of
+from twin.experiment import MonitorExperiment
 from twin.results import RenderRun
 from twin.truth import trace_truth
 
-STAGES = ("build the instrument", "trace the truth", "calibrate", "render the spots", "expose", "recover", "crosstalk")
+STAGES = (
+    "build the instrument",
+    "perturb",
+    "trace the truth",
+    "calibrate",
+    "render the spots",
+    "expose",
+    "recover",
+    "crosstalk",
+)
 
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
@@ -53,28 +62,29 @@ def render_job(
     progress(STAGES[0])
     experiment = MonitorExperiment(resolved, backend)
     check_nodes(resolved.job, experiment.instrument.nodes)
-    state = state_of(resolved.job)
+    progress(STAGES[1])
+    state = experiment.state(resolved.job)
     try:
-        progress(STAGES[1])
-        truth = trace_truth(experiment.instrument, backend, [state])
         progress(STAGES[2])
-        calibration = experiment.calibration
+        truth = trace_truth(experiment.instrument, backend, [state])
         progress(STAGES[3])
+        calibration = experiment.calibration
+        progress(STAGES[4])
         nominal = experiment.nominal_photons
         photons = experiment.path.expected_photons([state])
     except (AimError, BeamMissedError) as error:
         raise _too_large(resolved, str(error)) from error
-    progress(STAGES[4])
+    progress(STAGES[5])
     before = experiment.frames_before(count, number)
     after = experiment.frames_after(photons, count, number)
-    progress(STAGES[5])
+    progress(STAGES[6])
     try:
         recovery = recover(before, after, calibration, resolved.job.analysis.centroid)
     except SpotError as error:
         channels = experiment.path.channels
         reasons = "; ".join(f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items())
         raise _too_large(resolved, f"a spot cannot be measured ({reasons})") from error
-    progress(STAGES[6])
+    progress(STAGES[7])
     tables = crosstalk(experiment, _covariances(recovery))
     return RenderRun(
         resolved=resolved,

@@ -1,5 +1,6 @@
 import pytest
 
+from optics.glass import GLASSES
 from optics.material import MATERIALS, Material, material
 
 # name: range of CTE 1e-6/K, density, E GPa that handbooks give
@@ -9,6 +10,9 @@ PLAUSIBLE = {
     "N-BK7": ((7.0, 7.2), (2500, 2520), (81, 83)),
     "SiC": ((2.0, 2.6), (3100, 3210), (400, 470)),
     "Invar": ((0.5, 1.6), (8000, 8150), (137, 150)),
+    "Ti-6Al-4V": ((8.5, 9.0), (4420, 4440), (105, 120)),
+    "alumina": ((4.6, 7.2), (3600, 3990), (300, 420)),
+    "AlN": ((2.5, 4.6), (3250, 3300), (310, 350)),
     "CFRP": ((-1.0, 1.0), (1500, 1800), (60, 200)),
     "aluminium": ((23, 24), (2690, 2720), (68, 71)),
 }
@@ -31,12 +35,20 @@ def test_the_catalogue_is_complete() -> None:
     assert set(MATERIALS) == set(PLAUSIBLE)
 
 
+@pytest.mark.parametrize("name", list(GLASSES))
+def test_every_glass_has_a_material_of_its_name(name: str) -> None:
+    assert material(name).name == name
+
+
 def test_names() -> None:
     assert material("BK7") is material("n-bk7")
+    assert material("titanium").name == "Ti-6Al-4V"
+    assert material("Al2O3").name == "alumina"
+    assert material("aluminium nitride").name == "AlN"
     assert material("aluminum") is material("Aluminium")
     with pytest.raises(KeyError, match="did you mean 'Invar'"):
         material("inver")
-    with pytest.raises(KeyError, match="known: CFRP, Invar"):
+    with pytest.raises(KeyError, match="known: AlN, CFRP, Invar"):
         material("xyz")
 
 
