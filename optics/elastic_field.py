@@ -89,7 +89,7 @@ class Finder:
         )
 
     def _local(self, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Coordinates of points (P, 3) in the reference cells of ``cells`` (P,), by Newton; far ones may be off."""
+        """Coordinates of points (P, 3) in the reference cells of ``cells`` (P,), by Newton; infinite where it fails."""
         corners = self._corners[cells]
         x = np.full_like(points, 0.25 if self._simplex else 0.5)
         for _ in range(1 if self._simplex else 8):
@@ -100,7 +100,9 @@ class Finder:
             x = x + step if self._simplex else np.clip(x + step, -0.5, 1.5)
             if np.max(np.abs(step)) < 1e-12:
                 break
-        return x
+        # a point far from a cell may have no place in it; where the clipped iteration then stops means nothing
+        failed = np.max(np.abs(step), axis=1, keepdims=True) > 1e-8
+        return x if self._simplex else np.where(failed, np.inf, x)
 
 
 def rigid_modes(points: np.ndarray) -> np.ndarray:

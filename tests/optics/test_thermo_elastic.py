@@ -195,6 +195,19 @@ class TestFree:
         assert abs(moved[2] @ normal) / np.linalg.norm(normal) < 1e-12 * size
         assert abs(moved[1] @ along) > 1e-3 * size  # along the line it is free
 
+    @pytest.mark.parametrize("cells", [4, 8, 9, 16])
+    @pytest.mark.parametrize("aperture", [Circle(0.3, (0.0, -0.4)), Rectangle(0.3, 0.1)])
+    def test_every_point_of_a_curved_face_is_found_in_its_own_cell(self, aperture, cells: int) -> None:
+        surface = Surface(1 / 3, -1.0)
+        body = ElasticBody(mirror_mesh(surface, aperture, 0.06, 1, cells), SILICA)
+        x0, x1, y0, y1 = aperture.bounds
+        u = np.random.default_rng(5).uniform(-1, 1, (1500, 2))
+        x, y = 0.5 * (x0 + x1 + (x1 - x0) * u[:, 0]), 0.5 * (y0 + y1 + (y1 - y0) * u[:, 1])
+        inside = aperture.contains(x, y)
+        points = np.stack([x, y, surface.sag(x, y)], axis=-1)[inside]
+        # the field u = r, which curved cells hold as well
+        np.testing.assert_allclose(Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9)
+
     def test_load_cases_add_up_and_differ_not_from_single_ones(self) -> None:
         body, support = bar()
         fields = [lambda p: p[:, 0] ** 2, lambda p: np.sin(30 * p[:, 1])]
