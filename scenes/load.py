@@ -1,7 +1,7 @@
 """Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
 
-The library's folders are scenes/cameras, scenes/instruments and scenes/detectors; a file's name without .yaml is its
-name there.
+The library's folders are scenes/cameras, scenes/instruments, scenes/detectors and scenes/lab (experiments on the
+ground); a file's name without .yaml is its name there.
 """
 
 from pathlib import Path
@@ -14,6 +14,7 @@ from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.spec import Spec
 from scenes.translate import validate
+from scenes.turntable import PrincipleExperimentSpec, PrincipleSetup
 from scenes.yaml_file import read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
@@ -21,6 +22,7 @@ SpecType = TypeVar("SpecType", bound=Spec)
 LIBRARY = Path(__file__).resolve().parent
 EXAMPLES = LIBRARY / "examples"
 CAMERAS, INSTRUMENTS, DETECTORS = "cameras", "instruments", "detectors"
+LAB = "lab"
 
 
 def library_names(folder: str) -> tuple[str, ...]:
@@ -86,6 +88,16 @@ def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None)
 def load_detector(name_or_path: str | Path, relative_to: str | Path | None = None) -> DetectorSpec:
     """Read a detector's data sheet; arguments and errors as `load_instrument`."""
     return _load(DetectorSpec, DETECTORS, name_or_path, relative_to)
+
+
+def load_principle_experiment(
+    name_or_path: str | Path = "principle_experiment", relative_to: str | Path | None = None
+) -> PrincipleSetup:
+    """Read a principle experiment and the data sheet of its area CCDs; arguments and errors as `load_instrument`."""
+    spec = _load(PrincipleExperimentSpec, LAB, name_or_path, relative_to)
+    reference = spec.autocollimator.area_ccd.detector
+    detector = _find(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
+    return PrincipleSetup(spec, load_detector(detector))
 
 
 def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None) -> SpecType:

@@ -1,0 +1,166 @@
+"""Readings of a digital autocollimator, and the relations that the principle experiment of paper 001 tests with them
+(Wang et al. 2018, section 3.1, Table 2).
+
+A plane mirror has two angles that an autocollimator can see, the turns of its normal about the instrument's own X and
+Y (Z is its view, X up). A turn of the mirror about its own normal changes nothing that comes back. Two autocollimators
+look at two mirrors that stand b = 2 theta apart on one turntable; frame 2 is frame 1 turned about X by b, so that
+
+    Y1 = Y2 cos b - Z2 sin b,    Z1 = Y2 sin b + Z2 cos b,
+
+and a turn of the table by a small angle reads
+
+    about X1: d_beta   mirror 1  d_beta  about X1    mirror 2  d_beta         about X2
+    about Y1: d_alpha  mirror 1  d_alpha about Y1    mirror 2  d_alpha cos b  about Y2
+    about Z1: d_gamma  mirror 1  nothing             mirror 2  d_gamma sin b  about Y2.
+
+The paper prints the same factors with "beta" for b, but calls the last one a turn of mirror 2 "about its own Z". That
+turn is d_gamma cos b and cannot be seen; what is d_gamma sin b, and what the autocollimator reads, is the turn about
+Y2. And it prints readings of mirror 1 about Z, where there is nothing to read.
+
+Angles in radians. A reading is (about X, about Y) = (atan(n_y / -n_z), atan(-n_x / -n_z)) of the mirror's normal n in
+the autocollimator's frame; a turn about X alone or about Y alone reads exactly as itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "AXES",
+    "ReadingMap",
+    "column_component",
+    "exact_reading",
+    "mean_difference",
+    "mirror_rotation",
+    "reading_of_normal",
+    "relation_factor",
+]
+
+Array = NDArray[np.float64]
+AXES = ("X", "Y", "Z")
+
+
+def mirror_rotation(shift_m: ArrayLike, focal_length_m: float) -> Array:
+    """Turn of a mirror, radians, from the shift of its spot, metres: L = f tan(2 theta), paper 001 eq. (1)."""
+    return np.asarray(0.5 * np.arctan(np.asarray(shift_m, np.float64) / focal_length_m))
+
+
+def reading_of_normal(normal: ArrayLike) -> Array:
+    """Reading (..., 2), radians, for mirror normals (..., 3) in the autocollimator's frame; (0, 0, -1) reads zero."""
+    n = np.asarray(normal, np.float64)
+    return np.stack([np.arctan2(n[..., 1], -n[..., 2]), np.arctan2(-n[..., 0], -n[..., 2])], axis=-1)
+
+
+def column_component(axis: str) -> int:
+    """Which component of the readings the columns of Table 2 hold for a turn about this axis: 0 about X, 1 about Y.
+
+    For Z it is 1: mirror 2 turns about its own Y.
+    """
+    return 0 if axis == "X" else 1
+
+
+def relation_factor(axis: str, unit: int, between: float) -> float:
+    """What autocollimator 1 or 2 reads for one unit of turn of the table, to first order.
+
+    axis: X, Y or Z of frame 1. unit: 1 or 2. between: b, radians.
+    """
+    if axis not in AXES or unit not in (1, 2):
+        raise ValueError(f"relations: axis must be X, Y or Z and unit 1 or 2, found {axis!r} and {unit!r}")
+    if unit == 1:
+        return 0.0 if axis == "Z" else 1.0
+    return {"X": 1.0, "Y": float(np.cos(between)), "Z": float(np.sin(between))}[axis]
+
+
+def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Array:
+    """Reading (..., 2) for turns of the table by any angle, (...), radians; mirrors square to begin with.
+
+    With u the axis in the autocollimator's frame, n = n0 cos a + (u x n0) sin a + u (u . n0)(1 - cos a), n0 = -Z. What
+    it adds to the relations: about Y2 a relative -sin^2(b) a^2 / 6 for a turn about Y1 (-cos^2(b) a^2 / 6 about Z1),
+    0.0003" at 720"; but about X2 a second-order sin(b) cos(b) a^2 / 2 in size, 0.54" at 720" and 30 or 60 deg.
+    """
+    a = np.asarray(angle, np.float64)
+    b = between if unit == 2 else 0.0
+    relation_factor(axis, unit, between)  # checks the names
+    u = {
+        "X": np.array([1.0, 0.0, 0.0]),
+        "Y": np.array([0.0, np.cos(b), -np.sin(b)]),
+        "Z": np.array([0.0, np.sin(b), np.cos(b)]),
+    }[axis]
+    n0 = np.array([0.0, 0.0, -1.0])
+    # 1 - cos a without cancellation
+    versine = 2.0 * np.sin(0.5 * a) ** 2
+    return reading_of_normal(
+        n0 + np.sin(a)[..., None] * np.cross(u, n0) + versine[..., None] * (u * float(u @ n0) - n0)
+    )
+
+
+def mean_difference(first: ArrayLike, second: ArrayLike) -> float:
+    """Mean of |first - second| over the rows of a table.
+
+    So Table 2 gets its last line: about X and Y between mirror 1 and scaled mirror 2; about Z, however, between scaled
+    mirror 2 and the *turntable's* angle.
+    """
+    return float(np.mean(np.abs(np.asarray(first, np.float64) - np.asarray(second, np.float64))))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingMap:
+    """Calibration of an autocollimator: polynomial from the place of its spot to the reading.
+
+    The lens images f tan(2 theta) only to first order: it distorts by some 1e-4. As makers do, the map is found once by
+    turning a mirror by known angles, and holds from then on.
+
+    centre: (row, column) px that the polynomial counts from. scale: px, of the range.
+    degree: of the polynomial in row and column together. coefficients: (terms, 2), radians.
+    residual: rms misfit of the calibration, radians.
+    """
+
+    centre: Array
+    scale: float
+    degree: int
+    coefficients: Array
+    residual: float
+
+    @classmethod
+    def fit(cls, place: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
+        """Least squares over P known turns.
+
+        place: (P, 2) spots (row, column), px. reading: (P, 2) about X, about Y, radians.
+        Raises ValueError when there are too few of them.
+        """
+        spots, known = np.asarray(place, np.float64), np.asarray(reading, np.float64)
+        if spots.ndim != 2 or spots.shape[1] != 2 or known.shape != spots.shape:
+            raise ValueError(f"reading map: place {spots.shape} and reading {known.shape} must both be (P, 2)")
+        centre = 0.5 * (spots.min(axis=0) + spots.max(axis=0))
+        scale = float(np.max(np.abs(spots - centre)))
+        design = _monomials((spots - centre) / max(scale, 1e-300), degree)
+        solution, _, rank, _ = np.linalg.lstsq(design, known, rcond=None)
+        if rank < design.shape[1]:
+            raise ValueError(f"reading map: {len(spots)} spots do not settle a polynomial of degree {degree}")
+        rms = float(np.sqrt(np.mean((design @ solution - known) ** 2)))
+        return cls(centre, scale, degree, np.asarray(solution, dtype=np.float64), rms)
+
+    def __call__(self, place: ArrayLike) -> Array:
+        """Readings (..., 2), radians, for spots (..., 2) in px."""
+        reduced = (np.asarray(place, np.float64) - self.centre) / self.scale
+        return np.asarray(_monomials(reduced, self.degree) @ self.coefficients)
+
+    def slope(self, place: ArrayLike) -> Array:
+        """d(reading)/d(row, column), (..., 2, 2), rad/px."""
+        spot = np.asarray(place, np.float64)
+        step = 0.5 * np.eye(2)
+        return np.stack([self(spot + step[k]) - self(spot - step[k]) for k in range(2)], axis=-1)
+
+    def covariance(self, place: ArrayLike, spot_covariance: ArrayLike) -> Array:
+        """Covariance (..., 2, 2) rad^2 of readings from that of the spots, (..., 2, 2) px^2."""
+        slope = self.slope(place)
+        return np.asarray(slope @ np.asarray(spot_covariance, np.float64) @ np.swapaxes(slope, -1, -2))
+
+
+def _monomials(spot: Array, degree: int) -> Array:
+    """All products row^i column^j with i + j <= degree, (..., terms)."""
+    row, column = spot[..., 0], spot[..., 1]
+    return np.stack([row**i * column**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)

@@ -1,0 +1,191 @@
+"""The principle experiment's file, and the bench that is built from it."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.backend import Backend
+from optics.tree import Motion
+from scenes.errors import InputError
+from scenes.load import LAB, LIBRARY, library_names, load_principle_experiment
+from scenes.spec import Spec
+from scenes.translate import validate
+from scenes.turntable import PrincipleExperimentSpec
+from scenes.turntable_model import (
+    UNITS,
+    autocollimator_body,
+    axis_body,
+    build_bench,
+    ccd_body,
+    mirror_body,
+    paraxial_focus,
+    pinhole_body,
+)
+from scenes.yaml_file import dump_yaml, parse_yaml
+from twin.autocollimator import AutocollimatorPath
+
+FILE = LIBRARY / LAB / "principle_experiment.yaml"
+SPEC = load_principle_experiment().spec
+ANGLES = [math.radians(15), math.radians(30)]
+
+
+def test_the_file() -> None:
+    assert "principle_experiment" in library_names(LAB)
+    setup = load_principle_experiment()
+    assert setup.detector.name == setup.spec.autocollimator.area_ccd.detector == "autocollimator_ccd"
+    programme = setup.spec.programme
+    np.testing.assert_allclose(np.degrees([programme.small, programme.table, programme.large]), [0.01, 0.02, 0.03])
+    assert np.degrees([programme.stands.X, programme.stands.Y, programme.stands.Z]).round(9).tolist() == [15, 15, 30]
+    assert programme.steps == 10
+    # the CCD holds the beam turned by the largest series, with half a window to spare
+    ccd = setup.spec.autocollimator.area_ccd
+    reach = paraxial_focus(setup.spec.autocollimator.lens, 650e-9)[0] * math.tan(2 * 10 * programme.large)
+    assert reach + 0.5 * setup.spec.autocollimator.window * ccd.pitch < 0.5 * ccd.pitch * min(ccd.rows, ccd.columns)
+
+
+def test_a_full_well_is_just_below_saturation() -> None:
+    detector = load_principle_experiment().detector
+    full = detector.full_well_e * detector.system_gain_dn_per_e + detector.offset_dn
+    assert 0.9 * 2**detector.bit_depth < full < 2**detector.bit_depth - 1
+
+
+def test_the_specification_reads_back() -> None:
+    again: Spec = validate(PrincipleExperimentSpec, parse_yaml(dump_yaml(SPEC.plain())))
+    assert again == SPEC
+    assert hash(again) == hash(SPEC)
+
+
+@pytest.mark.parametrize("half_angle", ANGLES)
+def test_mirrors_are_square_to_their_autocollimators(half_angle: float) -> None:
+    bench = build_bench(SPEC, half_angle)
+    placed = bench.assembly.place()
+    for unit in UNITS:
+        view = placed.pose(autocollimator_body(unit)).rotation[:, 2]
+        mirror = placed.pose(mirror_body(unit))
+        np.testing.assert_allclose(mirror.rotation[:, 2], -view, atol=1e-15)
+        # the view passes through the mirror's middle and the turntable's centre
+        lens = placed.pose(autocollimator_body(unit)).translation
+        np.testing.assert_allclose(np.cross(mirror.translation - lens, view), 0.0, atol=1e-15)
+        np.testing.assert_allclose(np.cross(lens, view), 0.0, atol=1e-15)
+        # pinhole and CCD lie symmetric about the view
+        ends = [placed.pose(body(unit)).translation - lens for body in (pinhole_body, ccd_body)]
+        np.testing.assert_allclose(np.cross(ends[0] + ends[1], view), 0.0, atol=1e-15)
+        np.testing.assert_allclose(bench.frame(unit), placed.pose(autocollimator_body(unit)).rotation, atol=1e-15)
+    one, two = (bench.frame(unit) for unit in UNITS)
+    assert math.acos(one[:, 2] @ two[:, 2]) == pytest.approx(2 * half_angle, abs=1e-12)
+    np.testing.assert_allclose(one[:, 0], two[:, 0], atol=1e-15)
+    # Y1 = Y2 cos b - Z2 sin b, Z1 = Y2 sin b + Z2 cos b
+    c, s = math.cos(2 * half_angle), math.sin(2 * half_angle)
+    np.testing.assert_allclose(one[:, 1], c * two[:, 1] - s * two[:, 2], atol=1e-15)
+    np.testing.assert_allclose(one[:, 2], s * two[:, 1] + c * two[:, 2], atol=1e-15)
+
+
+def test_the_table_carries_the_mirrors_and_nothing_else() -> None:
+    bench = build_bench(SPEC, ANGLES[0])
+    for k, axis in enumerate("XYZ"):
+        turn = [0.0, 0.0, 0.0]
+        turn[k] = 0.1
+        placed = bench.assembly.place([{}, {axis_body(axis): Motion(rotate=(turn[0], turn[1], turn[2]))}])
+        from scipy.spatial.transform import Rotation
+
+        matrix = Rotation.from_rotvec(turn).as_matrix()
+        for unit in UNITS:
+            before, after = (placed.pose(mirror_body(unit), s) for s in (0, 1))
+            np.testing.assert_allclose(after.rotation, matrix @ before.rotation, atol=1e-14)
+            np.testing.assert_allclose(after.translation, matrix @ before.translation, atol=1e-14)
+            assert placed.pose(ccd_body(unit), 1) == placed.pose(ccd_body(unit), 0)
+
+
+def test_the_lens_is_a_collimator(backend: Backend) -> None:
+    # the beam at the mirror is flat to the lens's field curvature, and the pinhole's image falls on the CCD's middle
+    bench = build_bench(SPEC, ANGLES[1])
+    assert bench.focal_length == pytest.approx(0.5, abs=1e-6)
+    path = AutocollimatorPath(bench, backend)
+    position, _, _, valid = path.rays([{}])
+    assert valid.all()
+    middle = np.einsum("n,bnk->bk", path.nodes.share, position)[:, :2]
+    assert np.max(np.abs(middle)) < 0.05 * path.pitch
+    # every ray within the Airy radius
+    airy = 0.61 * SPEC.autocollimator.wavelength / bench.numerical_aperture
+    assert np.max(np.abs(position[..., :2])) < airy
+
+
+def test_a_larger_autocollimator_has_a_longer_focal_length(backend: Backend) -> None:
+    bench = build_bench(SPEC, ANGLES[0])
+    path = AutocollimatorPath(bench, backend)
+    turn = Motion(rotate=(2e-3, 0.0, 0.0))
+    grown = {autocollimator_body(1): Motion(scale=1e-3)}
+    position = path.rays([{}, {axis_body("X"): turn}, grown, {axis_body("X"): turn, **grown}])[0]
+    column = np.einsum("n,bnk->bk", path.nodes.share, position)[:4, 0]
+    assert column[1] - column[0] == pytest.approx(0.5 * math.tan(4e-3), rel=1e-3)
+    assert (column[3] - column[2]) / (column[1] - column[0]) - 1 == pytest.approx(1e-3, rel=0.02)
+
+
+def broken(tmp_path: Path, old: str, new: str) -> tuple[Path, int]:
+    """A copy of the file with one place changed, and the line of that place."""
+    text = FILE.read_text("utf-8")
+    assert text.count(old) == 1
+    path = tmp_path / "own.yaml"
+    path.write_text(text.replace(old, new), "utf-8")
+    return path, text[: text.index(old)].count("\n") + 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "words"),
+    [
+        ("small: 0.01 deg", "small: 0.01", "programme.small", ["without a unit"]),
+        ("thickness: 12 mm", "thickness: 12 deg", "autocollimator.lens.thickness", ["is a unit of an angle"]),
+        ("glass: N-BK7", "glass: N-BK8", "autocollimator.lens.glass", ["no such glass", "did you mean"]),
+        ("window: 64 ", "window: 3.5 ", "autocollimator.window", []),
+        ("window: 64 ", "window: 400 ", None, []),
+        (
+            "offset: [0 mm, 7.5 mm]",
+            "offset: [0 mm, 1 mm]",
+            "autocollimator.area_ccd.offset",
+            ["stands on the area CCD"],
+        ),
+        ("aperture: 40 mm, radius", "aperture: 90 mm, radius", "mirrors.aperture", ["run into each other", "80.3"]),
+        ("radius: 150 mm", "radius: 460 mm", "mirrors.radius", ["behind the autocollimator's lens"]),
+        ("focal_length: 670 ppm", "focal_length: -1 ppm", "errors.focal_length", ["outside the limits"]),
+        ("steps: 10 ", "steps: 0 ", "programme.steps", []),
+        (
+            "detector: autocollimator_ccd",
+            "detector: autocolimator_ccd",
+            "autocollimator.area_ccd.detector",
+            ["did you"],
+        ),
+        ("front_radius: 283.19552 mm", "front_radius: 30 mm", "autocollimator.lens.front_radius", ["too strongly"]),
+    ],
+)
+def test_mistakes(old: str, new: str, key: str | None, words: list[str], tmp_path: Path) -> None:
+    path, line = broken(tmp_path, old, new)
+    if key is None:  # a right file, so that the test's way of breaking it does not break it by itself
+        assert load_principle_experiment(path).spec != SPEC
+        return
+    with pytest.raises(InputError) as caught:
+        load_principle_experiment(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}:{line}: {key}: ")
+    for word in words:
+        assert word in message
+
+
+def test_a_misspelt_key_is_told(tmp_path: Path) -> None:
+    path, line = broken(tmp_path, "narrow: 15 deg", "narow: 15 deg")
+    with pytest.raises(InputError) as caught:
+        load_principle_experiment(path)
+    unknown = next(issue for issue in caught.value.issues if issue.key == ("programme", "narow"))
+    assert (unknown.line, unknown.suggestion) == (line, "narrow")
+
+
+def test_a_missing_key_is_told(tmp_path: Path) -> None:
+    path, _ = broken(tmp_path, "  axis_tilt: 10 arcsec", "  # gone")
+    with pytest.raises(InputError, match="'axis_tilt' is missing"):
+        load_principle_experiment(path)
+
+
+def test_an_unknown_name() -> None:
+    with pytest.raises(InputError, match="did you mean 'principle_experiment'"):
+        load_principle_experiment("principle_experimnt")

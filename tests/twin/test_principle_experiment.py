@@ -1,0 +1,280 @@
+"""The rendered principle experiment: ideal relations from images against the exact trace, the scatter against the
+sigmas that are stated, the errors of the bench, and the table.
+
+Chi-square tests have a false-alarm rate of 1e-4 each, two-sided; seeds are fixed, so that they pass or fail for good.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from analysis.autocollimator import exact_reading, mirror_rotation, relation_factor
+from optics.backend import Backend
+from optics.trace import BeamMissedError
+from optics.tree import Motion
+from scenes.load import load_principle_experiment
+from scenes.turntable import BenchErrorsSpec, PrincipleSetup
+from scenes.turntable_model import UNITS, autocollimator_body, axis_body, mirror_body
+from twin import principle_printed as printed
+from twin.autocollimator import window_pattern
+from twin.principle_checks import declared_spread, principle_checks, printed_mean_difference
+from twin.principle_experiment import Reader, run_principle_experiment, states_of, table_2, whole_programme
+from twin.principle_figure import write_principle_figure
+from twin.principle_table import PrincipleTable, Series
+
+ARCSEC = math.pi / 648000
+SETUP = load_principle_experiment()
+FALSE_ALARM = 1e-4
+
+
+@pytest.fixture(scope="module")
+def reader(backend: Backend) -> Reader:
+    return Reader(SETUP, backend)
+
+
+@pytest.fixture(scope="module")
+def benches(reader: Reader, backend: Backend) -> list[PrincipleTable]:
+    """Table 2 on five benches with all errors."""
+    return [run_principle_experiment(SETUP, backend, seed=seed, reader=reader) for seed in range(100, 105)]
+
+
+def with_errors(**sigmas: float) -> PrincipleSetup:
+    """The experiment with these errors of the bench and no others."""
+    zero = dict.fromkeys(BenchErrorsSpec.model_fields, 0.0)
+    errors = BenchErrorsSpec.model_construct(**{**zero, **sigmas})
+    return PrincipleSetup(SETUP.spec.model_copy(update={"errors": errors}), SETUP.detector)
+
+
+def scatter_agrees(squares: float, freedom: int) -> bool:
+    low, high = chi2.ppf([0.5 * FALSE_ALARM, 1 - 0.5 * FALSE_ALARM], freedom)
+    return bool(low < squares < high)
+
+
+def test_ideal_images_satisfy_the_relations(reader: Reader, backend: Backend) -> None:
+    series = whole_programme(SETUP.spec)
+    table = run_principle_experiment(SETUP, backend, series, ideal=True, reader=reader)
+    assert len(table.results) == 18
+    for result in table.results:
+        # exact to all orders, on both axes of both mirrors
+        assert np.max(np.abs(result.from_exact)) < 0.001 * ARCSEC
+        # what is left of the first-order relations is the second order, and that is there
+        s = result.series
+        between = 2 * s.half_angle
+        for unit in UNITS:
+            factor = relation_factor(s.axis, unit, between)
+            own = result.readings[unit - 1, :, 0 if s.axis == "X" else 1]
+            second_order = exact_reading(s.axis, s.angles, unit, between)[:, 0 if s.axis == "X" else 1]
+            left = second_order - factor * s.angles
+            assert np.max(np.abs(own - factor * s.angles - left)) < 0.001 * ARCSEC
+        if s.axis != "X":
+            cross = result.readings[1, -1, 0]
+            wanted = 0.5 * math.sin(between) * math.cos(between) * s.angles[-1] ** 2
+            assert abs(cross) == pytest.approx(wanted, abs=0.001 * ARCSEC)
+            assert wanted > 0.13 * ARCSEC  # so that this is no empty statement
+        if s.axis == "Z":
+            assert np.max(np.abs(result.readings[0])) < 0.001 * ARCSEC
+
+
+@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+def test_spots_lie_where_the_exact_trace_sends_them(axis: str, reader: Reader) -> None:
+    # no calibration in between: centroids of images against the mean of the traced rays, and eq. (1) on both
+    series = next(s for s in table_2(SETUP.spec) if s.axis == axis)
+    path = reader.path(series.half_angle)
+    states = states_of(SETUP.spec, series, None)[::5]
+    windows = path.windows(states)
+    mean = reader.detector.expected_dn(windows.photons, reader.exposure)
+    shape = windows.corner.shape
+    place = reader.place(mean.reshape(-1, *mean.shape[2:]), windows.corner.reshape(-1, 2))[0].reshape(shape)
+    position = path.rays(states)[0]
+    traced = np.einsum("n,bnk->bk", path.nodes.share, position[..., 1::-1]).reshape(shape)
+    shift = (place - place[:, :1]) * path.pitch
+    assert np.max(np.abs(shift - (traced - traced[:, :1]))) < 5e-4 * path.pitch
+    # eq. (1) with the paraxial focal length is good to the lens's distortion
+    reading = mirror_rotation(shift, path.bench.focal_length)[..., ::-1]
+    angles = np.array([0.0, *series.angles])[::5]
+    for unit in UNITS:
+        exact = exact_reading(axis, angles, unit, 2 * series.half_angle)
+        assert np.max(np.abs(reading[unit - 1] - exact)) < 5e-4 * angles[-1]
+
+
+def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None:
+    # one state seen 60 times: the only differences are the detectors' temporal noise
+    setup = with_errors()
+    windows = reader.path(math.radians(15)).windows([{axis_body("Y"): Motion(rotate=(0.0, 1e-3, 0.0))}])
+    count = 60
+    places, sigmas = [], []
+    for seed in range(count):
+        mean = reader.expose(windows, (7, seed), 3).mean(axis=2)
+        place, spots = reader.place(mean[:, 0], windows.corner[:, 0])
+        places.append(place)
+        sigmas.append(np.einsum("bkk->bk", spots.temporal_covariance))
+    residual = np.array(places) - np.mean(places, axis=0)
+    assert scatter_agrees(float(np.sum(residual**2 / np.mean(sigmas, axis=0))), 4 * (count - 1))
+    # and the whole reading, fixed pattern and zero included
+    result = run_principle_experiment(
+        setup, backend, [Series("X", math.radians(15), math.radians(0.003), 100)], 4, reader=reader
+    )["X"]
+    off = result.from_exact[..., 1:, :]
+    freedom = off.size - 4
+    # the reading at zero is common to all rows and drops out with their mean
+    spread = off - off.mean(axis=1, keepdims=True)
+    variance = 0.5 * result.sigma[:, 1:] ** 2
+    assert scatter_agrees(float(np.sum(spread**2 / variance)), freedom)
+    assert 0.003 * ARCSEC < np.max(result.sigma) < 0.05 * ARCSEC
+
+
+def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) -> None:
+    series = Series("X", math.radians(15), math.radians(0.002), 100)
+    setup = with_errors(reading=0.5 * ARCSEC, turntable_step=0.8 * ARCSEC)
+    result = run_principle_experiment(setup, backend, [series], 11, reader=reader)["X"]
+    off = result.from_exact[:, 1:, 0]
+    noise = np.mean(result.sigma**2) / 2
+    # the table's position is common to both mirrors, the unrest is not
+    difference = (off[0] - off[1]) - np.mean(off[0] - off[1])
+    assert scatter_agrees(float(np.sum(difference**2) / (2 * (0.5 * ARCSEC) ** 2 + 2 * noise)), 99)
+    common = 0.5 * (off[0] + off[1])
+    common = common - common.mean()
+    assert scatter_agrees(float(np.sum(common**2) / ((0.8 * ARCSEC) ** 2 + 0.5 * (0.5 * ARCSEC) ** 2)), 99)
+    # across it is the unrest alone
+    cross = result.from_exact[:, 1:, 1]
+    cross = cross - cross.mean(axis=1, keepdims=True)
+    assert scatter_agrees(float(np.sum(cross**2) / ((0.5 * ARCSEC) ** 2 + noise)), 198)
+
+
+def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend) -> None:
+    series = table_2(SETUP.spec)[0]
+    angle = series.angles[-1]
+
+    def last(**sigmas: float) -> tuple[np.ndarray, dict[str, Motion]]:
+        setup = with_errors(**sigmas)
+        result = run_principle_experiment(setup, backend, [series], 2, reader=reader)["X"]
+        return result.readings[:, -1], dict(states_of(setup.spec, series, 2)[-1])
+
+    limit = 6 * 0.015 * ARCSEC  # six sigma of the images
+    reading, state = last(focal_length=2e-3)
+    for k, unit in enumerate(UNITS):
+        growth = state[autocollimator_body(unit)].scale
+        assert abs(growth) > 1e-4
+        assert reading[k, 0] == pytest.approx(angle * (1 + growth), abs=limit)
+    reading, state = last(ccd_rotation=math.radians(0.5))
+    for k, unit in enumerate(UNITS):
+        roll = state[f"{autocollimator_body(unit)}/focal_plane/area_ccd"].rotate[2]
+        assert abs(roll) > math.radians(0.05)
+        # a detector turned by +r about Z sees the spot turned by -r: of +Y some is seen along +X, rows run along -X
+        assert reading[k] == pytest.approx([angle * math.cos(roll), -angle * math.sin(roll)], abs=limit)
+    reading, state = last(axis_tilt=math.radians(0.2))
+    turn = state[axis_body("X")].rotate
+    assert abs(turn[1]) > 1e-4 * angle
+    assert reading[0] == pytest.approx([turn[0], turn[1]], abs=limit)
+    # a mirror that leans keeps reading relative to its zero; its lean is in the state
+    reading, state = last(mirror_mount=math.radians(0.02))
+    assert abs(state[mirror_body(1)].rotate[0]) > 1e-5
+    assert reading[:, 0] == pytest.approx([angle, angle], abs=limit)
+
+
+def test_errors_are_drawn_as_large_as_declared() -> None:
+    e = SETUP.spec.errors
+    series = table_2(SETUP.spec)[0]
+    drawn: dict[str, list[float]] = {name: [] for name in BenchErrorsSpec.model_fields}
+    for seed in range(300):
+        zero, *_, last = states_of(SETUP.spec, series, seed)
+        turn = np.array(last[axis_body("X")].rotate)
+        drawn["turntable_step"].append(float(np.linalg.norm(turn) - series.angles[-1]))
+        drawn["axis_tilt"] += (turn[1:] / turn[0]).tolist()
+        for unit in UNITS:
+            root = autocollimator_body(unit)
+            drawn["focal_length"].append(last[root].scale)
+            drawn["reading"] += [*last[root].rotate[:2], *zero[root].rotate[:2]]
+            drawn["ccd_rotation"].append(last[f"{root}/focal_plane/area_ccd"].rotate[2])
+            drawn["mirror_mount"] += last[mirror_body(unit)].rotate[:2]
+    for name, values in drawn.items():
+        assert scatter_agrees(float(np.sum((np.array(values) / getattr(e, name)) ** 2)), len(values)), name
+
+
+def test_seeds(reader: Reader, backend: Backend) -> None:
+    first, again, other = (
+        run_principle_experiment(SETUP, backend, table_2(SETUP.spec)[:n], seed, reader=reader)
+        for n, seed in ((1, 1), (3, 1), (1, 2))
+    )
+    # a series does not depend on those run with it
+    assert np.array_equal(first["X"].readings, again["X"].readings)
+    assert not np.array_equal(first["X"].readings, other["X"].readings)
+
+
+def test_a_pixel_keeps_its_pattern_in_every_window(reader: Reader) -> None:
+    corner = np.array([[130, 190], [150, 180], [0, 0]])
+    pattern = window_pattern(reader.detector, corner, 64, 3, (9,))
+    np.testing.assert_array_equal(pattern.gain[0, 20:, : 64 - 10], pattern.gain[1, : 64 - 20, 10:])
+    assert np.std(pattern.gain) == pytest.approx(SETUP.detector.prnu, rel=0.05)
+    assert not np.array_equal(pattern.gain[0], window_pattern(reader.detector, corner, 64, 3, (8,)).gain[0])
+
+
+def test_too_large_a_turn_is_told(reader: Reader, backend: Backend) -> None:
+    with pytest.raises(BeamMissedError, match="does not fit on the area CCD"):
+        run_principle_experiment(
+            SETUP, backend, [Series("X", math.radians(15), math.radians(0.04), 10)], reader=reader, ideal=True
+        )
+
+
+def test_the_checks(backend: Backend) -> None:
+    said: list[str] = []
+    checks = {c.id: c for c in principle_checks(SETUP, backend, benches=1, progress=said.append)}
+    assert list(checks) == ["001.table2.x", "001.table2.y", "001.table2.z", "001.table2.z_columns"]
+    assert said
+    for axis in "XYZ":
+        check = checks[f"001.table2.{axis.lower()}"]
+        assert check.printed == printed.MEAN_DIFFERENCE[axis] == pytest.approx(printed_mean_difference(axis), abs=6e-7)
+        assert 0.05 < check.measured < 1.5
+        assert 0.05 < check.sigma < 0.4
+        assert check.unit == "arcsec"
+    same = checks["001.table2.z_columns"]
+    assert same.printed < 5e-7
+    assert same.measured == pytest.approx(720, abs=4)
+
+
+def test_declared_spread_is_that_of_rendered_benches(benches: list[PrincipleTable]) -> None:
+    # mean differences against the distribution without images: their mean within 4 sigma, none absurd
+    for series in table_2(SETUP.spec):
+        spread = declared_spread(SETUP.spec, series, 0.011 * ARCSEC / math.sqrt(2))
+        found = np.array([table[series.axis].mean_difference for table in benches])
+        assert abs(found.mean() - spread.mean()) < 4 * spread.std() / math.sqrt(len(found))
+        assert np.all((found > 0) & (found < np.quantile(spread, 0.9999) * 1.2))
+
+
+@pytest.mark.parametrize(
+    ("error", "sigma", "x", "z"),
+    [
+        # E|n| = sqrt(2 / pi) sigma; the mean angle is 360 arcsec, ten of eleven rows are turned
+        ("focal_length", 1e-3, math.sqrt(2) * 0.36, 0.36),
+        ("turntable_step", ARCSEC, 0.0, 10 / 11),
+        ("reading", ARCSEC, 2.0, math.sqrt(2) * 2 / math.sqrt(3)),
+    ],
+)
+def test_declared_spread_of_single_errors(error: str, sigma: float, x: float, z: float) -> None:
+    spec = with_errors(**{error: sigma}).spec
+    for series, wanted in zip(table_2(spec)[::2], (x, z), strict=True):
+        mean = declared_spread(spec, series, 0.0).mean() / ARCSEC
+        assert mean == pytest.approx(math.sqrt(2 / math.pi) * wanted, rel=0.05, abs=1e-3)
+
+
+def test_the_table_as_the_paper_prints_it(reader: Reader, benches: list[PrincipleTable], tmp_path: Path) -> None:
+    table = benches[0]
+    plain = table.to_dict()
+    assert [s["axis"] for s in plain["series"]] == ["X", "Y", "Z"]
+    assert [s["mirror_2_scale"] for s in plain["series"]] == pytest.approx([1, 2 / math.sqrt(3), 2 / math.sqrt(3)])
+    for series in plain["series"]:
+        angles = [row["angle_arcsec"] for row in series["rows"]]
+        assert angles == pytest.approx(printed.ANGLES)
+        for row in series["rows"]:
+            assert row["scaled_mirror_2_arcsec"] == pytest.approx(row["angle_arcsec"], abs=3)
+            wanted = 0.0 if series["axis"] == "Z" else row["angle_arcsec"]
+            assert row["mirror_1_arcsec"] == pytest.approx(wanted, abs=3)
+    assert len(table.text().splitlines()) == 13
+    with pytest.raises(KeyError):
+        table["W"]
+    place = tmp_path / "principle.png"
+    write_principle_figure(reader, benches, place)
+    assert place.read_bytes().startswith(b"\x89PNG")
