@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -20,18 +17,15 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 from analysis.recovery import ESTIMATORS
-from optics.backend import NAMES, BackendUnavailable, load_backend
-from optics.llvm import LibraryMissing
-from scenes.errors import InputError
+from optics.backend import load_backend
 from scenes.resolved import ResolvedJob, resolve
+from twin.cli import BACKEND_HELP, LARGEST_SEED, check_backend, exit_on_terminate, explained
 from twin.output import write_run
 from twin.render_job import STAGES, render_job
 from twin.results import RenderRun
-from twin.run_folder import RunFolder, RunFolderError, next_free
+from twin.run_folder import RunFolder, next_free
 
 WRITE = "write the run folder"
-BAD_INPUT, FAILURE, INTERRUPTED, TERMINATED = 2, 1, 130, 143
-LARGEST_SEED = 2**63 - 1
 LABELS = {
     "d_alpha_arcsec": ('d_alpha "', 4),
     "d_beta_arcsec": ('d_beta "', 4),
@@ -61,7 +55,7 @@ def main(
     frames: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Frames per state; overrides the file's.")
     ] = None,
-    backend: Annotated[str, typer.Option(help=f"Where to trace: {' or '.join(NAMES)}.")] = "llvm",
+    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
     force: Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print truth and recovered as JSON on stdout, and nothing else.")
@@ -90,30 +84,16 @@ def main(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     errors = Console(stderr=True)
-    try:
-        if backend not in NAMES:
-            raise InputErrorText(f"unknown backend {backend!r}; choose {' or '.join(NAMES)}")
+    with explained(errors):
+        check_backend(backend)
         resolved = resolve(job)
         folder = RunFolder(out if out is not None else next_free(Path("runs"), job.stem), force)
         run = _run(folder, resolved, backend, frames, seed, silent=as_json or quiet, errors=errors)
-    except (InputError, InputErrorText, RunFolderError) as error:
-        errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
-        raise typer.Exit(BAD_INPUT) from None
-    except (BackendUnavailable, LibraryMissing) as error:
-        errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
-        raise typer.Exit(FAILURE) from None
-    except KeyboardInterrupt:
-        errors.print("interrupted: nothing was kept", style="bold red")
-        raise typer.Exit(INTERRUPTED) from None
     if as_json:
         json.dump({"truth": run.truth_dict(), "recovered": run.recovered_dict()}, sys.stdout, allow_nan=False)
         sys.stdout.write("\n")
     elif not quiet:
         _print_result(run, folder.target)
-
-
-class InputErrorText(Exception):
-    """Bad input that has no file to point at."""
 
 
 def _run(
@@ -136,7 +116,7 @@ def _run(
     )
     tracer = load_backend(backend)
     hidden = silent or not errors.is_terminal
-    with _exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
+    with exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
         task = bar.add_task("start", total=len(STAGES) + 1)
 
         def stage(name: str) -> None:
@@ -147,23 +127,6 @@ def _run(
         write_run(run, folder, started, time.monotonic() - clock)
         bar.update(task, completed=len(STAGES) + 1)
     return run
-
-
-@contextmanager
-def _exit_on_terminate() -> Iterator[None]:
-    """Let SIGTERM end the program as an exception, so that a half-written run folder is removed."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def leave(number: int, frame: object) -> None:
-        raise SystemExit(TERMINATED)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _print_result(run: RenderRun, target: Path) -> None:

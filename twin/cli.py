@@ -1,0 +1,72 @@
+"""What the commands share: exit codes, errors as one sentence, and an orderly end on SIGTERM."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+
+from optics.backend import NAMES, BackendUnavailable
+from optics.llvm import LibraryMissing
+from scenes.errors import InputError
+from twin.run_folder import RunFolderError
+
+FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+LARGEST_SEED = 2**63 - 1
+BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
+
+
+class InputErrorText(Exception):
+    """Bad input that has no file to point at."""
+
+
+def check_backend(name: str) -> None:
+    """Complain about an unknown backend before anything is started.
+
+    Raises:
+        InputErrorText: there is none of that name.
+    """
+    if name not in NAMES:
+        raise InputErrorText(f"unknown backend {name!r}; choose {' or '.join(NAMES)}")
+
+
+@contextmanager
+def explained(errors: Console) -> Iterator[None]:
+    """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code."""
+    try:
+        yield
+    except (InputError, InputErrorText, RunFolderError) as error:
+        print_error(errors, str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    except (BackendUnavailable, LibraryMissing) as error:
+        print_error(errors, str(error))
+        raise typer.Exit(FAILURE) from None
+    except KeyboardInterrupt:
+        errors.print("interrupted: nothing was kept", style="bold red")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def print_error(errors: Console, text: str) -> None:
+    """One error message, as it is: no markup, no wrapping."""
+    errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def exit_on_terminate() -> Iterator[None]:
+    """Let SIGTERM end the program as an exception, so that a half-written run folder is removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def leave(number: int, frame: object) -> None:
+        raise SystemExit(TERMINATED)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,207 @@
+"""``python -m twin.validate``: the source papers' formulas and numbers, one by one, against the simulation."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
+from rich.table import Column, Table
+from rich.text import Text
+
+from optics.backend import load_backend
+from twin.cli import BACKEND_HELP, FAILURE, LARGEST_SEED, InputErrorText, check_backend, exit_on_terminate, explained
+from twin.run_folder import RunFolder
+from twin.validation import registry
+from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, Verdict
+from twin.validation.output import write_validation
+from twin.validation.registry import Selection, UnknownCheck, select
+from twin.validation.report import measured_text, printed_text, sigma_text
+from twin.validation.runner import Validation, rough_seconds, run_checks
+
+STYLES: dict[Verdict, str] = {AGREES: "green", DIFFERS: "cyan", DOUBTFUL: "yellow", FAILED: "bold red"}
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    only: Annotated[
+        str | None,
+        typer.Option(help="Check ids or their beginnings, separated by commas, e.g. 001.eq1,001.table1. Default: all."),
+    ] = None,
+    list_checks: Annotated[
+        bool, typer.Option("--list", help="Print the ids with their statements and rough times; run nothing.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(readable=False, help="Run folder to make. Default: nothing is written.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise.")] = 1,
+    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
+    force: Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print validation.json (or the list) on stdout, and nothing else.")
+    ] = False,
+) -> None:
+    """Check what the source papers print, formula by formula and number by number, by simulation.
+
+    Every check has a dotted id that begins with the paper's number, a tolerance that is fixed beforehand, and a
+    verdict that follows from the numbers:
+
+    - **agrees**: the simulation gives the printed value within the tolerance plus three sigma.
+
+    - **differs**: it does not; the printed maths may be sound, but the simulated instrument is another one than the
+    paper assumes, or the cause is not known.
+
+    - **paper doubtful**: it does not, and it does give the value that follows when a named fault or ambiguity of the
+    printed maths is put right.
+
+    - **failed**: the check could not be computed; this says nothing about the paper.
+
+    The run folder gets validation.json, a self-contained report.html, and figures and tables in artefacts/.
+
+    Exit codes: 0 all checks ran, whatever their verdict; 1 a check failed, or the backend cannot be used; 2 bad
+    input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is left behind.
+    """
+    errors = Console(stderr=True)
+    with explained(errors):
+        check_backend(backend)
+        try:
+            selections = select(registry.GROUPS, only)
+        except UnknownCheck as error:
+            raise InputErrorText(str(error)) from error
+        if list_checks:
+            _print_list(selections, as_json)
+            return
+        folder = None if out is None else RunFolder(out, force)
+        with exit_on_terminate():
+            validation = _run(selections, backend, seed, only, folder, errors)
+    if as_json:
+        _print_json(validation.to_dict())
+    else:
+        _print_result(validation, None if folder is None else folder.target)
+    for result in validation.results:
+        if result.verdict == FAILED:
+            text = f"{result.id} failed: {result.how}"
+            errors.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
+    if validation.failed:
+        raise typer.Exit(FAILURE)
+
+
+def _run(
+    selections: Sequence[Selection],
+    backend: str,
+    seed: int,
+    only: str | None,
+    folder: RunFolder | None,
+    errors: Console,
+) -> Validation:
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
+        BarColumn(bar_width=14),
+        TimeElapsedColumn(),
+        _TimeLeft(),
+    )
+    tracer = load_backend(backend)
+    with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
+        task = bar.add_task("start", total=rough_seconds(selections))
+
+        def show(done: float, text: str) -> None:
+            bar.update(task, completed=done, description=text)
+
+        if folder is None:
+            return run_checks(selections, tracer, seed, only, show)
+        with folder:
+            validation = run_checks(selections, tracer, seed, only, show, folder.path)
+            show(rough_seconds(selections), "write the run folder")
+            write_validation(validation, folder)
+        return validation
+
+
+class _TimeLeft(ProgressColumn):
+    """Time left: the groups' rough seconds, corrected by the pace so far."""
+
+    def render(self, task: Task) -> Text:
+        """Minutes and seconds."""
+        left = task.remaining or 0.0
+        if task.elapsed and task.completed > 0.05 * (task.total or 0.0):
+            left *= task.elapsed / task.completed
+        minutes, seconds = divmod(round(left), 60)
+        return Text(f"about {minutes}:{seconds:02d} left", style="cyan", no_wrap=True)
+
+
+def _print_json(data: Any) -> None:
+    json.dump(data, sys.stdout, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def _print_list(selections: Sequence[Selection], as_json: bool) -> None:
+    """Ids, statements and rough times of the selected checks."""
+    if as_json:
+        rows = [
+            {
+                "id": check.id,
+                "paper": check.paper,
+                "equation": check.equation,
+                "statement": check.statement,
+                "printed": check.printed,
+                "unit": check.unit,
+                "tolerance": check.tolerance,
+                "group": selection.group.prefix,
+                "group_seconds": selection.group.seconds,
+            }
+            for selection in selections
+            for check in selection.group.checks
+            if check.id in selection.ids
+        ]
+        _print_json({"checks": rows})
+        return
+    console = Console()
+    for selection in selections:
+        group = selection.group
+        console.print(
+            f"{group.prefix}: {group.title} (together about {group.seconds:g} s)",
+            style="bold", markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+        for check in group.checks:
+            if check.id in selection.ids:
+                console.print(
+                    f"  {check.id}  {check.equation}: {check.statement}", markup=False, highlight=False, soft_wrap=True
+                )
+
+
+def _print_result(validation: Validation, target: Path | None) -> None:
+    """Every check in a line, and where to read more."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("check", no_wrap=True)
+    table.add_column("printed", justify="right", no_wrap=True)
+    table.add_column("measured", justify="right", no_wrap=True)
+    table.add_column("sigma", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for r in validation.results:
+        unit = "" if r.unit == "1" else r.unit
+        cells = (r.id, printed_text(r), measured_text(r), sigma_text(r), unit)
+        table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
+    console = Console()
+    # a number that is cut is worse than a line that wraps
+    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
+    console.print(table)
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in validation.counts.items() if count)
+    number = len(validation.results)
+    console.print(f"{number} check{'' if number == 1 else 's'}: {counts}", markup=False, highlight=False)
+    if target is None:
+        console.print("How each was done: --out DIR writes a report, --json prints it.", style="dim", soft_wrap=True)
+    else:
+        console.print(f"report: {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,77 @@
+"""All groups of checks, and how they are selected by the beginnings of their ids."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from scenes.errors import nearest
+from twin.validation import formulas_001
+from twin.validation.group import CheckGroup, matches
+
+GROUPS: tuple[CheckGroup, ...] = (formulas_001.GROUP,)
+"""Every group, in the order in which they run. A new one is added here."""
+
+
+class UnknownCheck(Exception):
+    """A prefix under which there is no check; the message names the nearest."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A group and those of its ids that are wanted."""
+
+    group: CheckGroup
+    ids: frozenset[str]
+
+
+def require_unique(groups: Iterable[CheckGroup]) -> None:
+    """Refuse groups or ids that come twice.
+
+    Raises:
+        ValueError: one does.
+    """
+    groups = tuple(groups)
+    names = Counter(group.prefix for group in groups)
+    ids = Counter(identifier for group in groups for identifier in group.ids)
+    twice = [name for counter in (names, ids) for name, count in counter.items() if count > 1]
+    if twice:
+        raise ValueError(f"registered twice: {', '.join(twice)}")
+
+
+def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, ...]:
+    """The groups, with the ids that lie under one of the prefixes; all where ``only`` is None.
+
+    Args:
+        groups: all there are.
+        only: prefixes, separated by commas, that end where a part of an id ends.
+
+    Raises:
+        UnknownCheck: there is nothing under one of them.
+    """
+    require_unique(groups)
+    ids = [identifier for group in groups for identifier in group.ids]
+    if only is None:
+        return tuple(Selection(group, frozenset(group.ids)) for group in groups)
+    prefixes = [part.strip() for part in only.split(",")]
+    for prefix in prefixes:
+        if not any(matches(identifier, prefix) for identifier in ids):
+            raise UnknownCheck(_unknown(prefix, ids))
+    out = []
+    for group in groups:
+        chosen = frozenset(i for i in group.ids if any(matches(i, prefix) for prefix in prefixes))
+        if chosen:
+            out.append(Selection(group, chosen))
+    return tuple(out)
+
+
+def _unknown(prefix: str, ids: Sequence[str]) -> str:
+    """What is wrong with a prefix, and what was meant."""
+    if not prefix:
+        return "an empty id; --only takes ids or their beginnings, separated by commas, and --list shows them"
+    # everything that could have been given; whole parts only
+    known = {".".join(parts[:n]): None for i in ids for parts in [i.split(".")] for n in range(1, len(parts) + 1)}
+    bare = prefix.strip(".")
+    meant = bare if bare in known else nearest(bare, known)
+    return f"no check {prefix!r}; " + (f"did you mean {meant!r}? " if meant else "") + "--list shows all"

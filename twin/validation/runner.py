@@ -1,0 +1,220 @@
+"""Run the selected groups of checks; one that fails is reported and does not stop the others."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from optics.backend import Backend
+from twin.experiment import MonitorExperiment
+from twin.validation.artefact import Artefact
+from twin.validation.check import FAILED, VERDICTS, CheckResult, Verdict
+from twin.validation.group import CheckGroup, Context
+from twin.validation.registry import Selection
+from twin.versions import versions
+
+FILES = "artefacts"
+"""Folder, in the run folder, of what the groups add; each has a folder of its prefix there."""
+
+Progress = Callable[[float, str], None]
+"""Takes the rough seconds of work that are done, of ``rough_seconds``, and what is being done."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroupRun:
+    """What a group gave: results in the order of its checks, artefacts, the time it took, and files it wrote itself."""
+
+    group: CheckGroup
+    results: tuple[CheckResult, ...]
+    artefacts: tuple[Artefact, ...]
+    seconds: float
+    files: tuple[str, ...] = ()
+
+    def place(self, artefact: Artefact) -> str:
+        """Path of an artefact in the run folder."""
+        return f"{FILES}/{self.group.prefix}/{artefact.name}.{artefact.kind}"
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """What a validation found.
+
+    Attributes:
+        runs: group by group.
+        backend, seed: what it ran with.
+        only: the selection as it was given, None for everything.
+        started: time of the start, seconds since the epoch.
+        seconds: computing time.
+        written: whether it goes into a run folder.
+    """
+
+    runs: tuple[GroupRun, ...]
+    backend: str
+    seed: int
+    only: str | None
+    started: float
+    seconds: float
+    written: bool = False
+
+    @property
+    def results(self) -> tuple[CheckResult, ...]:
+        """All results, sorted by paper and else in the order of the groups."""
+        return tuple(sorted((r for run in self.runs for r in run.results), key=lambda r: r.paper))
+
+    @property
+    def counts(self) -> dict[Verdict, int]:
+        """Verdict -> how many checks have it."""
+        return {verdict: sum(r.verdict == verdict for r in self.results) for verdict in VERDICTS}
+
+    @property
+    def failed(self) -> bool:
+        """Whether any check could not be computed."""
+        return self.counts[FAILED] > 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for validation.json."""
+        return {
+            "checks": [result.to_dict() for result in self.results],
+            "counts": dict(self.counts),
+            "verdicts": dict(VERDICTS),
+            "groups": [
+                {
+                    "prefix": run.group.prefix,
+                    "title": run.group.title,
+                    "seconds": run.seconds,
+                    "artefacts": [
+                        {"name": a.name, "title": a.title, "file": run.place(a) if self.written else None}
+                        for a in run.artefacts
+                    ],
+                    "files": list(run.files),
+                }
+                for run in self.runs
+            ],
+            "only": self.only,
+            "seed": self.seed,
+            "backend": self.backend,
+            "versions": versions(),
+            "started_unix_s": self.started,
+            "wall_time_s": self.seconds,
+        }
+
+
+def rough_seconds(selections: Sequence[Selection]) -> float:
+    """About how long these groups take."""
+    return sum(selection.group.seconds for selection in selections)
+
+
+def run_checks(
+    selections: Sequence[Selection],
+    backend: Backend,
+    seed: int,
+    only: str | None = None,
+    progress: Progress = lambda done, text: None,
+    folder: Path | None = None,
+) -> Validation:
+    """Run the groups one after the other.
+
+    Args:
+        selections: the groups with their wanted ids.
+        backend: where to trace.
+        seed: of all noise.
+        only: the selection as the user gave it, kept in the results.
+        progress: called whenever a group gets on.
+        folder: the open run folder, None when nothing is written.
+    """
+    started, clock = time.time(), time.monotonic()
+    experiments: dict[str, MonitorExperiment] = {}
+    runs = []
+    done = 0.0
+    for selection in selections:
+        share = _Share(progress, done, selection.group)
+        runs.append(_run_group(selection, backend, seed, share, folder, experiments))
+        done += selection.group.seconds
+    progress(done, "done")
+    took = time.monotonic() - clock
+    return Validation(tuple(runs), backend.name, seed, only, started, took, written=folder is not None)
+
+
+@dataclass(frozen=True)
+class _Share:
+    """A group's own share of the progress."""
+
+    progress: Progress
+    start: float
+    group: CheckGroup
+
+    def __call__(self, fraction: float, text: str) -> None:
+        self.progress(self.start + fraction * self.group.seconds, f"{self.group.prefix}: {text}")
+
+
+def _run_group(
+    selection: Selection,
+    backend: Backend,
+    seed: int,
+    share: _Share,
+    folder: Path | None,
+    experiments: dict[str, MonitorExperiment],
+) -> GroupRun:
+    group = selection.group
+    own = None if folder is None else folder / FILES / group.prefix
+    if own is not None:
+        own.mkdir(parents=True)
+    checks = {check.id: check for check in group.checks}
+    context = Context(backend, seed, selection.ids, checks, share, own, experiments)
+    found: dict[str, CheckResult] = {}
+    begin = last = time.monotonic()
+    why = "the group gave no result for it"
+    share(0.0, "start")
+    try:
+        for result in group.run(context):
+            now = time.monotonic()
+            _keep(result.timed(now - last), found, group, selection.ids)
+            last = now
+    except Exception as error:
+        why = _sentence(error)
+    results = []
+    for check in group.checks:
+        if check.id in found:
+            results.append(found[check.id])
+        elif check.id in selection.ids:
+            results.append(check.failed(why).timed(time.monotonic() - last))
+            last = time.monotonic()
+    files = _files(own)
+    return GroupRun(group, tuple(results), tuple(context.artefacts), time.monotonic() - begin, files)
+
+
+def _keep(result: CheckResult, found: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
+    """File a result.
+
+    Raises:
+        ValueError: the group has no such check, or has answered it before.
+    """
+    if result.id not in group.ids:
+        raise ValueError(f"the group {group.prefix} answered {result.id}, which it does not hold")
+    if result.id in found:
+        raise ValueError(f"the group {group.prefix} answered {result.id} twice")
+    if result.id in wanted:
+        found[result.id] = result
+
+
+def _sentence(error: Exception) -> str:
+    """An error and where it was raised, for a reader of the report."""
+    text = " ".join(str(error).split()) or "no message"
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {text} (in {place.name}, {Path(place.filename).name}:{place.lineno})"
+
+
+def _files(own: Path | None) -> tuple[str, ...]:
+    """Files that the group put into its folder, relative to the run folder; an empty folder is removed."""
+    if own is None:
+        return ()
+    files = tuple(sorted(p.relative_to(own.parents[1]).as_posix() for p in own.rglob("*") if p.is_file()))
+    if not files:
+        for place in (own, own.parent):
+            if not any(place.iterdir()):
+                place.rmdir()
+    return files
