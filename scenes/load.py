@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from scenes.camera import CameraSpec
 from scenes.detector import DetectorSpec
+from scenes.error_budget import ErrorBudgetSpec
 from scenes.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
@@ -22,7 +23,7 @@ SpecType = TypeVar("SpecType", bound=Spec)
 LIBRARY = Path(__file__).resolve().parent
 EXAMPLES = LIBRARY / "examples"
 CAMERAS, INSTRUMENTS, DETECTORS = "cameras", "instruments", "detectors"
-LAB = "lab"
+LAB, BUDGETS = "lab", "budgets"
 
 
 def library_names(folder: str) -> tuple[str, ...]:
@@ -49,6 +50,13 @@ def instrument_path(job: JobSpec) -> Path:
         InputError: there is none, said with the line of the job's file.
     """
     return _find(INSTRUMENTS, job.instrument, job, ("instrument",))
+
+
+def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
+    """Read an error budget: a name in scenes/budgets, or a path. Raises InputError as `load_job`."""
+    path = Path(name_or_path)
+    own = "/" in str(name_or_path) or path.suffix in (".yaml", ".yml")
+    return validate(ErrorBudgetSpec, read_yaml(path if own else LIBRARY / BUDGETS / f"{name_or_path}.yaml"))
 
 
 def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = None) -> InstrumentSpec:

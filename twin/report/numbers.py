@@ -34,7 +34,7 @@ def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool =
     """A number with some significant digits, one less where a power of ten is written; below ``floor`` it is 0."""
     if not math.isfinite(value):
         return "\N{EM DASH}"
-    if abs(value) < floor:
+    if value == 0.0 or abs(value) < floor:
         return "0"
     value = float(f"{value:.{digits - 1}e}")
     size = math.floor(math.log10(abs(value)))
