@@ -36,6 +36,10 @@ LINES = (
 )
 """Table 3's seven lines, in the paper's order."""
 
+ALLOWED = 0.1 * ARCSEC
+"""Error of one line that the inverse view asks for, 3 sigma, radians."""
+_SEARCH_STEPS = 4
+
 PARAMETER_FIELDS = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
 
 Progress = Callable[[float, str], None]
@@ -211,14 +215,22 @@ class ErrorBudget:
         return out
 
     def _centroid_line(self) -> BudgetLine:
-        """Scatter of the paper's energy centroid in single frames, and how it goes with the light."""
+        """Scatter of the paper's energy centroid in single frames, and the light at which it is 0.1 arcsec.
+
+        Between shot noise and read noise the scatter follows no power of the light: the allowed light is searched for.
+        """
+        scatter = self._centroid_scatter(1.0)
+        target = np.log(ALLOWED / (3.0 * self.radians_per_pixel))
+        share, size = [0.0, -np.log(2.0)], [np.log(np.std(scatter))]
+        for _ in range(_SEARCH_STEPS):  # secants in the logarithms
+            size.append(np.log(np.std(self._centroid_scatter(float(np.exp(share[-1]))))))
+            slope = (size[-1] - size[-2]) / (share[-1] - share[-2])
+            share.append(share[-1] + (target - size[-1]) / slope)
         light = self.spec.photons_per_frame
-        full, half = (self._centroid_scatter(share) for share in (1.0, 0.5))
-        power = -float(np.log2(np.std(half) / np.std(full)))
-        return self._line("centroid", full, light, "photons per frame", power)
+        return self._line("centroid", scatter, light, "photons per frame", light * float(np.exp(share[-1])))
 
     def _centroid_scatter(self, light: float) -> np.ndarray:
-        """Energy centroids of single frames about their mean, px, (frames, C, 2), with a share of the budget's light."""
+        """Energy centroids of single frames about their mean, px, (frames, C, 2), at a share of the light."""
         count = max(self.spec.trials, 2)
         setup, stream = self.experiment, np.random.SeedSequence(self.seed, spawn_key=(8,))
         pattern = setup.pattern(self.seed)
@@ -230,12 +242,12 @@ class ErrorBudget:
             position = measure_spots(flat, 1, setup.calibration, "energy", cores()).position.reshape(count, spots, 2)
         return np.asarray((position - position.mean(axis=0)) * np.sqrt(count / (count - 1.0)))
 
-    def _line(self, name: str, shifts: np.ndarray, value: float, unit: str, power: float = 1.0) -> BudgetLine:
-        """Statistics of spot displacements (S, C, 2), px; the line goes with ``value ** power``."""
+    def _line(self, name: str, shifts: np.ndarray, value: float, unit: str, allowed: float | None = None) -> BudgetLine:
+        """Statistics of spot displacements (S, C, 2), px; a line without ``allowed`` is proportional to its input."""
         angle = self.radians_per_pixel * shifts
         three_sigma, sigma = _three_sigma(angle)
         axes = 3.0 * np.sqrt(np.mean(angle**2, axis=(0, 1)))
-        allowed = value * (0.1 * ARCSEC / three_sigma) ** (1.0 / power)
+        allowed = value * ALLOWED / three_sigma if allowed is None else allowed
         return BudgetLine(name, three_sigma, sigma, (float(axes[0]), float(axes[1])), value, unit, float(allowed))
 
     def together(self, progress: Progress = lambda fraction, text: None) -> Together:

@@ -18,7 +18,7 @@ from twin.validation.group import CheckGroup, Context
 BUDGET = "monitor_pair"
 FRAMES_OF_TABLE_4 = 9
 
-_INPUTS = "20 %: the paper prints two digits and none of its inputs; ours are stated to two digits"
+_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/budgets, are chosen for its Table 3"
 _LINES = {
     "centroid": ("Energy centre of one image", 0.021),
     "coordinate_thermal": ("Thermal distortion of the coordinate system (recorder's board)", 0.018),
@@ -122,7 +122,7 @@ def _totals(context: Context, budget: ErrorBudget, lines: dict[str, BudgetLine])
         size = _UNIT[unit]
         values = {e: tuple(v / size for v in p[field]) for e, p in together.parameters.items()}
         single = values["paper_single"]
-        rows.append([f"{text} [{unit}]", printed, round(formula[name] / size, 4),
+        rows.append([f"{text} [{unit}]", f"{printed:g}", f"{formula[name] / size:.3g}",
                      *(f"{values[e][0]:.4g} ± {values[e][1]:.2g}" for e in _SHOWN)])  # fmt: skip
         if f"001.table5.{name}" in context.selected:
             how = (
@@ -168,7 +168,7 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     rows: list[list[Cell]] = []
     for name, line in lines.items():
         text, printed = _LINES[name]
-        rows.append([text, printed, round(line.three_sigma / ARCSEC, 4), round(line.sigma / ARCSEC, 4),
+        rows.append([text, f"{printed:g}", f"{line.three_sigma / ARCSEC:.4f}", f"{line.sigma / ARCSEC:.4f}",
                      f"{line.value:.4g} {line.unit}", f"{line.allowed:.3g} {line.unit}"])  # fmt: skip
     context.add(
         Table(
