@@ -1,0 +1,105 @@
+"""Small scenes for the path tracer's tests: glass bodies, mirrors and screens, made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optics.aperture import Circle
+from optics.assembly import Assembly
+from optics.element import Element, Interaction
+from optics.finish import ABSORBER, BARE, Finish
+from optics.pose import Pose
+from optics.rotation import rotation_matrix
+from optics.solid import Coating, Face, Solid
+from optics.surface import plane
+from optics.system import assemble
+from optics.tree import Body, RigidTree
+from scenes.camera_model import LINE_AXIS, collimated, field_direction
+from scenes.scene_surface import Detector, Finishes, SceneSurface, detector_surface, mirror_surface, solid_surfaces
+from scenes.scenery import Scenery
+
+PERFECT = Finish(records=True)
+"""A detector that records all of its light."""
+
+
+def frame(normal: tuple[float, float, float], point: tuple[float, float, float]) -> Pose:
+    """A face's pose: +z along the normal."""
+    z = np.array(normal, float) / np.linalg.norm(normal)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return Pose(np.stack([x, np.cross(z, x), z], axis=-1), np.array(point, float))
+
+
+def slab(half: float, thickness: float, sides: Coating = Coating.GROUND) -> Solid:
+    """A plane-parallel plate from z = 0 to z = thickness."""
+    faces = [
+        Face("entry", "glass", Coating.TRANSMITTING, frame((0, 0, -1), (0, 0, 0))),
+        Face("exit", "glass", Coating.TRANSMITTING, frame((0, 0, 1), (0, 0, thickness))),
+    ]
+    for k, (x, y) in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1)]):
+        faces.append(Face(f"side{k}", "glass", sides, frame((x, y, 0), (half * x, half * y, 0))))
+    return Solid("glass", "N-BK7", tuple(faces))
+
+
+def right_angle_prism(half: float) -> Solid:
+    """Light enters along +z at z = -half, is turned to +x by total reflection and leaves at x = half."""
+    return Solid(
+        "glass",
+        "N-BK7",
+        (
+            Face("entry", "glass", Coating.TRANSMITTING, frame((0, 0, -1), (0, 0, -half))),
+            Face("hypotenuse", "glass", Coating.TOTAL, frame((-1, 0, 1), (0, 0, 0))),
+            Face("exit", "glass", Coating.TRANSMITTING, frame((1, 0, 0), (half, 0, 0))),
+            Face("side_a", "glass", Coating.GROUND, frame((0, 1, 0), (0, half, 0))),
+            Face("side_b", "glass", Coating.GROUND, frame((0, -1, 0), (0, -half, 0))),
+        ),
+    )
+
+
+def screen(name: str, pose: Pose, half: float, pixels: int = 10) -> tuple[SceneSurface, Detector]:
+    """A perfect detector that looks along its +z."""
+    grid = Detector(name, pixels, pixels, (2.0 * half / pixels, 2.0 * half / pixels))
+    return detector_surface(grid, pose, Finishes(detector=PERFECT, board=ABSORBER)), grid
+
+
+def facing(z: float) -> Pose:
+    """Pose of a screen at z that looks toward -z."""
+    return Pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, z]))
+
+
+def glass_scene(
+    solid: Solid,
+    index: float,
+    coated: Finish = BARE,
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    far: float = 0.5,
+) -> Scenery:
+    """One glass body at the origin between two large screens: ``front`` at z = -far, ``behind`` at z = far."""
+    tree = RigidTree((Body("glass", Pose(rotation_matrix(np.array(turn)), np.zeros(3))),))
+    assembly = Assembly(tree, {}, {}, {"glass": index})
+    faces = solid_surfaces(solid, assembly, assembly.place(), {}, Finishes(coated=coated, ground=ABSORBER))
+    behind, front = (
+        screen("behind", facing(far), 1.0),
+        screen("front", Pose(np.eye(3), np.array([0.0, 0.0, -far])), 1.0),
+    )
+    return Scenery((*faces, behind[0], front[0]), (behind[1], front[1]))
+
+
+def flat_mirror(finish: Finish, radius: float = 0.1) -> tuple[SceneSurface, ...]:
+    """A flat mirror in z = 0, lit from +z."""
+    element = Element("mirror", "mirror", plane(), Interaction.REFLECT, Circle(radius))
+    placed = Assembly(RigidTree((Body("mirror"),)), {"mirror": element}, {}).place()
+    return (mirror_surface(element, placed, Finishes(mirror=finish, mirror_back=ABSORBER)),)
+
+
+def scene_beam(instrument, backend, x: float = 0.0, y: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middle of the beam of a field in front of the forward camera, its direction and two axes across, world."""
+    model = instrument.cameras["forward"]
+    direction = field_direction(model.spec, x, y)
+    to_stop = assemble(model.bare_assembly(False), [model.mirrors[:2]])
+    middle = collimated(backend, to_stop, direction[None], np.zeros((1, 2)))[0, 0]
+    to_world = instrument.assembly.nominal_pose("base/forward") @ model.camera_frame.inverse()
+    heading = to_world.rotation @ direction
+    first = to_world.rotation @ (LINE_AXIS - (LINE_AXIS @ direction) * direction)
+    first /= np.linalg.norm(first)
+    return to_world.apply(middle), heading, np.stack([first, np.cross(heading, first)])

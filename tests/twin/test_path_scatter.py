@@ -1,0 +1,150 @@
+"""Scattered directions of the path tracer against the BSDF, by chi-square with a false-alarm rate of 1e-3 each."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.integrate import dblquad
+from scipy.stats import chi2
+
+from optics.finish import ABSORBER, Finish
+from optics.pose import Pose
+from optics.scatter import ABg, HarveyShack, total_scatter
+from scenes.scenery import Scenery
+from tests.optics.bench import unit
+from tests.twin.path_bench import flat_mirror, screen
+from twin.path_tracing.events import Event
+from twin.path_tracing.integrator import Sampling
+from twin.path_tracing.shading import Leaving, spread
+from twin.path_tracing.source import DiskSource, random_streams
+from twin.path_tracing.tracer import PathTracer
+
+FALSE_ALARM = 1e-3
+N = 1_000_000
+ANGLES = np.linspace(-np.pi, np.pi, 9)
+
+
+def scattered(backend, lobe, direction, index: float, diffusing: bool, floor: float = 0.0, seed: int = 1):
+    """Directions (N, 3), events and weights of N paths that leave z = 0 in a direction."""
+    vector = backend.Vector3(*(dr.full(backend.Float, float(c), N) for c in direction))
+    normal = backend.Vector3(0.0, 0.0, 1.0)
+    event = dr.full(backend.UInt, int(Event.DIFFUSE if diffusing else Event.REFLECT), N)
+    toward = dr.full(backend.Float, -float(abs(direction[2])), N)
+    leaving = Leaving(
+        vector,
+        normal,
+        backend.Float(index),
+        event,
+        dr.full(backend.Float, 1.0, N),
+        toward,
+        dr.full(backend.Bool, diffusing, N),
+    )
+    rng = random_streams(backend, dr.arange(backend.UInt, N), seed)
+    numbers = [backend.Float(v) for v in lobe]
+    out, event, weight, _ = spread(backend, rng, dr.full(backend.Bool, True, N), numbers, backend.Float(floor), leaving)
+    return np.stack([c.numpy() for c in out], axis=-1), event.numpy(), weight.numpy()
+
+
+def check(counts: np.ndarray, expected: np.ndarray) -> None:
+    assert expected.min() > 20.0
+    statistic = np.sum((counts - expected) ** 2 / expected)
+    assert statistic < chi2.ppf(1.0 - FALSE_ALARM, counts.size - 1)
+
+
+@pytest.mark.parametrize("index", [1.0, 1.5], ids=["air", "glass"])
+@pytest.mark.parametrize(
+    "scatter",
+    [ABg(5e-3, 2e-3, 1.5), ABg(3e-4, 1e-5, 2.6), HarveyShack(5.0, 0.03, -2.2)],
+    ids=["g1.5", "g2.6", "harvey"],
+)
+def test_scattered_directions_follow_the_bsdf(backend, scatter, index: float) -> None:
+    specular = unit(0.4, -0.2, 0.8)
+    direction, event, weight = scattered(backend, scatter.lobe.numbers, specular, index, False)
+    assert np.all(weight == 1.0)
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=1e-12)
+    assert np.all(direction[:, 2] > 0.0)
+    stayed = event == Event.REFLECT
+    np.testing.assert_array_equal(direction[stayed], np.broadcast_to(specular, direction[stayed].shape))
+    away = index * (direction - specular)[~stayed, :2]
+    reach = 0.5 * index
+    edges = np.geomspace(0.6 * scatter.lobe.scale, reach, 11)
+    r, phi = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
+    counts = np.histogram2d(r, phi, [edges, ANGLES])[0].ravel()
+    fine = [np.geomspace(a, b, 201) for a, b in pairwise(edges)]
+    ring = np.array([np.trapezoid(2.0 * np.pi * d * scatter.bsdf(d), d) for d in fine])
+    expected = N * np.repeat(ring / 8.0, 8)
+    counts, expected = np.append(counts, N - counts.sum()), np.append(expected, N - expected.sum())
+    check(counts, expected)
+    if index == 1.0:
+        total = total_scatter(scatter, float(np.hypot(*specular[:2])))
+        assert abs((~stayed).mean() - total) < 3.3 * np.sqrt(total / N)
+
+
+def test_drawing_more_scatter_keeps_its_power(backend) -> None:
+    scatter = ABg(1e-5, 1e-4, 2.0)
+    specular = unit(0.2, 0.1, 0.9)
+    total = total_scatter(scatter, float(np.hypot(*specular[:2])))
+    _, event, weight = scattered(backend, scatter.lobe.numbers, specular, 1.0, False, floor=0.4)
+    found = np.where(event == Event.SCATTER, weight, 0.0)
+    assert (event == Event.SCATTER).mean() > 0.3
+    assert abs(found.mean() - total) < 3.3 * found.std() / np.sqrt(N)
+    assert found.std() / np.sqrt(N) < 0.003 * total
+    assert abs(weight.mean() - 1.0) < 3.3 * weight.std() / np.sqrt(N)
+
+
+def test_diffused_directions_follow_lambert(backend) -> None:
+    direction, event, _ = scattered(backend, (0.0, 1.0, 2.0, 0.0), unit(0.6, 0.0, 0.8), 1.0, True)
+    assert np.all(event == Event.DIFFUSE)
+    assert np.all(direction[:, 2] > 0.0)
+    r2, phi = np.sum(direction[:, :2] ** 2, axis=1), np.arctan2(direction[:, 1], direction[:, 0])
+    counts = np.histogram2d(r2, phi, [np.linspace(0.0, 1.0, 11), ANGLES])[0].ravel()
+    check(counts, np.full(counts.size, N / counts.size))
+
+
+def test_a_scattering_mirror_in_a_scene(backend) -> None:
+    """Share and pattern of the light that a mirror scatters onto a small screen, against the BSDF's integral."""
+    scatter = ABg(2e-2, 3e-2, 2.0)
+    finish = Finish(reflectance=0.5, diffuse=0.2, scatter=scatter)
+    half, distance = 0.05, 0.4
+    aside = np.array([0.15, 0.0, distance])
+    surface, grid = screen("screen", Pose(np.diag([-1.0, 1.0, -1.0]), aside), half, 4)
+    tracer = PathTracer(
+        backend, Scenery((*flat_mirror(finish), surface), (grid,)), sampling=Sampling(floor=0.3, scatter_floor=0.4)
+    )
+    direction = unit(-0.3, 0.1, -1.0)
+    result = tracer.run(DiskSource.along(-0.3 * direction, direction, 0.0), N, 7)
+    beta = direction[:2]
+
+    def into(lobe: bool):
+        def density(y: float, x: float) -> float:
+            line = np.array([x, y, distance])
+            length = np.linalg.norm(line)
+            cosine = distance / length
+            f = 0.5 * float(scatter.bsdf(np.hypot(*(line[:2] / length - beta)))) if lobe else 0.2 / np.pi
+            return f * cosine * cosine / length**2
+
+        return dblquad(density, 0.15 - half, 0.15 + half, -half, half, epsrel=1e-6)[0]
+
+    for mark, expected in (("mirror*", into(True)), ("mirror~", into(False))):
+        (family,) = (f for f in result.families if f.text == mark)
+        assert family.kind == "stray"
+        assert abs(family.energy - expected) < 3.89 * family.error, mark
+        assert family.error < 0.03 * expected
+    assert abs(result.balance.error) < 0.01
+
+
+def test_specular_light_is_not_stray(backend) -> None:
+    surface, grid = screen("screen", Pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.4])), 0.3)
+    finish = Finish(reflectance=0.5, scatter=ABg(1e-5, 1e-4, 2.0))
+    tracer = PathTracer(backend, Scenery((*flat_mirror(finish), surface), (grid,)))
+    direction = unit(-0.1, 0.0, -1.0)
+    result = tracer.run(DiskSource.along(-0.3 * direction, direction, 0.0), 10_000)
+    kinds = {f.text: f.kind for f in result.families}
+    assert kinds["mirror"] == "ghost"
+    assert sum(f.energy for f in result.families) == pytest.approx(0.5, rel=1e-9)
+    assert result.balance.absorbed["mirror"] == pytest.approx(0.5, rel=1e-12)
+    assert abs(result.balance.error) < 1e-12
+    assert ABSORBER.absorptance == 1.0

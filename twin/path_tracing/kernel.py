@@ -1,0 +1,275 @@
+"""The loop over a path's surfaces, recorded once as one Dr.Jit kernel; all numbers of the scene enter as arrays.
+
+In each step a path flies to the next surface. In the open Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on
+triangles) says which surface that is; Newton's method then finds the point on the analytic surface in float64. Inside a
+glass body no triangles are needed: the body is convex and its faces are flat, so the next face is the nearest one
+ahead, exactly, and no path leaks through an edge. Back in the open a triangle that only rounding puts there (the
+surface just left, the inside of a glass face, the rim of a mesh beyond a mirror's edge) is passed over, and the flight
+goes on behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from optics import fresnel
+from optics.backend import Backend
+from twin.path_tracing.events import BITS, FACTOR, OUTSIDE, START, Event
+from twin.path_tracing.shading import Leaving, level, nearest_face, spread, within
+from twin.path_tracing.sinks import Arrival, Sinks, record
+from twin.path_tracing.tables import APERTURES, CLEARANCE, INDEX, PART, ROWS_PER_SURFACE, Kind, SceneTables
+
+REFINEMENTS = 3
+"""Newton steps from the triangle to the surface: from below a millimetre to 1e-7 and 1e-13 m and to rounding, also at
+grazing incidence."""
+
+STEP_BACK = 1e-5
+"""How far behind a triangle that is passed over the search goes on, metres."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """What decides the kernel's code.
+
+    Attributes:
+        even: number of aspheric terms, -1 when all surfaces are flat.
+        glass: there are glass bodies.
+        branching: some finish does more than one thing with light that goes on.
+        roulette: weak paths are ended at random.
+        keep_nominal: detections of the nominal family are recorded as well.
+        log: the events of every path are written down.
+    """
+
+    even: int
+    glass: bool
+    branching: bool
+    roulette: bool = False
+    keep_nominal: bool = False
+    log: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Numbers of one launch as opaque arrays of width 1.
+
+    Attributes:
+        steps: largest number of steps.
+        room: of the records.
+        floor: smallest probability of going each of the ways that there are; 0: as the power goes.
+        scatter_floor: smallest probability of drawing a direction from a scatter lobe.
+        weak: weight below which a path may be ended by roulette.
+    """
+
+    steps: Any
+    room: Any
+    floor: Any
+    scatter_floor: Any
+    weak: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Launch:
+    """Paths at their start: ``Vector3`` position and direction, weight, number of the path, random generator."""
+
+    position: Any
+    direction: Any
+    weight: Any
+    path: Any
+    rng: Any
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScene:
+    """What the kernel works with: array types, Mitsuba with its variant set, triangles and tables of one scene."""
+
+    backend: Backend
+    mi: Any
+    scene: Any
+    tables: SceneTables
+
+
+def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> None:
+    """Follow all paths to their end; nothing is evaluated yet.
+
+    The weight that escapes to infinity and the weight still under way at the step limit go to the sinks as well.
+    """
+    import drjit as dr
+
+    backend = prepared.backend
+    n = dr.width(launch.position)
+    UInt64 = dr.uint64_array_t(backend.Float)
+    state = (
+        backend.Vector3(launch.position),
+        backend.Vector3(launch.direction),
+        backend.Float(launch.weight),
+        dr.zeros(backend.Float, n),  # optical path
+        dr.zeros(backend.UInt, n),  # glass body that the path is in, 0 for none
+        dr.zeros(backend.Float, n),  # how far ahead the search for the next surface starts
+        dr.full(UInt64, START, n),
+        dr.zeros(backend.UInt, n),  # 1 when scattered or diffused somewhere
+        dr.zeros(backend.UInt, n),  # steps
+        dr.full(backend.Bool, True, n),
+        dr.zeros(backend.Float, n),  # escaped
+        launch.rng,
+    )
+    labels = (
+        "position",
+        "direction",
+        "weight",
+        "length",
+        "body",
+        "ahead",
+        "signature",
+        "stray",
+        "steps",
+        "active",
+        "escaped",
+        "rng",
+    )
+    body = _step(prepared, features, limits, launch.path, sinks)
+    out = dr.while_loop(state, lambda *s: s[9], body, labels=labels, label="paths", mode="symbolic")
+    alive = (out[8] >= limits.steps) & (out[10] == 0.0)
+    dr.scatter_add(sinks.left, out[10], backend.UInt(0), out[10] > 0.0)
+    dr.scatter_add(sinks.left, out[2], backend.UInt(1), alive)
+
+
+def _step(
+    prepared: PreparedScene, features: Features, limits: Limits, index: Any, sinks: Sinks
+) -> Callable[..., tuple[Any, ...]]:
+    """The loop's body: one step of every path."""
+    import drjit as dr
+
+    backend, tables, mi = prepared.backend, prepared.tables, prepared.mi
+    Float, UInt, Vector3 = backend.Float, backend.UInt, backend.Vector3
+    UInt64 = dr.uint64_array_t(Float)
+    glass = features.glass
+
+    def body(*state: Any) -> tuple[Any, ...]:
+        p, d, weight, length, medium, ahead, signature, stray, steps, active, escaped, rng = state
+        inside = medium != 0
+        # which surface, and about how far away
+        outside = active & ~inside if glass else active
+        ray = mi.Ray3f(mi.Point3f(dr.fma(d, ahead, p)), mi.Vector3f(d))
+        found = prepared.scene.ray_intersect_preliminary(ray, coherent=False, active=outside)
+        hit = found.is_valid() & outside
+        surface = dr.select(hit, UInt(found.shape_index), 0)
+        near = Float(found.t) + ahead
+        if glass:
+            inside &= active
+            t, face = nearest_face(backend, tables, p, d, medium, inside)
+            near, surface, hit = dr.select(inside, t, near), dr.select(inside, face, surface), hit | inside
+        escaped = dr.select(active & ~hit, weight, escaped)
+        active = hit
+
+        # where exactly, in the surface's own frame
+        g = tables.geometry(surface, active)
+        kind = dr.gather(UInt, tables.kind, surface, active)
+        x, y, z = (
+            dr.fma(g[3 * a], p.x, dr.fma(g[3 * a + 1], p.y, dr.fma(g[3 * a + 2], p.z, g[9 + a]))) for a in range(3)
+        )
+        dx, dy, dz = (dr.fma(g[3 * a], d.x, dr.fma(g[3 * a + 1], d.y, g[3 * a + 2] * d.z)) for a in range(3))
+        if features.even < 0:
+            t = -z / dz
+            x, y = dr.fma(t, dx, x), dr.fma(t, dy, y)
+            cosine, normal = dz, Vector3(g[6], g[7], g[8])
+        else:
+            t = near
+            for _ in range(REFINEMENTS):
+                value, nx, ny, nz = level(dr.fma(t, dx, x), dr.fma(t, dy, y), dr.fma(t, dz, z), g, features.even)
+                t = t - value / dr.fma(nx, dx, dr.fma(ny, dy, nz * dz))
+            x, y, z = dr.fma(t, dx, x), dr.fma(t, dy, y), dr.fma(t, dz, z)
+            _, nx, ny, nz = level(x, y, z, g, features.even)
+            unit = dr.rsqrt(dr.fma(nx, nx, dr.fma(ny, ny, nz * nz)))
+            nx, ny, nz = nx * unit, ny * unit, nz * unit
+            cosine = dr.fma(nx, dx, dr.fma(ny, dy, nz * dz))
+            normal = Vector3(*(dr.fma(g[a], nx, dr.fma(g[3 + a], ny, g[6 + a] * nz)) for a in range(3)))
+        front = cosine < 0.0
+        clear = within(x, y, g[APERTURES : APERTURES + 6])
+        if glass:
+            clear |= within(x, y, g[APERTURES + 6 : APERTURES + 12])
+        # what is there only by rounding and faceting
+        skip = ~clear & (kind & Kind.ENDS != 0)
+        again = t <= 0.5 * ahead
+        if glass:
+            skip |= (again | (~front & (kind & Kind.SOLID != 0))) & ~inside
+        else:
+            skip |= again
+        met = active & ~skip
+        ahead = dr.select(met, g[CLEARANCE], near + STEP_BACK)
+
+        flown = dr.select(met, t, 0.0)
+        before = dr.select(inside, g[INDEX], 1.0) if glass else Float(1.0)
+        p = dr.fma(d, flown, p)
+        length = dr.fma(flown, before, length)
+
+        # how the light is shared out
+        row = ROWS_PER_SURFACE * surface + dr.select(clear, dr.select(front, UInt(0), 1), 2)
+        f = tables.finish(row, met)
+        reflected, transmitted, diffused = f[0], f[1], f[3]
+        if glass:
+            toward = dr.abs(cosine)
+            after = dr.select(inside, 1.0, g[INDEX])
+            bent = fresnel.cosine_after(toward, before, after)
+            total = bent <= 0.0
+            bare, opaque = f[2] > 0.5, (f[2] <= 0.5) & (transmitted <= 0.0)
+            plain = fresnel.reflectance(toward, before, after)
+            transmitted = dr.select(bare, 1.0 - plain, dr.select(total, 0.0, transmitted))
+            reflected = dr.select(bare, plain, dr.select(total & ~opaque, 1.0, reflected))
+        going_on = reflected + transmitted + diffused
+        stays = dr.select(going_on < 1.0 - 1e-15, weight * (1.0 - going_on), 0.0)
+        dr.scatter_add(sinks.absorbed, stays, row, met & (stays > 0.0))
+        arrival = Arrival(x, y, stays, length, signature, stray != 0, index)
+        record(backend, tables, sinks, limits.room, kind, met & front & clear, arrival, features.keep_nominal)
+
+        # which way this path goes
+        turned = dr.fma(normal, -2.0 * cosine, d)
+        event = UInt(0) + 0 * surface
+        if features.branching:
+            whole = dr.select(going_on > 0.0, 1.0 / going_on, 0.0)
+            shares = (reflected, transmitted, diffused)
+            chances = [dr.select(s > 0.0, dr.maximum(s * whole, limits.floor), 0.0) for s in shares]
+            every = chances[0] + chances[1] + chances[2]
+            u = rng.next_float64() * every
+            reflecting = u < chances[0]
+            through = ~reflecting & (u < chances[0] + chances[1])
+            diffusing = ~reflecting & ~through & (chances[2] > 0.0)
+            share = dr.select(reflecting, reflected, dr.select(through, transmitted, diffused))
+            chance = dr.select(reflecting, chances[0], dr.select(through, chances[1], chances[2]))
+            onward = dr.select(chance > 0.0, weight * share * every / chance, 0.0)
+            event = dr.select(
+                reflecting,
+                UInt(int(Event.REFLECT)),
+                dr.select(through, UInt(int(Event.TRANSMIT)), int(Event.DIFFUSE)),
+            )
+            out_index = Float(1.0)
+            if glass:
+                ratio = before / after
+                along = dr.copysign(bent, cosine)
+                refracted = dr.fma(normal, along - ratio * cosine, ratio * d)
+                turned = dr.select(through, refracted, turned)
+                own = kind >> Kind.BODY_SHIFT & Kind.BODY_MASK
+                medium = dr.select(met & through, dr.select(inside, 0, own), medium)
+                out_index = dr.select(medium != 0, g[INDEX], 1.0)
+            leaving = Leaving(turned, normal, out_index, event, onward, cosine, diffusing)
+            turned, event, onward, rng = spread(backend, rng, met, f[4:8], limits.scatter_floor, leaving)
+            stray = dr.select(met & (event >= int(Event.DIFFUSE)), 1, stray)
+        else:
+            onward = weight * going_on
+        d = dr.select(met, turned, d)
+        weight = dr.select(met, onward, weight)
+        code = UInt(g[PART]) << BITS | (event + dr.select(clear, UInt(0), OUTSIDE))
+        signature = dr.select(met, (signature ^ UInt64(code)) * UInt64(FACTOR), signature)
+        if features.log:
+            dr.scatter(sinks.log, dr.select(met, code, 0), index * limits.steps + steps, active)
+        steps = steps + 1
+        active &= (weight > 0.0) & (steps < limits.steps)
+        if features.roulette:
+            weak = active & met & (weight < limits.weak)
+            survives = rng.next_float64() * limits.weak < weight
+            weight = dr.select(weak, dr.select(survives, limits.weak, 0.0), weight)
+            active &= ~weak | survives
+        return p, d, weight, length, medium, ahead, signature, stray, steps, active, escaped, rng
+
+    return body

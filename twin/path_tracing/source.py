@@ -1,0 +1,183 @@
+"""Light sources of the path tracer: evenly lit pinholes, collimated beams, and rays given one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from optics.aim import transverse_axes
+from optics.backend import Backend
+from twin.path_tracing.kernel import Launch
+
+
+@dataclass(frozen=True, eq=False)
+class DiskSource:
+    """Rays from an even disk of places into an even disk of direction cosines about an axis.
+
+    Its radiance is constant, so that power goes as the solid angle times the cosine with the axis (Lambert). Where
+    much of the cone is of little interest, part of the paths can be aimed into a narrower cone inside it; every path
+    then carries the weight (density of the wide cone) / (density it was drawn with), so that the expected power of
+    every direction stays the same. All weights add up to 1 on average.
+
+    Attributes:
+        centre: of the disk of places, world, metres, (3,).
+        axis: of the cone, unit, (3,).
+        across: two unit vectors square to the axis, (2, 3); the disk of places lies in their plane.
+        radius: of the disk of places, metres.
+        cone: sine of the cone's half angle; 0 is a collimated beam.
+        narrow: centre in the plane of ``across`` and radius of the narrow cone, direction cosines; within the wide.
+        share: of the paths that are aimed into the narrow cone.
+    """
+
+    centre: np.ndarray
+    axis: np.ndarray
+    across: np.ndarray
+    radius: float
+    cone: float = 0.0
+    narrow: tuple[float, float, float] | None = None
+    share: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the cones."""
+        if self.radius < 0.0 or not 0.0 <= self.cone < 1.0:
+            raise ValueError(
+                f"a source needs a radius of 0 or more and a cone in [0, 1), found {self.radius}, {self.cone}"
+            )
+        if self.narrow is not None:
+            x, y, r = self.narrow
+            if not (0.0 < r and float(np.hypot(x, y)) + r <= self.cone):
+                raise ValueError(f"the narrow cone {self.narrow} does not lie in the cone of sine {self.cone}")
+
+    @classmethod
+    def along(cls, centre: np.ndarray, axis: np.ndarray, radius: float, cone: float = 0.0) -> DiskSource:
+        """A source with any two axes across."""
+        axis = np.asarray(axis, np.float64) / np.linalg.norm(axis)
+        helper = np.eye(3)[np.argmin(np.abs(axis))]
+        return cls(np.asarray(centre, np.float64), axis, transverse_axes(axis, helper), radius, cone)
+
+    def aimed_at(self, directions: np.ndarray, room: float = 1.05, share: float = 0.5) -> DiskSource:
+        """The same source with a narrow cone around given directions (N, 3).
+
+        Args:
+            directions: unit vectors.
+            room: radius of the narrow cone relative to the smallest one about their middle.
+            share: of the paths that go there.
+        """
+        place = np.asarray(directions) @ self.across.T
+        middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
+        reach = room * float(np.max(np.linalg.norm(place - middle, axis=-1)))
+        return DiskSource(
+            self.centre,
+            self.axis,
+            self.across,
+            self.radius,
+            self.cone,
+            (float(middle[0]), float(middle[1]), reach),
+            share,
+        )
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """What the kernel takes, (20,)."""
+        x, y, r = self.narrow or (0.0, 0.0, self.cone)
+        share = self.share if self.narrow else 0.0
+        gain = (self.cone / r) ** 2 if r > 0.0 else 1.0
+        return np.array(
+            [
+                *self.centre,
+                *self.axis,
+                *self.across[0],
+                *self.across[1],
+                self.radius,
+                self.cone,
+                x,
+                y,
+                r,
+                share,
+                gain,
+                0.0,
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RaySource:
+    """Rays given one by one: world positions (N, 3), metres, unit directions (N, 3), weights (N,)."""
+
+    position: np.ndarray
+    direction: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def even(cls, position: np.ndarray, direction: np.ndarray) -> RaySource:
+        """Rays of equal weight 1/N; positions and directions broadcastable to each other."""
+        position, direction = np.broadcast_arrays(np.asarray(position, np.float64), np.asarray(direction, np.float64))
+        return cls(position, direction, np.full(len(position), 1.0 / len(position)))
+
+
+Source = DiskSource | RaySource
+
+
+def random_streams(backend: Backend, numbers: Any, seed: int) -> Any:
+    """A random generator with one stream per path, set by the seed and the path's number alone."""
+    import drjit as dr
+
+    module = import_module(f"drjit.{backend.name}.ad")
+    UInt64 = dr.uint64_array_t(backend.Float)
+    mix = dr.opaque(UInt64, (seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) & 0xFFFFFFFFFFFFFFFF)
+    # splitmix64 of Steele, Lea and Flood (2014)
+    z = mix + UInt64(numbers) * UInt64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> 30)) * UInt64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> 27)) * UInt64(0x94D049BB133111EB)
+    rng = module.PCG32()
+    rng.seed(z ^ (z >> 31), UInt64(numbers))
+    return rng
+
+
+def draw(backend: Backend, source: DiskSource, numbers: Any, total: int, seed: int) -> Launch:
+    """Draw the paths of the given numbers (``UInt``) of a run of ``total`` paths."""
+    import drjit as dr
+
+    rng = random_streams(backend, numbers, seed)
+    s = [dr.gather(backend.Float, backend.opaque(source.numbers), k) for k in range(19)]
+    vectors = [backend.Vector3(s[3 * k], s[3 * k + 1], s[3 * k + 2]) for k in range(4)]
+    centre, axis, first, second = vectors
+    radius, cone, x, y, narrow, share, gain = s[12:19]
+    r, turn = radius * dr.sqrt(rng.next_float64()), 2.0 * dr.pi * rng.next_float64()
+    sine, cosine = dr.sincos(turn)
+    position = centre + (r * cosine) * first + (r * sine) * second
+    aimed = rng.next_float64() < share
+    r, turn = dr.sqrt(rng.next_float64()), 2.0 * dr.pi * rng.next_float64()
+    sine, cosine = dr.sincos(turn)
+    r = r * dr.select(aimed, narrow, cone)
+    u, v = r * cosine + dr.select(aimed, x, 0.0), r * sine + dr.select(aimed, y, 0.0)
+    direction = u * first + v * second + dr.sqrt(1.0 - u * u - v * v) * axis
+    inside = (u - x) * (u - x) + (v - y) * (v - y) <= narrow * narrow * (1.0 + 1e-12)
+    density = dr.select(inside & (share > 0.0), 1.0 - share + share * gain, 1.0 - share)
+    weight = dr.opaque(backend.Float, 1.0 / total) / density
+    return Launch(position, direction, weight, numbers, rng)
+
+
+def take(backend: Backend, source: RaySource, chosen: np.ndarray, seed: int) -> Launch:
+    """The rays of the given numbers of a list."""
+    import drjit as dr
+
+    numbers = backend.UInt(np.ascontiguousarray(chosen, np.uint32))
+    dr.make_opaque(numbers)
+    return Launch(
+        backend.vector(source.position[chosen]),
+        backend.vector(source.direction[chosen]),
+        backend.opaque(source.weight[chosen]),
+        numbers,
+        random_streams(backend, numbers, seed),
+    )
+
+
+def pieces(total: int, size: int) -> Iterator[tuple[int, int]]:
+    """First number and count of launches of at most ``size`` paths."""
+    for first in range(0, total, size):
+        yield first, min(size, total - first)

@@ -1,0 +1,176 @@
+"""A scene made ready for path tracing, run piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from optics.backend import Backend
+from scenes.scenery import Scenery
+from twin.path_tracing.collect import Collector, Key, event_lists
+from twin.path_tracing.events import signature
+from twin.path_tracing.families import Touch, touches
+from twin.path_tracing.integrator import BALANCED, Sampling, make_integrator
+from twin.path_tracing.kernel import Features, Launch, PreparedScene
+from twin.path_tracing.result import PathResult
+from twin.path_tracing.scene import build_scene, load_mitsuba
+from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
+from twin.path_tracing.source import DiskSource, Source, draw, pieces, take
+from twin.path_tracing.tables import ROWS_PER_SURFACE, upload
+
+CHUNK = 1 << 20
+"""Paths of one launch: about 200 MB at work."""
+
+LEAST_ROOM = 1 << 14
+MOST_FAMILIES = 200
+"""Families whose ways are looked up, the strongest first."""
+
+Progress = Callable[[int, int], None]
+"""Called with the number of paths done and the number of all."""
+
+
+class PathTracer:
+    """A scene made ready for tracing.
+
+    Args:
+        backend: where to trace.
+        scenery: the surfaces.
+        nominal: detector -> codes of the events of its nominal family.
+        sampling: how paths are drawn.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scenery: Scenery,
+        nominal: Mapping[str, tuple[int, ...]] | None = None,
+        sampling: Sampling = BALANCED,
+    ) -> None:
+        self.backend = backend
+        self.scenery = scenery
+        self.nominal = dict(nominal or {})
+        self.sampling = sampling
+        self.integrator = make_integrator(backend, sampling)
+        mi = load_mitsuba(backend)
+        signatures = {name: signature(codes) for name, codes in self.nominal.items()}
+        tables = upload(backend, scenery, signatures)
+        self.prepared = PreparedScene(backend, mi, build_scene(mi, scenery), tables)
+        self._signatures = [signatures.get(d.name, 0) for d in scenery.detectors]
+
+    def features(self, keep_nominal: bool = False, log: bool = False) -> Features:
+        """What the kernel must be able to do for this scene."""
+        surfaces = self.scenery.surfaces
+        flat = all(s.surface.is_plane for s in surfaces)
+        finishes = [f for s in surfaces for f in (s.front, s.back, s.outside)]
+        return Features(
+            even=-1 if flat else max(len(s.surface.even) for s in surfaces),
+            glass=any(s.solid is not None for s in surfaces),
+            branching=any(f.bare or f.transmission or f.diffuse or f.scatter for f in finishes),
+            roulette=self.sampling.roulette > 0.0,
+            keep_nominal=keep_nominal,
+            log=log,
+        )
+
+    def run(
+        self,
+        source: Source,
+        paths: int | None = None,
+        seed: int = 0,
+        keep: bool = False,
+        chunk: int = CHUNK,
+        progress: Progress | None = None,
+        look_up: int = MOST_FAMILIES,
+    ) -> PathResult:
+        """Trace paths from a source.
+
+        Args:
+            source: where they start.
+            paths: how many; all rays of a ``RaySource``.
+            seed: of the random numbers; the same seed gives the same paths, whatever the chunk.
+            keep: keep the single detections (memory grows with the number of paths).
+            chunk: paths of one launch; bounds the memory.
+            progress: told after each launch.
+            look_up: number of families whose ways are looked up, the strongest first.
+        """
+        total = self._total(source, paths)
+        features = self.features(keep)
+        collector = Collector(self.scenery, self._signatures, keep)
+        room = max(LEAST_ROOM, min(chunk, total) // (1 if keep else 2))
+        for first, count in pieces(total, chunk):
+            while True:
+                sinks = self._sinks(room)
+                emitted = self.integrator.launch(
+                    self.prepared, features, self._start(source, first, count, total, seed), 1.0 / total, sinks
+                )
+                wanted = int(sinks.counter.numpy()[0])
+                if wanted <= sinks.room:
+                    break
+                room = 2 * wanted  # the launch is the same when it is done again
+            collector.add(sinks, emitted, count)
+            if progress is not None:
+                progress(first + count, total)
+        return collector.result(self._ways(source, collector, total, seed, look_up))
+
+    def _total(self, source: Source, paths: int | None) -> int:
+        if isinstance(source, DiskSource):
+            if paths is None or paths < 1:
+                raise ValueError(f"say how many paths to trace, at least 1; found {paths}")
+            return paths
+        if paths not in (None, len(source.position)):
+            raise ValueError("a list of rays is traced as a whole")
+        return len(source.position)
+
+    def _sinks(self, room: int, log: int = 0) -> Sinks:
+        detectors = self.scenery.detectors
+        pixels = sum(d.columns * d.rows for d in detectors)
+        return make_sinks(
+            self.backend, ROWS_PER_SURFACE * len(self.scenery.surfaces), len(detectors), pixels, room, log
+        )
+
+    def _start(self, source: Source, first: int, count: int, total: int, seed: int) -> Launch:
+        import drjit as dr
+
+        if isinstance(source, DiskSource):
+            numbers = dr.arange(self.backend.UInt, count) + dr.opaque(self.backend.UInt, first)
+            return draw(self.backend, source, numbers, total, seed)
+        return take(self.backend, source, np.arange(first, first + count), seed)
+
+    def _ways(
+        self, source: Source, collector: Collector, total: int, seed: int, most: int
+    ) -> dict[Key, tuple[Touch, ...]]:
+        """Events of the families: of the nominal ones as given, of the others by tracing one path of each again."""
+        names = [d.name for d in self.scenery.detectors]
+        ways = {
+            key: touches(self.scenery, self.nominal[names[key.detector]])
+            for key in collector.sums
+            if key.kind == NOMINAL
+        }
+        keys = collector.strongest(most)
+        if not keys:
+            return ways
+        examples = np.array([collector.examples[k] for k in keys], np.uint32)
+        for key, codes in zip(keys, self.events(source, examples, total, seed), strict=True):
+            # the path may have gone on from the detector: the family is what came before
+            for n in range(len(codes) + 1):
+                if signature(codes[:n]) == key.signature:
+                    ways[key] = touches(self.scenery, codes[:n])
+                    break
+        return ways
+
+    def events(self, source: Source, numbers: np.ndarray, total: int, seed: int) -> list[tuple[int, ...]]:
+        """Codes of all events of the paths of the given numbers of a run."""
+        import drjit as dr
+
+        count, steps = len(numbers), self.sampling.steps
+        if isinstance(source, DiskSource):
+            chosen = self.backend.UInt(np.ascontiguousarray(numbers, np.uint32))
+            dr.make_opaque(chosen)
+            start = draw(self.backend, source, chosen, total, seed)
+        else:
+            start = take(self.backend, source, numbers.astype(np.intp), seed)
+        slots = dr.arange(self.backend.UInt, count)
+        start = Launch(start.position, start.direction, start.weight, slots, start.rng)
+        sinks = self._sinks(LEAST_ROOM, count * steps)
+        self.integrator.launch(self.prepared, self.features(log=True), start, 1.0 / total, sinks)
+        return list(event_lists(sinks.log.numpy(), count))
