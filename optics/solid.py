@@ -124,9 +124,10 @@ def _corners(path: str, normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     if found.x[3] > 1e2:
         raise SolidError(f"{path}: its faces do not enclose a body; it is open on one side")
     try:
-        corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), found.x[:3]).intersections
+        with np.errstate(divide="ignore", invalid="ignore"):  # corners at infinity are found below
+            corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), found.x[:3]).intersections
     except QhullError as error:
-        raise SolidError(f"{path}: its faces do not enclose a body ({str(error).splitlines()[0]})") from error
+        raise SolidError(f"{path}: its faces do not enclose a body; it is open on one side") from error
     if not np.all(np.isfinite(corners)) or np.abs(corners).max() > 1e2:
         raise SolidError(f"{path}: its faces do not enclose a body; it is open on one side")
     return np.asarray(corners)

@@ -127,7 +127,7 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
     assembly = square_facets(assembly, channels, chains, backend)
     cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
-    nodes = _nodes(assembly.tree, cameras, solids)
+    nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
     instrument = Instrument(
         spec, assembly, cameras, tuple(channels), MappingProxyType(nodes), solids, MappingProxyType(lengths)
@@ -195,20 +195,22 @@ def _camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...
     }
 
 
-def _nodes(tree: RigidTree, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
+def _nodes(
+    assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]
+) -> dict[str, NodeInfo]:
     """What may be done to each body; the base itself is the frame of everything and is not moved."""
-    mirrors = {f"{BASE}/{name}/{mirror}" for name, model in cameras.items() for mirror in model.mirrors}
+    # a figure belongs to the element's own body: a face that the beam meets twice has one for each passage
+    shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}
     roots = {f"{BASE}/{name}" for name in cameras}
-    faces = {face.body for solid in solids for face in solid.faces if face.body != solid.path}
     out = {}
-    for body in tree.bodies:
+    for body in assembly.tree.bodies:
         if body.path == BASE:
             out[BASE] = NodeInfo(allows=frozenset({"temperature"}))
             continue
         allows = {"rotate", "shift"}
-        if body.path not in faces:
+        if not any(body.path.startswith(f"{solid.path}/") for solid in solids):
             allows.add("temperature")
-        if body.path in mirrors | faces:
+        if body.path in shaped:
             allows.add("figure")
         if body.path in roots:
             allows.add("scale")

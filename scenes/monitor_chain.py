@@ -21,7 +21,9 @@ from optics.aperture import Circle
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
+from optics.glass import glass
 from optics.pose import Pose
+from optics.rotation import rotation_matrix
 from optics.solid import Solid, SolidError, solid_mesh
 from optics.surface import plane
 from optics.system import SystemBatch, assemble
@@ -31,7 +33,7 @@ from scenes.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.channel import BASE, CENTRAL_PRISM, Channel
 from scenes.errors import KeyPath
 from scenes.misplaced import MisplacedError, key_of
-from scenes.prism_model import prism_0, prism_180, roof_offset
+from scenes.prism_model import null_point, prism_0, prism_180, roof_offset
 
 if TYPE_CHECKING:
     from scenes.instrument import InstrumentSpec, MonitorSpec
@@ -129,9 +131,10 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         to_base: the camera's pose in the base.
 
     Raises:
-        InputError, MisplacedError: the central prism is too near the camera's beam for the rhomboid's displacement, or
-            that is too small for the rhomboid's width.
+        InputError, MisplacedError: a prism's glass or width does not suit the beam; the central prism is too near the
+            camera's beam for the rhomboid's displacement, or that is too small for the rhomboid's width.
     """
+    _check_prisms(spec)
     monitor, up = spec.monitor, beam.direction
     apex = np.array(spec.central_prism.position)
     spread = np.array(spec.central_prism.spread)
@@ -160,8 +163,9 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     # of the two mirror-image prisms the one that lies more nearly across the line
     x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
     hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
-    pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
     made = monitor.prism_180
+    pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
+    pose = pose @ _turn(made.tilt, null_point(length, made.width))
     first = prism_180(
         channel.prism_body("prism_180"),
         into_camera @ pose,
@@ -172,8 +176,9 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         hand,
         made.angle_errors,
     )
-    pose = Pose(_columns(toward, -up), centre + monitor.prism_0.distance * up - 0.5 * monitor.prism_0.shift * toward)
     small = monitor.prism_0
+    pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
+    pose = pose @ _turn(small.tilt, (0.0, 0.0, 0.0))
     try:
         second = prism_0(
             channel.prism_body("prism_0"),
@@ -201,6 +206,35 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         (first.solid, second.solid),
         MappingProxyType({"prism_180": first.path_length, "prism_0": second.path_length}),
     )
+
+
+def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
+    """A turn about x and y that leaves a point in place."""
+    turn = rotation_matrix(np.array([*tilt, 0.0]))
+    return Pose(turn, np.array(about) - turn @ np.array(about))
+
+
+def _check_prisms(spec: InstrumentSpec) -> None:
+    """Check that the prisms' glasses have an index at the monitor's wavelength and that they let the beam pass."""
+    monitor, face = spec.monitor, spec.monitor.return_face.aperture
+    for name, prism in (("prism_180", monitor.prism_180), ("prism_0", monitor.prism_0)):
+        known = glass(prism.material)
+        if not known.shortest <= monitor.wavelength <= known.longest:
+            raise spec.error(
+                f"the index of {prism.material} is not known at the monitor's wavelength of "
+                f"{1e9 * monitor.wavelength:.6g} nm",
+                ("monitor", name, "material"),
+                found=prism.material,
+                allowed=f"a glass for that wavelength, or a wavelength from {1e9 * known.shortest:.6g} to "
+                f"{1e9 * known.longest:.6g} nm",
+            )
+        if prism.width < face:
+            raise spec.error(
+                f"the prism is narrower than the beam: {1e3 * prism.width:.4g} mm for a return face of "
+                f"{1e3 * face:.4g} mm",
+                ("monitor", name, "width"),
+                allowed=f"at least {1e3 * face:.4g} mm",
+            )
 
 
 def square_facets(
@@ -254,7 +288,7 @@ def _aimed(
     """Parameters of ``aim``; MisplacedError at ``key`` when it finds no ray."""
     try:
         return aim(backend, systems, fan, target, start)[0]
-    except AimError as error:
+    except (AimError, np.linalg.LinAlgError) as error:
         raise MisplacedError(f"no light of {channels} gets to where it has to go: {error}", key) from error
 
 
@@ -270,6 +304,8 @@ def _missed(
             what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
             if element.interaction is Interaction.TOTAL:
                 what += ", or is not totally reflected there"
+            else:
+                what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
             return MisplacedError(what, key_of(element.body))
     return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
 

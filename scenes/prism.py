@@ -25,6 +25,22 @@ GlassName = Annotated[str, Field(strict=True), AfterValidator(_known_glass)]
 """A glass of the catalogue in optics/glass.py."""
 
 
+PRISM_180_FACES = ("window", "mirror", "roof_a", "roof_b")
+PRISM_0_FACES = ("entry", "mirror_a", "mirror_b", "exit")
+
+
+def _faces_of(known: tuple[str, ...]) -> AfterValidator:
+    """Refuse angle errors of faces that a prism does not have."""
+
+    def check(errors: dict[str, tuple[float, float]]) -> FrozenMap[str, tuple[float, float]]:
+        for name in errors:
+            if name not in known:
+                raise Problem("no such face", shown(name), names_text(known), nearest(name, known), (name,))
+        return FrozenMap(errors)
+
+    return AfterValidator(check)
+
+
 class Prism180Spec(Spec):
     """The lateral-transfer prism: three mutually perpendicular faces send the beam back parallel to itself.
 
@@ -32,6 +48,8 @@ class Prism180Spec(Spec):
         material: its glass.
         distance: from the camera's origin to its window, along the line of sight, metres.
         width: of the clear apertures across the beam, metres; somewhat more than the return face's.
+        tilt: turn about its own x and y from where its faces stand square to the beam, about its null point, radians.
+            It leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
         angle_errors: face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a,
             roof_b.
     """
@@ -39,7 +57,8 @@ class Prism180Spec(Spec):
     material: GlassName
     distance: PositiveLength
     width: PositiveLength
-    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, AfterValidator(FrozenMap)] = Field(
+    tilt: Tilt = (0.0, 0.0)
+    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, _faces_of(PRISM_180_FACES)] = Field(
         default_factory=FrozenMap
     )
 
@@ -52,6 +71,7 @@ class Prism0Spec(Spec):
         distance: from the return face to its centre, along the beam, metres.
         shift: by how much it displaces the beam, toward the central prism, metres.
         width: of the clear apertures across the beam, metres.
+        tilt: turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
         angle_errors: face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit.
     """
 
@@ -59,7 +79,8 @@ class Prism0Spec(Spec):
     distance: PositiveLength
     shift: PositiveLength
     width: PositiveLength
-    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, AfterValidator(FrozenMap)] = Field(
+    tilt: Tilt = (0.0, 0.0)
+    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, _faces_of(PRISM_0_FACES)] = Field(
         default_factory=FrozenMap
     )
 

@@ -102,8 +102,8 @@ def prism_180(
     """
     off = roof_offset(width)
     half = 0.5 * width
-    height = sqrt(2.0) * off + sqrt(3.0) * half + EDGE
-    apex = (0.0, 0.0, height + 0.5 * length)
+    height = _beam_height(width)
+    apex = null_point(length, width)
     reach, side = 0.5 * length + half + EDGE, off + half + EDGE
     planes: list[Plane] = [
         ("window", (0, 0, -1), (0, 0, 0), Coating.TRANSMITTING),
@@ -127,6 +127,16 @@ def prism_180(
         Passage("exit", "window", Interaction.REFRACT, at([x, -y, 0.0]), -up),
     ]
     return _parts(path, pose, key, material, planes, passages, width, errors, apex, {"window": (0.0, 0.0, 0.0)})
+
+
+def _beam_height(width: float) -> float:
+    """Height of the transferred beam above the window, metres: its way down from the roof clears the window's edge."""
+    return sqrt(2.0) * roof_offset(width) + sqrt(3.0) * 0.5 * width + EDGE
+
+
+def null_point(length: float, width: float) -> tuple[float, float, float]:
+    """Apex of the 180-deg prism's three reflecting faces in its frame, metres: turns about it leave the beam alone."""
+    return (0.0, 0.0, _beam_height(width) + 0.5 * length)
 
 
 def roof_offset(width: float) -> float:

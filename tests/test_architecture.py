@@ -15,7 +15,7 @@ MAY_IMPORT = {
     "analysis": {"analysis"},
 }
 # optics knows nothing of YAML, commands or Mitsuba scenes.
-NOT_IN_OPTICS = {"ruamel", "yaml", "pydantic", "pint", "typer", "rich", "mitsuba", "matplotlib", "trimesh"}
+NOT_IN_OPTICS = {"ruamel", "yaml", "pydantic", "pint", "typer", "rich", "mitsuba", "matplotlib"}
 # analysis must be usable on real images, without the twin's renderers.
 ONLY_IN_ANALYSIS = {"analysis", "numpy", "scipy", "cv2"} | sys.stdlib_module_names
 # Modules of analysis that are commands may use these as well; name each module here.

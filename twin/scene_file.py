@@ -14,24 +14,18 @@ import numpy as np
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from optics.aperture import Aperture, Circle
+from optics.aperture import Circle
 from optics.solid import solid_mesh
-from optics.surface import Surface
 from optics.tree import State
 from scenes.channel import BASE, Channel
 from scenes.instrument_model import Instrument
+from scenes.mirror_mesh import BOARD, CHIP, behind, board_size, mirror_mesh
 from twin.experiment import MonitorExperiment
 from twin.light_paths import RIM, Beam, LightPaths, trace_light_paths
 
-GRID = 24
-"""Cells across a mirror: the mesh departs from the surface by less than a millimetre."""
-
-BOARD = 0.010
-"""Thickness of the focal plane's board, metres; it stands behind the detectors."""
-CHIP = 0.0005
 LINE_WIDTH = 0.002
 RETICLE = 0.0005
-"""Thickness of chips, width of the line CCD and radius of the reticle as drawn, metres."""
+"""Width of the line CCD and radius of the reticle as drawn, metres."""
 TUBE = 0.0015
 TUBE_SIDES = 5
 """Radius of drawn rays, metres, and their number of sides."""
@@ -101,24 +95,23 @@ def body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.
     """Body path -> mesh in the body's own frame, metres, unscaled."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
-        chief = paths.of(camera, monitor=False)[0].vertices[0]
-        for i, mirror in enumerate(model.mirrors):
-            path = f"{BASE}/{camera}/{mirror}"
-            travel = paths.placed.pose(path).rotation.T @ (chief[i + 1] - chief[i])
-            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], 1.0 if travel[2] > 0 else -1.0)
-            out[path] = _painted(mesh, MIRROR)
+        for mirror in model.mirrors:
+            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror))
+            out[f"{BASE}/{camera}/{mirror}"] = _painted(mesh, MIRROR)
         plane = f"{BASE}/{camera}/focal_plane"
         line = model.spec.line.pixels * model.spec.line.pitch
         channels = [c for c in instrument.channels if c.camera == camera]
-        reach_y = 2.0 * max(0.5 * line, *(abs(c.ccd[1]) for c in channels)) + 0.04
-        reach_x = 2.0 * max(abs(c.pinhole[0]) for c in channels) + 0.04
+        reach_x, reach_y = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
         # light arrives along +Z of the focal plane, so what carries the detectors stands on the +Z side
         out[plane] = _painted(_box((reach_x, reach_y, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
         out[f"{plane}/line"] = _painted(_box((LINE_WIDTH, line, CHIP), 0.5 * CHIP), SILICON)
         for channel in channels:
             out.update(_channel_meshes(instrument, channel))
-    for solid in instrument.solids:
-        out[solid.path] = _painted(solid_mesh(solid, paths.placed).mesh, GLASS if solid.transparent else BLOCK)
+    placed = paths.placed
+    for solid in instrument.solids:  # as they have grown: brought back to nominal size like all others
+        mesh = solid_mesh(solid, placed).mesh
+        mesh.vertices = mesh.vertices / placed.scale[0, placed.index[solid.path]].real
+        out[solid.path] = _painted(mesh, GLASS if solid.transparent else BLOCK)
     return out
 
 
@@ -136,39 +129,6 @@ def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trime
         channel.reticle_body: _painted(reticle, BRASS),
         channel.face_body: _painted(disc, MIRROR),
     }
-
-
-def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Trimesh:
-    """Watertight mesh of a mirror: its optical surface over the clear aperture, a flat back and an edge.
-
-    Args:
-        surface: shape, metres.
-        aperture: clear aperture.
-        back: +1 when the substrate is on the surface's +z side, -1 when on its -z side.
-    """
-    x0, x1, y0, y1 = aperture.bounds
-    s = np.linspace(-1.0, 1.0, GRID + 1)
-    u, v = np.meshgrid(s, s)
-    if isinstance(aperture, Circle):  # square onto disk, ring by ring
-        ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
-        u, v = ring * np.cos(angle), ring * np.sin(angle)
-    x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
-    z = surface.sag(x, y)
-    thickness = 0.08 * max(x1 - x0, y1 - y0)
-    flat = (z.max() + thickness) if back > 0 else (z.min() - thickness)
-    n = GRID + 1
-    front = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    rear = front.copy()
-    rear[:, 2] = flat
-    i = (np.arange(GRID)[:, None] * n + np.arange(GRID)).ravel()
-    face = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
-    up, down = np.arange(GRID), np.arange(GRID, 0, -1)
-    rim = np.concatenate([up, up * n + GRID, GRID * n + down, down * n])
-    after = np.roll(rim, -1)
-    offset = n * n
-    edge = np.concatenate([np.stack([rim, rim + offset, after], 1), np.stack([after, rim + offset, after + offset], 1)])
-    faces = np.concatenate([face, face[:, ::-1] + offset, edge])
-    return trimesh.Trimesh(np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces, process=False)
 
 
 def _box(size: tuple[float, float, float], z: float) -> trimesh.Trimesh:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from optics.aperture import Circle, Rectangle
+from optics.aperture import Circle, Ellipse, Rectangle
 
 
 def test_circle() -> None:
@@ -23,6 +23,24 @@ def test_rectangle() -> None:
     assert bool(np.all(box.contains(*outline.T)))
 
 
+def test_ellipse() -> None:
+    ellipse = Ellipse(2.0, 1.0, (0.5, -1.0))
+    x, y = np.array([2.5, 2.51, 0.5, 0.5, 1.9, 2.0]), np.array([-1.0, -1.0, 0.0, 0.01, -0.3, -0.3])
+    np.testing.assert_array_equal(ellipse.contains(x, y), [1, 0, 1, 0, 1, 0])
+    assert ellipse.bounds == (-1.5, 2.5, -2.0, 0.0)
+    outline = ellipse.outline(33)
+    np.testing.assert_allclose(outline[0], outline[-1], atol=1e-15)
+    u, v = ((outline - (0.5, -1.0)) / (2.0, 1.0)).T
+    np.testing.assert_allclose(u * u + v * v, 1.0)
+    assert outline[1, 1] > outline[0, 1]  # counterclockwise
+
+
+def test_a_round_ellipse_is_a_circle() -> None:
+    xy = np.random.default_rng(1).uniform(-2.0, 2.0, (2, 500))
+    np.testing.assert_array_equal(Ellipse(1.0, 1.0).contains(*xy), Circle(1.0).contains(*xy))
+    assert Ellipse(1.0, 1.0).bounds == Circle(1.0).bounds
+
+
 @pytest.mark.parametrize("sizes", [(0.0, 0.0), (-1.0, 0.0), (1.0, 1.0), (1.0, -0.1), (float("nan"), 0.0)])
 def test_bad_circles_are_refused(sizes: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="aperture"):
@@ -33,3 +51,9 @@ def test_bad_circles_are_refused(sizes: tuple[float, float]) -> None:
 def test_bad_rectangles_are_refused(sizes: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="aperture"):
         Rectangle(*sizes)
+
+
+@pytest.mark.parametrize("sizes", [(0.0, 1.0), (1.0, -1.0), (float("nan"), 1.0)])
+def test_bad_ellipses_are_refused(sizes: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="aperture"):
+        Ellipse(*sizes)

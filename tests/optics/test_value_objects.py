@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 
-from optics.aperture import Circle, Rectangle
+from optics.aperture import Circle, Ellipse, Rectangle
 from optics.element import Element, Interaction
 from optics.figure import ZernikeFigure
 from optics.frozen_map import FrozenMap
@@ -15,21 +15,33 @@ from optics.glass import N_BK7, Glass, ThermalDispersion
 from optics.material import Material, material
 from optics.pose import Pose
 from optics.rotation import about_axis
+from optics.solid import Coating, Face, Solid
 from optics.surface import Surface
+from optics.system import Medium
 from optics.tree import Body, Motion
 
 FIGURE = ZernikeFigure(0.5, (0.1, 0.0), {4: 1e-7, 5: 2e-7})
 SURFACE = Surface(-0.15, -1.5, (1e-5, 2e-6), FIGURE)
+FACE = Face("window", "a", Coating.TRANSMITTING, Pose(about_axis(0, 0.3), np.array([1.0, 2.0, 3.0])))
 # each with another value of its class
 VALUES = [
     (Pose(about_axis(0, 0.3), np.array([1.0, 2.0, 3.0])), Pose()),
     (Body("a/b", Pose(), {"tip": (1.0, 2.0, 3.0)}), Body("a/b", Pose(), {"tip": (1.0, 2.0, 3.5)})),
     (Motion((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), "tip", 1e-6, {4: 1e-9}), Motion(figure={4: 1e-9})),
+    (
+        Motion(stretch=1e-6, index=1e-5, index_gradient=(1e-6, 0.0, 2e-6)),
+        Motion(stretch=1e-6, index=1e-5, index_gradient=(1e-6, 0.0, 3e-6)),
+    ),
     (Circle(1.0, (0.1, 0.2), 0.3), Circle(1.0)),
+    (Ellipse(1.0, 2.0, (0.1, 0.2)), Ellipse(1.0, 2.0)),
     (Rectangle(1.0, 2.0, (0.1, 0.2)), Rectangle(1.0, 2.0)),
     (FIGURE, ZernikeFigure(0.5)),
     (SURFACE, SURFACE.with_figure(None)),
     (Element("e", "a/b", SURFACE, Interaction.REFLECT, Circle(1.0)), Element("e", "a/b", SURFACE, Interaction.PASS)),
+    (Element("e", "a", SURFACE, Interaction.TOTAL, solid="a"), Element("e", "a", SURFACE, Interaction.TOTAL)),
+    (FACE, Face("window", "a", Coating.TRANSMITTING, Pose())),
+    (Solid("a", "N-BK7", (FACE,)), Solid("a", "N-BK7", (FACE,), transparent=False)),
+    (Medium("a"), Medium(None, 1.5)),
     (N_BK7, dataclasses.replace(N_BK7, thermal=None)),
     (ThermalDispersion(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), ThermalDispersion(1.0, 2.0, 3.0, 4.0, 5.0, 6.5)),
     (material("Invar"), material("SiC")),
@@ -37,7 +49,21 @@ VALUES = [
 ]
 NAMESPACE = {
     c.__name__: c
-    for c in (Pose, Body, Motion, Circle, Rectangle, ZernikeFigure, Surface, Element, Glass, Material, FrozenMap)
+    for c in (
+        Pose,
+        Body,
+        Motion,
+        Circle,
+        Ellipse,
+        Rectangle,
+        Medium,
+        ZernikeFigure,
+        Surface,
+        Element,
+        Glass,
+        Material,
+        FrozenMap,
+    )
 } | {"array": np.array, "ThermalDispersion": ThermalDispersion}
 
 
@@ -55,7 +81,7 @@ class TestValue:
     def test_repr_says_what_it_is(self, value, other) -> None:
         assert repr(value).startswith(type(value).__name__)
         assert repr(value) != repr(other)
-        if "Interaction" not in repr(value):
+        if not any(enum in repr(value) for enum in ("Interaction", "Coating")):
             with np.printoptions(floatmode="unique", precision=17):
                 assert eval(repr(value), dict(NAMESPACE)) == value
 

@@ -1,19 +1,24 @@
 """scene.glb holds every body where the perturbed instrument has it."""
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
 
+from optics.solid import face_plane
 from optics.tree import Motion
 from scenes.channel import BASE
+from scenes.mirror_mesh import BOARD, CHIP, mirror_mesh
 from twin.light_paths import FIELDS, trace_light_paths
-from twin.scene_file import BOARD, build_scene, mirror_mesh
+from twin.scene_file import TUBE, build_scene
 
 TOLERANCE = 1e-3
 """Metres: meshes and float32 files are for looking at."""
 STATE = {
     "base/forward/M2": Motion(shift=(0.0, 0.0, 2e-3)),  # enough to be seen in a millimetre's tolerance
     "base/backward/focal_plane": Motion(rotate=(0.0, 0.0, 0.02)),
+    "base/backward/monitor": Motion(shift=(0.0, 2e-3, 0.0)),
 }
 
 
@@ -91,6 +96,79 @@ def test_boxes_of_mirrors_and_detectors(gf7_pair, loaded):
         assert face[1, 1] - face[0, 1] == pytest.approx(2 * radius, abs=TOLERANCE)
         checked += 2
     assert checked == 2 * 4 + 4 * 2
+
+
+def corners_of(solid, placed) -> np.ndarray:
+    """Corners of a convex body in the base frame: of all meetings of three faces those that no fourth one cuts off."""
+    points, normals = (np.array(a) for a in zip(*(face_plane(f, placed) for f in solid.faces), strict=True))
+    out = []
+    for three in itertools.combinations(range(len(normals)), 3):
+        if abs(np.linalg.det(normals[list(three)])) > 1e-6:
+            corner = np.linalg.solve(normals[list(three)], np.einsum("fi,fi->f", normals, points)[list(three)])
+            if np.all(np.einsum("fi,fi->f", normals, corner - points) < 1e-9):
+                out.append(corner)
+    return np.array(out)
+
+
+def test_boxes_of_prisms(gf7_pair, loaded):
+    """Every solid stands where its faces are; the prisms of the backward camera 2 mm beside their nominal place."""
+    scene, placed = loaded
+    nominal = gf7_pair.assembly.place()
+    assert len(gf7_pair.solids) == 2 * 4 + 1
+    for solid in gf7_pair.solids:
+        corners = corners_of(solid, placed)
+        found = box(scene, solid.path)
+        assert np.abs(found - [corners.min(axis=0), corners.max(axis=0)]).max() < 1e-6  # float32 at a few metres
+        moved = np.abs(corners_of(solid, nominal).mean(axis=0) - corners.mean(axis=0)).max()
+        assert (moved > 1e-3) == ("backward/monitor" in solid.path)
+        if solid.path.endswith("prism_180"):
+            # the window is at the given distance along the line of sight, and faces the camera
+            window = nominal.pose(solid.path)
+            origin = nominal.pose(f"{BASE}/{solid.path.split('/')[1]}")
+            away = origin.inverse().apply(window.translation)
+            assert away[2] == pytest.approx(gf7_pair.spec.monitor.prism_180.distance, abs=0.05)
+
+
+def test_boxes_of_facets_and_beams(gf7_pair, paths, loaded):
+    """Facets' coatings lie on the central prism's faces; tubes of light are where the rays are, half a tube wide."""
+    scene, placed = loaded
+    planes = [face_plane(face, placed) for face in gf7_pair.solids[-1].faces]
+    for channel in gf7_pair.channels:
+        matrix, geometry = scene.graph.get(channel.face_body)
+        disc = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
+        height = np.max([(disc - point) @ normal for point, normal in planes], axis=0)  # of a convex body
+        assert height.min() == pytest.approx(0.0, abs=1e-6)
+        assert height.max() == pytest.approx(CHIP, abs=1e-6)
+    for beam in paths.beams:
+        low, high = box(scene, f"light/{beam.camera}/{beam.name.replace(' ', '_')}")
+        middle, rays = beam.vertices[0], beam.vertices.reshape(-1, 3)
+        assert np.all(low < middle.min(axis=0))
+        assert np.all(high > middle.max(axis=0))
+        assert np.all(low > rays.min(axis=0) - 1.01 * TUBE)
+        assert np.all(high < rays.max(axis=0) + 1.01 * TUBE)
+        if beam.is_monitor:  # 25 elements between pinhole and area CCD, both within 4 mm of each other
+            assert beam.vertices.shape[1] == 2 + 2 * (3 + 5 + 4) + 1
+            assert np.linalg.norm(middle[-1] - middle[0]) < 4e-3
+
+
+def test_glass_can_be_looked_through(gf7_pair, loaded):
+    scene, _ = loaded
+    for solid in gf7_pair.solids:
+        material = scene.geometry[solid.path].visual.material
+        assert (material.alphaMode == "BLEND") == solid.transparent
+        assert (material.baseColorFactor[3] < 200) == solid.transparent
+    assert scene.geometry["base/forward/M1"].visual.material.alphaMode != "BLEND"
+
+
+@pytest.mark.parametrize("growth", ["scale", "stretch"])
+def test_grown_bodies_are_drawn_once_as_large(gf7_pair, paths, growth):
+    """One percent of growth of a prism shows as one percent."""
+    path = gf7_pair.solids[0].path
+    boxes = []
+    for state in ({}, {path: Motion(**{growth: 0.01})}):
+        scene = build_scene(gf7_pair, type(paths)(paths.beams, gf7_pair.assembly.place([state])))
+        boxes.append(np.ptp(scene.geometry[path].vertices, axis=0))
+    assert boxes[1] / boxes[0] == pytest.approx([1.01] * 3, rel=1e-9)
 
 
 def test_the_state_is_seen(gf7_pair, loaded):

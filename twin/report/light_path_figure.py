@@ -6,9 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
+from scipy.spatial import ConvexHull
 
+from optics.solid import Solid, solid_mesh
 from scenes.camera_model import CameraModel
-from scenes.channel import BASE, CENTRAL_PRISM
+from scenes.channel import BASE, CENTRAL_PRISM, SIDES
 from scenes.instrument_model import Instrument
 from twin.light_paths import RIM, Beam, LightPaths
 from twin.report.svg import (
@@ -30,6 +32,7 @@ FIELD_COLOURS = {"left edge": SKY, "centre": BLUE, "right edge": PURPLE}
 SIDE_COLOURS = {"left": VERMILION, "right": ORANGE}
 ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
+_GLASS, _BLOCK = (0.34, 0.71, 0.91, 0.25), (0.0, 0.62, 0.45, 0.22)  # fills, red, green, blue and opacity
 _UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the stop: the ones in the plane of symmetry
 
 
@@ -43,9 +46,7 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
         axes = figure.subplots()
         for camera in instrument.cameras:
             _camera_side(axes, instrument, paths, camera)
-        prism = paths.placed.pose(CENTRAL_PRISM).translation
-        axes.plot(prism[0], prism[2], marker="s", ms=9, color=GREEN, mec=INK, mew=0.6, zorder=5)
-        _label(axes, "central prism\n(reference)", prism[[0, 2]], (10, 0), "center", across="left")
+        _prisms(axes, instrument, paths)
         axes.set(xlabel="base X, flight direction [m]", ylabel="base Z, toward the scene [m]", aspect="equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.grid(color=LIGHT, lw=0.5)
@@ -56,8 +57,10 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
             Line2D([], [], color=VERMILION, lw=1.2, label="monitor beam, left channel (out and back)"),
             Line2D([], [], color=INK, lw=3, label="mirrors, clear apertures"),
             Line2D([], [], color=GREEN, lw=3, label="focal plane; return faces"),
+            Patch(fc=_GLASS, ec=INK, lw=0.8, label="glass prisms"),
+            Patch(fc=_BLOCK, ec=INK, lw=0.8, label="central prism, common reference"),
         ]
-        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return to_svg(figure)
 
 
@@ -84,17 +87,41 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
             assert aperture is not None
             radius = aperture.bounds[1]
             ends = pose.apply(radius * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
-            axes.plot(*_widest(ends), color=GREEN, lw=4, solid_capstyle="butt", zorder=5)
-    face = monitor.vertices[0, 1 + len(model.mirrors)]
-    side = np.sign(face[0] - imaging.vertices[0, 0, 0]) or 1.0  # the arrow of the line of sight is on the other side
-    _label(axes, f"{camera}\nreturn faces", face[[0, 2]], (22.0 * side, 9.0), "bottom")
+            axes.plot(*_widest(ends), color=GREEN, lw=3, solid_capstyle="butt", zorder=5)
     origin = placed.pose(f"{BASE}/{camera}")
     end = imaging.vertices[0, 0]
     tip = end + ARROW * (end - imaging.vertices[0, 1]) / np.linalg.norm(end - imaging.vertices[0, 1])
     axes.annotate("", xy=tip[[0, 2]], xytext=end[[0, 2]], arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.3})
     look_deg = float(np.degrees(instrument.spec.cameras[camera].look))
     text = f"{camera}, look {look_deg:+.4g}°".replace("-", "\N{MINUS SIGN}")
-    _label(axes, text, origin.translation[[0, 2]], (-4, -22), "top", bold=True)
+    first = placed.pose(f"{BASE}/{camera}/{model.mirrors[0]}").apply(_section(model, model.mirrors[0]))
+    _label(axes, text, np.array([origin.translation[0], first[:, 2].min()]), (-4, -22), "top", bold=True)
+
+
+def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
+    """Outlines of all glass bodies; left and right ones lie behind each other and get one label."""
+    small = []
+    for solid in instrument.solids:
+        outline = _outline(solid, paths)
+        fill = _GLASS if solid.transparent else _BLOCK
+        axes.add_patch(Polygon(outline, closed=True, fc=fill, ec="none", zorder=1.6))
+        axes.add_patch(Polygon(outline, closed=True, fill=False, ec=INK, lw=0.8, zorder=3))
+        if not solid.transparent:
+            middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
+            _label(axes, "central prism", np.array([middle, outline[:, 1].min()]), (0, -4), "top")
+        elif solid.path.endswith("prism_0"):
+            small.append(outline)
+        elif f"/{SIDES[0]}/" in solid.path:
+            _label(axes, "180° prism", outline[np.argmax(outline[:, 1])], (0, 5), "bottom")
+    corners = np.concatenate(small)
+    among = np.array([np.mean([outline[:, 0].mean() for outline in small]), corners[:, 1].max()])
+    _label(axes, "0° prisms", among, (0, 6), "bottom")
+
+
+def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
+    """A convex body as the side view sees it: corners of its outline in order, x and z, metres."""
+    corners = paths.placed.pose(solid.path).apply(solid_mesh(solid, paths.placed).mesh.vertices)[:, [0, 2]]
+    return np.asarray(corners[ConvexHull(corners).vertices])
 
 
 def _focal_plane(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str) -> None:
@@ -102,7 +129,10 @@ def _focal_plane(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     pose = paths.placed.pose(f"{BASE}/{camera}/focal_plane")
     bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))
     axes.plot(bar[:, 0], bar[:, 2], color=GREEN, lw=4, solid_capstyle="butt", zorder=5)
-    _label(axes, "focal plane", pose.translation[[0, 2]], (0, 11), "bottom")
+    # beside the monitor beams, which go to the central prism
+    prism = paths.placed.pose(CENTRAL_PRISM).translation
+    aside = -17.0 if prism[0] > pose.translation[0] else 10.0
+    _label(axes, "focal plane", pose.translation[[0, 2]], (aside, 10.0), "bottom")
 
 
 def _widest(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,14 +166,13 @@ def _label(
     offset: tuple[float, float],
     vertical: str,
     bold: bool = False,
-    across: str = "center",
 ) -> None:
     axes.annotate(
         text,
         xy=(float(at[0]), float(at[1])),
         xytext=offset,
         textcoords="offset points",
-        ha=across,
+        ha="center",
         va=vertical,
         fontsize=8.5,
         fontweight="bold" if bold else "normal",

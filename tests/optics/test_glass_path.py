@@ -1,0 +1,193 @@
+"""Light through glass bodies against closed forms: plates, prisms, total reflection, growth and change of index."""
+
+import numpy as np
+import pytest
+
+from optics.aperture import Ellipse
+from optics.assembly import Assembly
+from optics.element import Element, Interaction
+from optics.pose import Pose
+from optics.rotation import about_axis
+from optics.surface import plane
+from optics.system import Medium, assemble, media_along
+from optics.trace import make_rays, trace
+from optics.tree import Body, Motion, RigidTree
+
+N = 1.52
+REFRACT, TOTAL, PASS, REFLECT = Interaction.REFRACT, Interaction.TOTAL, Interaction.PASS, Interaction.REFLECT
+
+
+def glass(*faces: tuple[str, Pose, Interaction], screen: Pose | None = None, index: float = N) -> Assembly:
+    """A body with faces on bodies of their own, and a screen in the world; outward normals along +z."""
+    bodies = [Body("glass"), *(Body(f"glass/{name}", pose) for name, pose, _ in faces)]
+    elements = [Element(name, f"glass/{name}", plane(), what, solid="glass") for name, _, what in faces]
+    if screen is not None:
+        bodies.append(Body("screen", screen))
+        elements.append(Element("screen", "screen", plane(), PASS))
+    names = tuple(e.name for e in elements)
+    return Assembly(RigidTree(tuple(bodies)), {e.name: e for e in elements}, {"all": names}, {"glass": index})
+
+
+def at(z: float, angle: float = 0.0) -> Pose:
+    """A face whose outward normal is turned from +z about y."""
+    return Pose(about_axis(1, angle), np.array([0.0, 0.0, z]))
+
+
+def send(backend, assembly, position, direction, state=None):
+    """World position, direction (N, 3), path and validity (N,)."""
+    systems = assemble(assembly, ["all"], [state or {}])
+    traced = trace(backend, systems, make_rays(backend, np.array(position), np.array(direction)), world=True)
+    return tuple(a[0] for a in traced.numpy(traced.world))
+
+
+def slanted(angles) -> np.ndarray:
+    """Directions in the x-z plane at these angles to +z."""
+    angles = np.asarray(angles)
+    return np.stack([np.sin(angles), 0.0 * angles, np.cos(angles)], axis=-1)
+
+
+def test_plate() -> None:
+    """Media of the plate's sequence, there and back."""
+    plate = glass(("front", at(0.0, np.pi), REFRACT), ("back", at(0.05), REFRACT), screen=at(0.2))
+    inside = Medium("glass")
+    assert media_along(plate.sequence("all")) == [Medium(), inside, Medium(), Medium()]
+    back = plate.with_sequence("back", ("back", "front"))
+    assert media_along(back.sequence("back")) == [Medium(), inside, Medium()]
+    mirror = Element("mirror", "glass/back", plane(), REFLECT, solid="glass")
+    there = plate.with_element(mirror).with_sequence("mangin", ("front", "mirror", "front"))
+    assert media_along(there.sequence("mangin")) == [Medium(), inside, inside, Medium()]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 10.0, 45.0, 80.0])
+def test_plane_parallel_plate(backend, degrees) -> None:
+    """Displaced by t sin(i) (1 - cos i / sqrt(n^2 - sin^2 i)), with the direction and the path of the textbook."""
+    thick, far, i = 0.05, 0.2, np.radians(degrees)
+    plate = glass(("front", at(0.0, np.pi), REFRACT), ("back", at(thick), REFRACT), screen=at(far))
+    position, direction, path, valid = send(backend, plate, np.zeros((1, 3)), slanted([i]))
+    assert valid.all()
+    assert np.abs(direction - slanted([i])).max() < 3e-15
+    root = np.sqrt(N**2 - np.sin(i) ** 2)
+    shift = thick * np.sin(i) * (1.0 - np.cos(i) / root)
+    straight = far * np.tan(i)
+    # lengths near 1 m at 80 degrees: rounding of 1e-16 each, over a few operations
+    assert (straight - position[0, 0]) * np.cos(i) == pytest.approx(shift, abs=3e-15)
+    assert path[0] == pytest.approx(N**2 * thick / root + (far - thick) / np.cos(i), rel=2e-15)
+
+
+def wedge(apex: float) -> Assembly:
+    """A prism whose faces lean by half the apex angle to either side of the y-z plane's normal, light along +z."""
+    return glass(("in", at(0.0, np.pi - 0.5 * apex), REFRACT), ("out", at(0.1, 0.5 * apex), REFRACT))
+
+
+def deviation(direction: np.ndarray, into: np.ndarray) -> np.ndarray:
+    """Angle between directions, right-handed about y, exact for small angles."""
+    across = into[:, 2] * direction[:, 0] - into[:, 0] * direction[:, 2]
+    return np.arctan2(across, np.sum(direction * into, axis=-1))
+
+
+@pytest.mark.parametrize("apex_deg", [1.0, 10.0, 60.0])
+def test_prism(backend, apex_deg) -> None:
+    """Deviation i + e - A with e from Snell's law at both faces; least where the path is symmetric."""
+    apex = np.radians(apex_deg)
+    least = 2.0 * np.arcsin(N * np.sin(0.5 * apex)) - apex
+    incidence = 0.5 * (apex + least) + np.radians([-8.0, -3.0, -1e-3, 0.0, 1e-3, 3.0, 8.0])
+    # the entering face's inward normal is turned by -A/2 from +z about y; incidence counts away from the apex
+    into = slanted(incidence - 0.5 * apex)
+    _, direction, _, valid = send(backend, wedge(apex), np.zeros(into.shape), into)
+    assert valid.all()
+    got = np.abs(deviation(direction, into))
+    emergent = np.arcsin(np.sin(apex) * np.sqrt(N**2 - np.sin(incidence) ** 2) - np.cos(apex) * np.sin(incidence))
+    assert got == pytest.approx(incidence + emergent - apex, abs=3e-15)
+    assert got[3] == pytest.approx(least, abs=1e-15)
+    assert np.all(got[[0, 1, 5, 6]] > got[3])
+    # at the least the deviation is stationary: 1e-3 degrees aside change it by order 1e-10
+    assert np.all(np.abs(got[[2, 4]] - least) < 3e-9 * apex)
+
+
+@pytest.mark.parametrize("apex", [1e-3, 1e-2, 0.1])
+def test_thin_prism(backend, apex) -> None:
+    """(n - 1) A, and beyond that n (n^2 - 1) A^3 / 24; the next term is of fifth order."""
+    least = 2.0 * np.arcsin(N * np.sin(0.5 * apex)) - apex
+    into = slanted([0.5 * (apex + least) - 0.5 * apex])
+    _, direction, _, _ = send(backend, wedge(apex), np.zeros((1, 3)), into)
+    third = N * (N**2 - 1.0) * apex**3 / 24.0
+    got = abs(deviation(direction, into)[0])
+    assert got == pytest.approx((N - 1.0) * apex + third, abs=apex**5 + 1e-15)
+    assert got - (N - 1.0) * apex > 0.9 * third - 1e-15
+
+
+def test_critical_angle(backend) -> None:
+    """Total reflection inside a right-angled prism begins where n sin = 1; the same ray refracts just before."""
+    critical = np.arcsin(1.0 / N)
+    # the slanted face's normal is at 45 degrees; inside, the ray meets it at 45 degrees less its own angle
+    inside = np.pi / 4.0 - critical + np.array([-0.3, -1e-9, 1e-9, 0.1])
+    into = slanted(np.arcsin(N * np.sin(inside)))
+    beyond = np.array([True, True, False, False])
+    start = np.zeros(into.shape) - 0.01 * into
+    faces = ("in", at(0.0, np.pi), REFRACT)
+    reflected = send(backend, glass(faces, ("slanted", at(0.05, np.pi / 4.0), TOTAL)), start, into)
+    assert np.array_equal(reflected[3], beyond)
+    # reflected by a plane at 45 degrees: x and z change places with the opposite sign
+    want = -slanted(inside)[:, ::-1]
+    assert np.abs(reflected[1] - want).max() < 1e-15
+    refracted = send(backend, glass(faces, ("slanted", at(0.05, np.pi / 4.0), REFRACT)), start, into)
+    assert np.array_equal(refracted[3], ~beyond)
+
+
+def test_no_total_reflection_from_outside(backend) -> None:
+    outside = glass(("slanted", at(0.05, np.pi - 1.5), TOTAL))
+    assert not send(backend, outside, np.zeros((1, 3)), slanted([0.0]))[3].any()
+
+
+def test_index_and_growth_change_the_path(backend) -> None:
+    """dn t, and n t times the growth; a stretch moves the far face but does not enlarge it, as a scale does."""
+    thick = 0.05
+    plate = glass(("front", at(0.0, np.pi), REFRACT), ("back", at(thick), REFRACT), screen=at(0.2))
+    start, along = np.zeros((1, 3)), slanted([0.0])
+    nominal = send(backend, plate, start, along)[2][0]
+    assert nominal == pytest.approx(0.15 + N * thick, rel=1e-15)
+    for motion, change in (
+        (Motion(index=1e-3), 1e-3 * thick),
+        (Motion(stretch=1e-3), (N - 1.0) * thick * 1e-3),
+        (Motion(scale=1e-3), (N - 1.0) * thick * 1e-3),
+        (Motion(stretch=1e-3, index=-1e-3), (N - 1.0) * thick * 1e-3 - 1e-3 * thick * 1.001),
+        (Motion(index=1e-3, index_gradient=(0.0, 0.0, 2e-3)), 1e-3 * thick + 1e-3 * thick**2),
+    ):
+        assert send(backend, plate, start, along, {"glass": motion})[2][0] - nominal == pytest.approx(change, abs=1e-15)
+    placed = plate.place([{"glass": Motion(stretch=0.5)}, {"glass": Motion(scale=0.5)}])
+    back = placed.index["glass/back"]
+    assert placed.translation[:, back, 2] == pytest.approx(1.5 * thick)
+    assert placed.scale[:, back] == pytest.approx([1.0, 1.5])
+    assert placed.scale[:, placed.index["glass"]] == pytest.approx([1.5, 1.5])
+
+
+def test_elliptic_aperture_vignettes(backend) -> None:
+    element = Element("e", "e", plane(), PASS, Ellipse(0.03, 0.01, (0.005, -0.002)))
+    assembly = Assembly(RigidTree((Body("e"),)), {"e": element}, {"all": ("e",)})
+    xy = np.random.default_rng(3).uniform(-0.04, 0.04, (400, 2))
+    start = np.column_stack([xy, np.full(400, -1.0)])
+    valid = send(backend, assembly, start, np.broadcast_to([0.0, 0.0, 1.0], start.shape))[3]
+    inside = ((xy[:, 0] - 0.005) / 0.03) ** 2 + ((xy[:, 1] + 0.002) / 0.01) ** 2 <= 1.0
+    assert np.array_equal(valid, inside)
+    assert 20 < inside.sum() < 100
+
+
+def test_what_an_assembly_refuses() -> None:
+    face = Element("face", "glass", plane(), REFRACT, solid="glass")
+    with pytest.raises(ValueError, match="'glass', which has no refractive index"):
+        Assembly(RigidTree((Body("glass"),)), {"face": face}, {})
+    with pytest.raises(ValueError, match="unknown body 'prism'"):
+        Assembly(RigidTree((Body("glass"),)), {}, {}, {"prism": 1.5})
+
+
+def test_glasses_of_one_batch_may_differ(backend) -> None:
+    """Two plates of different index are one structure; each ray sees its own."""
+    bodies, elements, sequences = [], {}, {}
+    for name in ("a", "b"):
+        bodies += [Body(name), Body(f"{name}/front", at(0.0, np.pi)), Body(f"{name}/back", at(0.05))]
+        for face in ("front", "back"):
+            elements[f"{name}_{face}"] = Element(f"{name}_{face}", f"{name}/{face}", plane(), REFRACT, solid=name)
+        sequences[name] = (f"{name}_front", f"{name}_back")
+    both = Assembly(RigidTree(tuple(bodies)), elements, sequences, {"a": 1.4, "b": 1.9})
+    traced = trace(backend, assemble(both, ["a", "b"]), make_rays(backend, np.zeros(3), np.array([0.0, 0.0, 1.0])))
+    assert traced.numpy()[2][:, 0] == pytest.approx([0.05 * 1.4, 0.05 * 1.9], rel=1e-15)

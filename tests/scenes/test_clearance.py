@@ -1,0 +1,296 @@
+"""Bodies that stand in each other, prisms in the way of light, and beams that miss a prism: found, and told."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull, Delaunay
+from typer.testing import CliRunner
+
+import twin.render as command
+from optics.rotation import rotation_matrix
+from scenes import obstruction
+from scenes.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, separation
+from scenes.errors import InputError
+from scenes.instrument_model import build_instrument
+from scenes.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
+from scenes.obstruction import RAYS, find_obstructions
+
+PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
+PAIR = re.sub(r", tilt: \[[^]]*\]", "", PAIR)  # prisms square to the beam, for round numbers
+PAIR = re.sub(r" +#.*", "", PAIR)
+ONLY_180 = "prism_180: {material: fused silica, distance: 2.4 m, width: 60 mm"
+ONLY_0 = "shift: 100 mm, width: 60 mm"
+
+
+def changed(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = PAIR
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "own.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def built(path: Path, backend):
+    spec = load_instrument(path)
+    return build_instrument(spec, {s.camera: load_camera(s.camera) for s in spec.cameras.values()}, backend)
+
+
+def cube(size: float = 1.0) -> np.ndarray:
+    return 0.5 * size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+
+
+@pytest.mark.parametrize(
+    ("move", "want"),
+    [
+        ((1.5, 0, 0), 0.5),
+        ((1.5, 2.0, 0), np.hypot(0.5, 1.0)),
+        ((2.0, 3.0, 1.5), np.sqrt(1 + 4 + 0.25)),
+        ((0.75, 0.1, 0.2), -0.25),
+        ((0.0, 0.0, 0.0), -1.0),
+        ((1.0 + 1e-5, 0, 0), 1e-5),
+    ],
+    ids=["face to face", "edge to edge", "corner to corner", "overlap", "concentric", "nearly"],
+)
+def test_separation_of_cubes(move, want) -> None:
+    """In any attitude; Qhull merges faces within some 1e-14 of the size."""
+    turn = rotation_matrix(np.array([0.3, -1.2, 0.7]))
+    assert separation(cube() @ turn.T, (cube() + move) @ turn.T) == pytest.approx(want, abs=1e-12)
+    assert separation((cube() + move) @ turn.T, cube() @ turn.T) == pytest.approx(want, abs=1e-12)
+
+
+def test_separation_of_crossed_edges() -> None:
+    """Two bars across each other, nearest at edges whose cross product is no face's normal: SAT over faces alone says
+    too little.
+    """
+    bar = cube() * [4.0, 1.0, 1.0]
+    first = bar @ rotation_matrix(np.array([np.pi / 4.0, 0.0, 0.0])).T
+    second = bar @ rotation_matrix(np.array([np.pi / 4.0, 0.0, 0.0])).T @ rotation_matrix([0.0, 0.0, np.pi / 2.0]).T
+    for gap in (0.3, -0.2):
+        assert separation(first, second + np.array([0.0, 0.0, np.sqrt(2.0) + gap])) == pytest.approx(gap, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
+def test_reference_instruments_have_room(name, instrument) -> None:
+    model = instrument(name)
+    assert find_overlaps(model) == ()
+    check_clearance(model)
+    bodies = convex_bodies(model)
+    assert len(bodies) == len(model.solids) + 2 * 4
+    for solid in model.solids:  # the hull has the body's own middle
+        middle = bodies[solid.path].mean(axis=0)
+        assert np.linalg.norm(middle - model.assembly.nominal_pose(solid.path).translation) < 1.5
+
+
+@pytest.fixture
+def bare(backend, monkeypatch):
+    """Function: changes of gf7_pair -> instrument, without the check that would refuse it."""
+    import scenes.instrument_model
+
+    monkeypatch.setattr(scenes.instrument_model, "check_clearance", lambda instrument: None, raising=False)
+    return lambda folder, *changes: built(changed(folder, *changes), backend)
+
+
+OVERLAPS = [
+    (
+        ("position: [0.15 m, 0 m, 0.5 m]", "position: [-0.5 m, 0 m, -0.1 m]"),
+        {("base/backward/M3", "base/central_prism")},
+        (6, "central_prism.position", "a position"),
+    ),
+    (
+        ("distance: 0.5 m", "distance: 30 mm"),
+        {
+            (f"base/{c}/monitor/{s}/prism_0", "base/central_prism")
+            for c in ("forward", "backward")
+            for s in ("left", "right")
+        },
+        (13, "monitor.prism_0.distance", "a distance"),
+    ),
+    (
+        ("field: 1.22 deg", "field: 0.3 deg"),
+        {tuple(f"base/{c}/monitor/{s}/prism_180" for s in ("left", "right")) for c in ("forward", "backward")},
+        (12, "monitor.prism_180.distance", "field"),
+    ),
+    (
+        ("position: [-1.4 m, 0 m, 0 m]", "position: [1.4 m, 0.6 m, 0 m]"),
+        None,
+        (5, "cameras.backward.position", "a position"),
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "pairs", "told"), OVERLAPS, ids=["central", "rhomboid", "field", "camera"])
+def test_bodies_in_each_other(change, pairs, told, bare, tmp_path) -> None:
+    model = bare(tmp_path, change)
+    found = find_overlaps(model)
+    if pairs is not None:
+        assert {tuple(sorted((o.first, o.second))) for o in found} == {tuple(sorted(p)) for p in pairs}
+    assert [o.depth for o in found] == sorted((o.depth for o in found), reverse=True)
+    with pytest.raises(InputError) as caught:
+        check_clearance(model)
+    line, key, remedy = told
+    issues = {(i.line, ".".join(map(str, i.key))): i for i in caught.value.issues}
+    assert (line, key) in issues
+    assert remedy in issues[line, key].allowed
+    for overlap, issue in zip(found, caught.value.issues, strict=True):
+        assert overlap.first in issue.problem
+        assert overlap.second in issue.problem
+        assert f"{1e3 * overlap.depth:.3g} mm" in issue.problem
+        assert issue.file.endswith("own.yaml")
+
+
+def test_depth_of_an_overlap(bare, tmp_path) -> None:
+    """The rhomboid's half height is 33 mm, its exit face square to the beam, as the facet: 30 mm leave 3 mm."""
+    found = find_overlaps(bare(tmp_path, ("distance: 0.5 m", "distance: 30 mm")))
+    assert [o.depth for o in found] == pytest.approx([3e-3] * 4, abs=1e-7)  # the facet leans some 10 urad
+
+
+def test_a_gap_below_the_least(bare, tmp_path) -> None:
+    """10 um between rhomboid and facet are too little, 100 um are enough."""
+    touching = bare(tmp_path, ("distance: 0.5 m", "distance: 33.01 mm"))
+    found = find_overlaps(touching)
+    assert len(found) == 4
+    assert all(-LEAST_GAP < o.depth <= 0.0 for o in found)
+    with pytest.raises(InputError, match=r"is only .* um from base/central_prism"):
+        check_clearance(touching)
+    check_clearance(bare(tmp_path, ("distance: 0.5 m", "distance: 33.1 mm")))
+
+
+REFUSED = [
+    (
+        [("distance: 0.5 m", "distance: 30 mm")],
+        13,
+        ["monitor.prism_0.distance", "prism_0 reaches 3 mm into base/central"],
+    ),
+    (
+        [(ONLY_180, f"{ONLY_180}, angle_errors: {{roof_a: [-1 deg, 1 deg], roof_b: [1 deg, 1 deg]}}")],
+        12,
+        [
+            "monitor.prism_180: the middle of the beam forward/left misses forward/left/prism_180/",
+            "base/forward/monitor",
+        ],
+    ),
+    (
+        [("width: 60 mm}\n  prism_0", "width: 30 mm}\n  prism_0")],
+        12,
+        ["monitor.prism_180.width: the prism is narrower than the beam: 30 mm for", "50 mm", "at least 50 mm"],
+    ),
+    ([(ONLY_0, "shift: 100 mm, width: 40 mm")], 13, ["monitor.prism_0.width", "narrower", "40 mm"]),
+    ([(ONLY_0, "shift: 50 mm, width: 60 mm")], 13, ["monitor.prism_0.shift", "prism_0", "at least 63 mm"]),
+    (
+        [("aperture: 50 mm", "aperture: 59 mm"), ("spread: [60 mm, 50 mm]", "spread: [20 mm, 20 mm]")],
+        14,
+        ["monitor.return_face.aperture: base/central_prism", "return_face reaches", "over the edge of its face"],
+    ),
+    ([("height: 60 mm", "height: 1 mm")], 6, ["central_prism: base/central_prism", "cut off"]),
+    ([("field: 1.22 deg", "field: 40 deg")], 9, ["monitor.field", "forward/left"]),
+    (
+        [("wavelength: 650 nm", "wavelength: 250 nm"), (ONLY_180, ONLY_180.replace("fused silica", "N-BK7"))],
+        12,
+        ["monitor.prism_180.material", "N-BK7", "250 nm", "300 to 2500 nm"],
+    ),
+    ([("wavelength: 650 nm", "wavelength: 4 um")], 12, ["monitor.prism_180.material", "4000 nm", "210 to 3710 nm"]),
+    (
+        [(ONLY_180, ONLY_180.replace("fused silica", "fused silca"))],
+        12,
+        ["monitor.prism_180.material: no such glass", "did you mean 'fused silica'?"],
+    ),
+    (
+        [("[0.15 m, 0 m, 0.5 m], material: fused silica", "[0.15 m, 0 m, 0.5 m], material: Invar")],
+        6,
+        ["central_prism.material: no such glass", "Zerodur"],
+    ),
+    (
+        [(ONLY_180, f"{ONLY_180}, angle_errors: {{roof: [1 arcsec, 0 arcsec]}}")],
+        12,
+        ["monitor.prism_180.angle_errors.roof: no such face", "roof_a, roof_b"],
+    ),
+    (
+        [(ONLY_0, f"{ONLY_0}, angle_errors: {{mirror: [1 arcsec, 0 arcsec]}}")],
+        13,
+        ["monitor.prism_0.angle_errors.mirror: no such face", "did you mean 'mirror_"],
+    ),
+    ([(ONLY_0, f"{ONLY_0}, angle_errors: {{exit: [1 arcsec, 2]}}")], 13, ["angle_errors.exit[1]", "without a unit"]),
+]
+
+
+@pytest.mark.parametrize(("changes", "line", "words"), REFUSED, ids=[words[0].split(":")[0] for _, _, words in REFUSED])
+def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> None:
+    """Exit code 2, the file with its line and key, and nothing written."""
+    changed(tmp_path, *changes)
+    job = tmp_path / "job.yaml"
+    job.write_text("instrument: own.yaml\n", "utf-8")
+    result = CliRunner().invoke(command.app, [str(job), "--out", str(tmp_path / "run"), "--quiet"])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 2
+    assert f"own.yaml:{line}: " in result.stderr
+    for word in words:
+        assert word in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_wide_beam_that_only_just_passes(backend, tmp_path) -> None:
+    """A face as wide as the prisms is built; one micrometre more is not."""
+    assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60 mm")), backend)
+    with pytest.raises(InputError, match="narrower than the beam"):
+        built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60.001 mm")), backend)
+
+
+@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
+def test_only_its_own_prisms_stand_before_a_camera(name, instrument, backend) -> None:
+    """Each 180-deg prism takes some 5 % of its camera's pupil, of which its channel uses the part that the return face
+    leaves; no prism stands in a monitor beam that is not its own.
+    """
+    model = instrument(name)
+    found = find_obstructions(model, backend)
+    assert {(o.beam, o.body) for o in found} == {
+        (f"{c.camera}/imaging", c.prism_body("prism_180")) for c in model.channels
+    }
+    for one in found:
+        camera = model.cameras[one.beam.partition("/")[0]]
+        clear = model.spec.monitor.prism_180.width**2 / camera.spec.entrance_pupil**2
+        assert one.used == pytest.approx(clear, abs=3.0 / RAYS)  # rays are spread evenly: a few at the edge
+        assert 0.03 < one.share < 0.07
+        assert one.used < one.share
+
+
+def test_segments_through_a_body() -> None:
+    """Against 4000 points along each of 300 random segments, as in a body seen from its corners."""
+    rng = np.random.default_rng(5)
+    corners = rng.normal(size=(12, 3))
+    planes = ConvexHull(corners).equations
+    segments = rng.normal(scale=2.0, size=(300, 1, 2, 3))
+    s = np.linspace(0.0, 1.0, 4000)[:, None]
+    points = segments[:, 0, :1] * (1.0 - s) + segments[:, 0, 1:] * s
+    inside = Delaunay(corners).find_simplex(points) >= 0
+    taken = obstruction._taken(segments, planes)
+    seen = inside.any(axis=1)
+    assert np.all(taken[seen])
+    assert np.sum(taken & ~seen) <= 1  # one that the points step over
+    assert 30 < seen.sum() < 270
+    # two segments are taken when one of them is; a body that is only touched takes nothing
+    both = np.stack([segments[:, 0], np.full((300, 2, 3), 9.0)], axis=1)
+    assert np.array_equal(obstruction._taken(both, planes), taken)
+    cube_planes = ConvexHull(cube()).equations
+    along = np.array([[[[-2.0, 0.0, 0.5], [2.0, 0.0, 0.5]]], [[[-2.0, 0.0, 0.0], [-0.5, 0.0, 0.0]]]])
+    assert not obstruction._taken(along, cube_planes).any()
+    assert obstruction._taken(along - [0.0, 0.0, 1e-5], cube_planes).tolist() == [True, False]
+
+
+def test_prisms_in_the_way(bare, backend, tmp_path) -> None:
+    """The central prism before the forward camera, and rhomboids that stand in their own beam to the 180-deg prism."""
+    model = bare(tmp_path, ("position: [0.15 m, 0 m, 0.5 m]", "position: [1.7 m, 0 m, 0.4 m]"))
+    found = {(o.beam, o.body): o for o in find_obstructions(model, backend)}
+    block = found["forward/imaging", "base/central_prism"]
+    assert block.used == 0.0
+    # 240 mm x 200 mm of block seen at 26 degrees, in a pupil 0.6 m wide, before M1 or behind it
+    pupil = 0.25 * np.pi * model.cameras["forward"].spec.entrance_pupil ** 2
+    face = 0.24 * 0.2 * np.cos(model.spec.cameras["forward"].look)
+    assert 0.7 * face / pupil < block.share < 2.5 * face / pupil
+    assert found["forward/left", "base/forward/monitor/left/prism_0"].share > 0.1
+    assert ("backward/imaging", "base/central_prism") not in found

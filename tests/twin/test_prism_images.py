@@ -1,0 +1,237 @@
+"""What turns and errors of the prisms do to the monitor's spots, in traced beams and in images.
+
+A channel's prisms map directions from the camera to the facet by M = -(1 + [V]) (180-deg prism, M = -1 without errors)
+or 1 + [V] (rhomboid); the way back is the transpose. The camera sees the facet's normal m as (1 - [V]) m, so that an
+error has the effect of turning the facet by -V, and a spot moves by twice that times the focal length.
+"""
+
+import numpy as np
+import pytest
+
+from analysis.recovery import measure_spots
+from optics.glass import glass
+from optics.system import assemble
+from optics.trace import make_rays, trace
+from optics.tree import Motion
+from scenes.instrument_model import build_instrument
+from scenes.load import load_camera
+from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
+from twin.monitor import MonitorPath
+
+ARCSEC = np.pi / 648000.0
+NAMES = ("gf7_pair", "monitor_pair")
+PRISMS = ("prism_180", "prism_0")
+STILL = 1e-3
+"""Pixels. A turned prism still displaces the beam, which passes a slightly other part of the camera's aberrations."""
+FACES = [
+    (prism, face)
+    for prism, faces in (
+        ("prism_180", ("window", "mirror", "roof_a", "roof_b")),
+        ("prism_0", ("entry", "mirror_a", "mirror_b", "exit")),
+    )
+    for face in faces
+]
+
+SIGNS = {face: -1.0 if face in ("mirror_b", "exit") else 1.0 for _, face in FACES}
+"""Of the errors of an imperfect prism: equal ones of a rhomboid's faces would cancel."""
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def path(request, instrument, backend) -> MonitorPath:
+    return MonitorPath(instrument(request.param), backend)
+
+
+def spots(path: MonitorPath, states) -> np.ndarray:
+    """Means of the traced beams on the CCDs, x and y in pixels from their middles, (C, S, 2)."""
+    rays = path.coarse.rays(states)
+    assert rays.valid.all()
+    mean = np.einsum("n,bnk->bk", path.coarse.nodes.share, rays.position[..., :2]) / path.pitch
+    return mean.reshape(len(path.channels), len(states), 2)
+
+
+def on_prisms(path: MonitorPath, prism: str, vector, face: str = ""):
+    """The same turn, arcseconds, of a prism or of one face in every channel."""
+    turn = tuple(ARCSEC * np.asarray(vector, float))
+    return {c.prism_body(prism) + (f"/{face}" if face else ""): Motion(rotate=turn) for c in path.channels}
+
+
+def seen_turn(path: MonitorPath, channel, prism: str, face: str, vector) -> np.ndarray:
+    """V in the world for a face turned by a vector (radians, its own axes), from nominal normals only."""
+    placed = path.instrument.assembly.place()
+    root = channel.prism_body(prism)
+    pose = {name: placed.pose(f"{root}/{name}").rotation for _, name in FACES if _ == prism}
+    up = placed.pose(root).rotation[:, 2]
+    turn = pose[face] @ vector
+    index = glass("fused silica").vacuum_index(path.wavelength)
+    if face in ("window", "entry", "exit"):
+        sign = {"window": 0.0, "entry": 1.0, "exit": -1.0}[face]  # a window that is passed twice cancels
+        return sign * (index - 1.0) * turn
+    mirrors = [name for name in pose if name not in ("window", "entry", "exit")]
+    turns = [turn if name == face else np.zeros(3) for name in mirrors]
+    return seen_outside(turn_by_mirrors([pose[name][:, 2] for name in mirrors], turns), up, index)
+
+
+def facets_turned(path: MonitorPath, vectors):
+    """A state in which every channel's facet is turned by its vector, world, radians."""
+    placed = path.instrument.assembly.place()
+    return {
+        c.face_body: Motion(rotate=tuple(placed.pose(c.face_body).rotation.T @ v))
+        for c, v in zip(path.channels, vectors, strict=True)
+    }
+
+
+def test_nominal_beams(path) -> None:
+    """All of every beam comes back to the CCD's middle: facets are squared by the middle rays, and over an aperture of
+    50 mm coma moves the mean of a beam by some 0.01 px.
+    """
+    assert path.rays([{}]).valid.all()
+    assert np.abs(spots(path, [{}])).max() < 0.03
+
+
+def test_facets_are_square_to_the_beams(path) -> None:
+    """Half of the angle between the pinhole's and the CCD middle's directions lies between a beam and its normal."""
+    placed = path.instrument.assembly.place()
+    aimed = path.coarse.nominal
+    middle = int(np.argmin(np.hypot(path.coarse.nodes.x, path.coarse.nodes.y)))
+    apex = placed.pose("base/central_prism").translation
+    for i, channel in enumerate(path.channels):
+        systems = assemble(path.instrument.assembly, [f"{channel.key}/outgoing"])
+        rays = make_rays(path.backend, aimed.position[i, middle], aimed.direction[i, middle])
+        traced = trace(path.backend, systems, rays, world=True)
+        after = traced.numpy(traced.world)[1][0, 0]
+        pose = placed.pose(channel.face_body)
+        normal = pose.rotation[:, 2]
+        # 3 mm / (2 f); across the line the focal length is 3 % longer
+        half = 0.5 * abs(channel.pinhole[0]) / path.instrument.cameras[channel.camera].line_focal_length
+        assert np.arccos(after @ normal) == pytest.approx(half, rel=0.07)
+        # all facets pass through the block's apex, and lean outward from it
+        assert abs((pose.translation - apex) @ normal) < 1e-3
+        assert np.all((pose.translation - apex)[:2] * normal[:2] > 0.0)
+
+
+@pytest.mark.parametrize("prism", PRISMS)
+def test_perfect_prisms_may_turn(path, prism) -> None:
+    turns = [on_prisms(path, prism, 10.0 * np.eye(3)[axis]) for axis in range(3)]
+    moved = spots(path, [{}, *turns])
+    assert np.abs(moved[:, 1:] - moved[:, :1]).max() < STILL
+
+
+def test_prisms_may_move(path) -> None:
+    """A rhomboid that moves displaces nothing; a 180-deg prism displaces the beam by twice its shift: 0.01 px/mm."""
+    states = [
+        {c.prism_body(p): Motion(shift=tuple(1e-3 * e)) for c in path.channels} for p in PRISMS for e in np.eye(3)
+    ]
+    moved = spots(path, [{}, *states])
+    change = np.abs(moved[:, 1:] - moved[:, :1])
+    assert change[:, 3:].max() < 1e-9
+    assert 1e-3 < change[:, :3].max() < 0.02
+
+
+@pytest.mark.parametrize(("prism", "face"), FACES)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_angle_error_is_a_turn_of_the_facet(path, prism, face, axis) -> None:
+    """One arcsecond on a face against a facet turned as the first order says: equal within 2e-3 px of up to 19 px.
+
+    What is left comes from the beam's walk along the 2 m to the facet and from products of angles of 1e-5.
+    """
+    vectors = [-seen_turn(path, c, prism, face, ARCSEC * np.eye(3)[axis]) for c in path.channels]
+    moved = spots(path, [{}, on_prisms(path, prism, np.eye(3)[axis], face), facets_turned(path, vectors)])
+    by_face, by_facet = moved[:, 1] - moved[:, 0], moved[:, 2] - moved[:, 0]
+    assert np.abs(by_face - by_facet).max() < 2e-3
+    size = np.linalg.norm(by_face, axis=-1)
+    focal = np.array([path.instrument.cameras[c.camera].line_focal_length for c in path.channels])
+    # twice the turn of the facet times the focal length; across the line that is 3 % longer, distortion adds as much
+    ups = [path.instrument.assembly.nominal_pose(c.face_body).rotation[:, 2] for c in path.channels]
+    want = [
+        2.0 * f * np.linalg.norm(np.cross(v, up)) / path.pitch for f, v, up in zip(focal, vectors, ups, strict=True)
+    ]
+    if face == "window":
+        assert size.max() < STILL
+    else:
+        assert size == pytest.approx(want, rel=0.07)
+        assert size.min() > 1.0
+
+
+@pytest.fixture(scope="module")
+def imperfect(backend, instrument) -> MonitorPath:
+    """The monitor pair with one arcsecond on every face of every prism, facets squared for that."""
+    spec = instrument("monitor_pair").spec
+    errors = {prism: {face: (SIGNS[face] * ARCSEC,) * 2 for p, face in FACES if p == prism} for prism in PRISMS}
+    monitor = spec.monitor.model_copy(
+        update={p: getattr(spec.monitor, p).model_copy(update={"angle_errors": errors[p]}) for p in PRISMS}
+    )
+    spec = spec.model_copy(update={"monitor": monitor})
+    cameras = {site.camera: load_camera(site.camera) for site in spec.cameras.values()}
+    return MonitorPath(build_instrument(spec, cameras, backend), backend)
+
+
+def test_squared_facets_absorb_the_errors(imperfect) -> None:
+    """As made, the spots stand on the CCDs' middles again."""
+    assert np.abs(spots(imperfect, [{}])).max() < 0.05
+
+
+@pytest.mark.parametrize("prism", PRISMS)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_imperfect_prism_that_turns(imperfect, instrument, backend, prism, axis) -> None:
+    """Its V turns with it: V becomes V + phi x V, 1e-9 rad for 60 arcsec; what a perfect prism does is taken off.
+
+    The facet is turned by 1e3 times as much, to stand out; its effect is linear to 1e-3. In the difference of two beams
+    that walk alike 5e-6 px are left.
+    """
+    phi, perfect = 60.0 * np.eye(3)[axis], MonitorPath(instrument("monitor_pair"), backend)
+    moved, ideal = (spots(p, [{}, on_prisms(p, prism, phi)]) for p in (imperfect, perfect))
+    got = (moved[:, 1] - moved[:, 0]) - (ideal[:, 1] - ideal[:, 0])
+    placed = perfect.instrument.assembly.place()
+    vectors = []
+    for channel in perfect.channels:
+        whole = sum(
+            seen_turn(perfect, channel, prism, face, SIGNS[face] * ARCSEC * np.array([1.0, 1.0, 0.0]))
+            for p, face in FACES
+            if p == prism
+        )
+        spin = ARCSEC * placed.pose(channel.prism_body(prism)).rotation @ phi
+        vectors.append(-1e3 * np.cross(spin, whole))
+    turned = spots(perfect, [{}, facets_turned(perfect, vectors)])
+    want = (turned[:, 1] - turned[:, 0]) / 1e3
+    assert np.abs(got - want).max() < 5e-6
+    assert np.abs(want).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def measured(experiment):
+    """Shifts of the monitor pair's spots (row, column), px, rendered without noise and measured, per state."""
+    setup = experiment("monitor_pair")
+    path = setup.path
+    kinds = [*((p, "", 10.0 * e) for p in PRISMS for e in np.eye(3)), ("prism_180", "mirror", np.eye(3)[0])]
+    kinds += [("prism_180", "roof_a", np.eye(3)[1]), ("prism_180", "roof_b", np.eye(3)[0])]
+    kinds += [("prism_0", "mirror_b", np.eye(3)[0]), ("prism_0", "entry", np.eye(3)[1])]
+    states = [{}, *(on_prisms(path, p, v, face) for p, face, v in kinds)]
+    photons = path.expected_photons(states)
+    images = setup.expected_frames(photons).reshape(-1, *photons.shape[2:])
+    place = measure_spots(images, 9, setup.calibration).position.reshape(len(states), -1, 2)
+    return path, dict(zip([(p, f, int(np.argmax(v))) for p, f, v in kinds], place[1:] - place[0], strict=True))
+
+
+def test_perfect_prisms_may_turn_in_images(measured) -> None:
+    _, moved = measured
+    still = {kind: np.abs(change).max() for kind, change in moved.items() if not kind[1]}
+    assert len(still) == 6
+    assert max(still.values()) < STILL
+
+
+def test_angle_errors_in_images(measured) -> None:
+    """Rows are y, columns x; the facet's turn is traced. Images and beams differ by the shape of coma, which
+    changes over the up to 19 px: 0.02 px.
+    """
+    path, moved = measured
+    checked = 0
+    for (prism, face, axis), change in moved.items():
+        if not face:
+            continue
+        vectors = [-seen_turn(path, c, prism, face, ARCSEC * np.eye(3)[axis]) for c in path.channels]
+        beams = spots(path, [{}, facets_turned(path, vectors)])
+        want = (beams[:, 1] - beams[:, 0])[:, ::-1]
+        assert np.abs(change - want).max() < 0.02
+        assert np.abs(want).max() > 2.0
+        checked += 1
+    assert checked == 5
