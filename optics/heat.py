@@ -21,6 +21,10 @@ class Temperature:
     change: float = 0.0
     gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def __add__(self, other: Temperature) -> Temperature:
+        x, y, z = (a + b for a, b in zip(self.gradient, other.gradient, strict=True))
+        return Temperature(self.change + other.change, (x, y, z))
+
     def at(self, point: np.ndarray) -> float:
         """Change at a point (3,) of the body's frame, kelvin."""
         return float(self.change + np.dot(self.gradient, point))
@@ -39,7 +43,8 @@ def carried_motion(expansion: float, gradient: np.ndarray, arm: np.ndarray) -> t
 
     Args:
         expansion: a, 1/K.
-        gradient: g, K/m; arm: q, metres; both in the body's frame.
+        gradient: g, K/m, in the body's frame.
+        arm: q, metres, likewise.
     """
     g, q = np.asarray(gradient, np.float64), np.asarray(arm, np.float64)
     return expansion * np.cross(g, q), expansion * ((g @ q) * q - 0.5 * (q @ q) * g)

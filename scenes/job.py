@@ -1,5 +1,5 @@
-"""A job: which instrument, what is perturbed, what is rendered and how the images are analysed. Its file is the user's
-main input.
+"""A job: which instrument, what is perturbed, what changes with time, what is rendered and how the images are
+analysed. Its file is the user's main input.
 """
 
 import re
@@ -7,24 +7,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
 
 from optics.frozen_map import FrozenMap
 from optics.heat import Temperature
 from optics.zernike import MAX_NOLL
-from scenes.errors import InputError, Issue, Problem, names_text, nearest, shown
+from scenes.course import CourseSpec, TemperatureChange, TemperatureGradient
+from scenes.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
 from scenes.instrument import Frames, Reference
 from scenes.quantity import Quantity, Vector
 from scenes.spec import Name, NothingIsEmpty, Paths, Spec, Whole
-from scenes.units import ANGLE, LENGTH, SCALE, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT
+from scenes.units import ANGLE, LENGTH, SCALE
 
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
 Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
 ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
-
-TemperatureChange = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="1000 K")]
-TemperatureGradient = Annotated[tuple[float, float, float], Vector(Quantity(TEMPERATURE_GRADIENT, largest="1000 K/m"))]
 
 NO_MOTION = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
@@ -52,7 +50,7 @@ Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string"
 
 
 class TemperatureSpec(Spec):
-    """A change of a body's temperature, and of all it carries that has no temperature of its own: change + gradient . r.
+    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r.
 
     Attributes:
         change: at the body's origin, kelvin.
@@ -70,12 +68,12 @@ class TemperatureSpec(Spec):
 
 def _uniform(value: Any) -> Any:
     """`temperature: 2 K` means a uniform change."""
-    return {"change": value} if isinstance(value, str) else value
+    return {"change": value} if isinstance(value, str | int | float) else value
 
 
 class PerturbationSpec(Spec):
-    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and for
-    a mirror or a prism's face a figure error.
+    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and
+    for a mirror or a prism's face a figure error.
 
     Attributes:
         rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
@@ -111,16 +109,29 @@ def _some(images: tuple[str, ...]) -> tuple[str, ...]:
     return images
 
 
+class StraySpec(Spec):
+    """Path tracing of ghosts and stray light: number of paths from every source."""
+
+    paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
+
+
+def _switch(value: Any) -> Any:
+    """`stray: true` takes the defaults, `stray: false` is none."""
+    return {True: {}, False: None}[value] if isinstance(value, bool) else value
+
+
 class RenderSpec(Spec):
     """What is rendered.
 
     Attributes:
         images: which images; at present the monitor's spots.
+        stray: whether ghosts and stray light are path-traced and added: true, or the number of paths.
         frames: number of frames, None for as many as the instrument's monitor takes.
         seed: of every random number in the job.
     """
 
     images: Annotated[tuple[Literal["spots"], ...], AfterValidator(_some)] = ("spots",)
+    stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     frames: Frames | None = None
     seed: Annotated[Whole, Field(ge=0, le=2**63 - 1)] = 1
 
@@ -137,14 +148,35 @@ class JobSpec(Spec):
     Attributes:
         instrument: name of an instrument in scenes/instruments, or path of an own file, relative to the job's file.
         perturb: node path -> perturbation; empty for the nominal state.
+        course: temperatures that change with time, None for a single state.
         render: what is rendered.
         analysis: how it is analysed.
     """
 
     instrument: Reference
     perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    course: CourseSpec | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
     analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
+
+    @model_validator(mode="after")
+    def _stray_of_one_state(self) -> "JobSpec":
+        if self.course is not None and self.render.stray is not None:
+            raise Problem(
+                "stray light is traced for one state, not for every time of a course",
+                "both course and render.stray",
+                "one of them; put the temperatures of one time under perturb",
+                within=("render", "stray"),
+            )
+        return self
+
+    def fields(self, time: int | None = None) -> dict[str, Temperature]:
+        """Node path -> change of its temperature, of the perturbation and of the course at time number ``time``."""
+        out = {path: what.temperature.field for path, what in self.perturb.items() if "temperature" in what.uses()}
+        if self.course is not None and time is not None:
+            for path, added in self.course.fields(time).items():
+                out[path] = out.get(path, Temperature()) + added
+        return out
 
 
 @dataclass(frozen=True)
@@ -171,23 +203,23 @@ def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
         InputError: one issue for each fault, with the nearest valid name.
     """
     issues = [issue for path, what in job.perturb.items() for issue in _node_issues(job, nodes, path, what)]
+    for path in job.course.temperature if job.course is not None else ():
+        key = ("course", "temperature", path)
+        if path not in nodes:
+            issues.append(_no_such_node(job, nodes, path, key))
+        elif "temperature" not in nodes[path].allows:
+            issues.append(_not_allowed(job, nodes[path], "temperature", key))
     if issues:
         raise InputError(*issues)
 
 
 def _node_issues(job: JobSpec, nodes: Mapping[str, NodeInfo], path: str, what: PerturbationSpec) -> list[Issue]:
     if path not in nodes:
-        meant = nearest(path, nodes)
-        return [
-            job.issue(
-                "no such node", ("perturb", path), found=path, allowed=names_text(sorted(nodes)), suggestion=meant
-            )
-        ]
+        return [_no_such_node(job, nodes, path, ("perturb", path))]
     info, issues = nodes[path], []
     for action in what.uses():
         if action not in info.allows:
-            allowed = names_text(sorted(info.allows)) or "nothing"
-            issues.append(job.issue(f"this node does not allow {action}", ("perturb", path, action), allowed=allowed))
+            issues.append(_not_allowed(job, info, action, ("perturb", path, action)))
     if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
         known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))
         key, meant = ("perturb", path, "pivot"), nearest(what.pivot, known)
@@ -195,3 +227,13 @@ def _node_issues(job: JobSpec, nodes: Mapping[str, NodeInfo], path: str, what: P
             job.issue("this node has no such pivot", key, found=what.pivot, allowed=names_text(known), suggestion=meant)
         )
     return issues
+
+
+def _no_such_node(job: JobSpec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
+    meant = nearest(path, nodes)
+    return job.issue("no such node", key, found=path, allowed=names_text(sorted(nodes)), suggestion=meant)
+
+
+def _not_allowed(job: JobSpec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
+    allowed = names_text(sorted(info.allows)) or "nothing"
+    return job.issue(f"this node does not allow {action}", key, allowed=allowed)

@@ -1,9 +1,10 @@
 """Heat: from temperatures of bodies to motions, deformed faces and refractive indices.
 
-A body without a temperature of its own has the field of the body that carries it. Structures expand freely about their
-mount (the pivot ``centre`` if there is one, else the origin) and carry what stands on them. Mirrors and prisms deform
-by a finite-element solution for a unit gradient along each axis, held at three points; the solution is linear, so that
-one factorisation serves all temperatures. Glass changes its index by dn/dT.
+A body without a temperature of its own has the field of the body that carries it. Every body is held at its mount
+(the pivot ``centre`` if there is one, else the origin) and expands freely about it; structures carry the mounts of
+what stands on them. Mirrors and prisms deform by a finite-element solution for a unit gradient along each axis, held
+at three points; the solution is linear, so that one factorisation serves all temperatures. Glass changes its index by
+dn/dT.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from optics.pose import Pose
 from optics.rotation import rotation_matrix
 from optics.solid import Solid, solid_mesh
 from optics.thermo_elastic import ElasticBody, Kinematic
-from optics.tree import Body, Motion, State
+from optics.tree import ORIGIN, Body, Motion, State
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from scenes.mirror_mesh import THICKNESS, behind
@@ -71,7 +72,12 @@ class ThermalModel:
             for name, model in instrument.cameras.items()
             for mirror in model.mirrors
         }
+        self._carried: dict[str, list[Body]] = {path: [] for path in self._bodies}
+        for body in instrument.assembly.tree.bodies:
+            if body.parent:
+                self._carried[body.parent].append(body)
         self._responses: dict[str, Response] = {}
+        self._extents: dict[str, np.ndarray] = {}
 
     @cached_property
     def materials(self) -> Mapping[str, Material]:
@@ -137,13 +143,19 @@ class ThermalModel:
         """Lowest absolute temperature that a field makes on a body, kelvin: at its corners for optics, else at its
         origin.
         """
-        if path in self._solids:
-            points = solid_mesh(self._solids[path], self._placed).mesh.vertices
-        elif path in self._mirrors:
-            points = self._mirror_outline(path)
-        else:
-            points = np.zeros((1, 3))
-        return float(self.reference + field.change + np.min(points @ np.array(field.gradient)))
+        return float(self.reference + field.change + np.min(self._extent(path) @ np.array(field.gradient)))
+
+    def _extent(self, path: str) -> np.ndarray:
+        """Points of a body between which its temperature lies, (P, 3), metres; kept, since a series asks often."""
+        if path not in self._extents:
+            if path in self._solids:
+                points = solid_mesh(self._solids[path], self._placed).mesh.vertices
+            elif path in self._mirrors:
+                points = self._mirror_outline(path)
+            else:
+                points = np.zeros((1, 3))
+            self._extents[path] = np.asarray(points, np.float64)
+        return self._extents[path]
 
     def state(
         self,
@@ -159,7 +171,7 @@ class ThermalModel:
             progress: called with the path of each body whose finite-element solution begins.
         """
         fields = self.fields(temperatures)
-        thermal: dict[str, Motion] = {}
+        thermal: State = {}
         for path, field in fields.items():
             if self._owner(path) in (None, path):
                 thermal = compose(thermal, self._warmed(path, field, progress), self._bodies)
@@ -168,7 +180,7 @@ class ThermalModel:
     def _warmed(self, path: str, field: Temperature, progress: Callable[[str], None]) -> State:
         """What a body's field does to the body itself, to its faces and to what it carries."""
         body, stuff = self._bodies[path], self.materials[path]
-        pivot = "centre" if "centre" in body.pivots else "origin"
+        pivot = _mount(body)
         about = np.array(body.pivots[pivot])
         gradient = np.array(field.gradient)
         own = Motion(pivot=pivot, stretch=stuff.expansion * field.at(about))
@@ -176,16 +188,24 @@ class ThermalModel:
         if path in self._solids and self._solids[path].transparent:
             change, slope = self._index(path, field)
             own = Motion(pivot=pivot, stretch=own.stretch, index=change, index_gradient=slope)
-        out = {path: own}
-        if bent and (path in self._solids or path in self._mirrors):
+        out: dict[str, Motion] = {path: own}
+        if path in self._solids or path in self._mirrors:
+            # the tree's stretch carries the faces; a face with two footprints carries these
+            out.update(
+                {face.path: Motion(stretch=own.stretch) for face in self._carried[path] if self._carried[face.path]}
+            )
+            if not bent:
+                return out
             bending = {face: _superposed(units, gradient) for face, units in self._response(path, progress).items()}
             return compose(bending, out, self._bodies)
-        if bent:
-            for child in self._bodies.values():
-                if child.parent == path:
-                    turn, move = carried_motion(stuff.expansion, gradient, child.pose.translation - about)
-                    inward = child.pose.rotation.T
-                    out[child.path] = Motion(rotate=_triple(inward @ turn), shift=_triple(inward @ move))
+        for child in self._carried[path]:
+            mount = np.array(child.pivots[_mount(child)])
+            turn, move = carried_motion(stuff.expansion, gradient, child.pose.apply(mount) - about)
+            inward = child.pose.rotation.T
+            # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
+            shift = inward @ move + own.stretch * mount
+            if np.any(turn) or np.any(shift):
+                out[child.path] = Motion(rotate=_triple(inward @ turn), shift=_triple(shift), pivot=_mount(child))
         return out
 
     def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
@@ -259,6 +279,11 @@ class ThermalModel:
 
 
 _THREE = tuple((float(np.cos(t)), float(np.sin(t))) for t in np.radians([90.0, 210.0, 330.0]))
+
+
+def _mount(body: Body) -> str:
+    """Name of the pivot at which a body is held."""
+    return "centre" if "centre" in body.pivots else ORIGIN
 
 
 def _upward(path: str) -> Iterator[str]:

@@ -2,6 +2,7 @@
 on.
 """
 
+import types
 import typing
 from typing import Any, TypeVar
 
@@ -133,4 +134,7 @@ def _annotation_at(model: type[Spec], key: KeyPath) -> Any:
 def _bare(annotation: Any) -> Any:
     if typing.get_origin(annotation) is typing.Annotated:
         return _bare(typing.get_args(annotation)[0])
+    if typing.get_origin(annotation) in (types.UnionType, typing.Union):
+        # "or None": what may be left out
+        return _bare(next(item for item in typing.get_args(annotation) if item is not type(None)))
     return annotation

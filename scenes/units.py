@@ -58,6 +58,8 @@ ANGLE = Kind(
 LENGTH = Kind("a length", "m", ("um", "mm", "m", "nm", "pm"), "20 um", ("um", "mm", "m", "nm"))
 SCALE = Kind("a relative change", "", ("ppm", "percent", "um/m"), "10 ppm", ("ppm", "percent"))
 TIME = Kind("a time", "s", ("ms", "s", "us"), "10 ms", ("ms", "s"))
+MOMENT = Kind("a time", "s", ("min", "h", "s"), "12 min", ("min", "h", "s"))
+"""When something is, as against how long it takes: minutes and hours come first."""
 POWER = Kind("a power", "W", ("mW", "W", "uW", "nW"), "1 mW", ("mW", "W"))
 TEMPERATURE = Kind("a temperature", "K", ("degC", "K"), "20 degC", ("degC", "K"))
 TEMPERATURE_DIFFERENCE = Kind("a temperature difference", "K", ("K", "mK"), "0.1 K")
@@ -66,7 +68,10 @@ PER_LENGTH3 = Kind("an inverse length cubed", "1/m^3", ("1/m^3", "1/mm^3"), "1e-
 PER_LENGTH5 = Kind("an inverse length to the fifth", "1/m^5", ("1/m^5", "1/mm^5"), "1e-3 1/m^5")
 PER_LENGTH7 = Kind("an inverse length to the seventh", "1/m^7", ("1/m^7", "1/mm^7"), "1e-3 1/m^7")
 TEMPERATURE_GRADIENT = Kind("a temperature gradient", "K/m", ("K/m", "mK/m"), "0.1 K/m")
-KINDS = (ANGLE, LENGTH, SCALE, TIME, POWER, TEMPERATURE, TEMPERATURE_GRADIENT, PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7)
+KINDS = (
+    *(ANGLE, LENGTH, SCALE, TIME, POWER, TEMPERATURE, TEMPERATURE_GRADIENT),
+    *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
+)
 
 _CELSIUS = ("degC", "celsius", "°C")
 _ZERO_CELSIUS = Decimal("273.15")

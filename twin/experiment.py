@@ -66,7 +66,7 @@ class MonitorExperiment:
         Raises:
             InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
         """
-        fields = {path: p.temperature.field for path, p in job.perturb.items() if "temperature" in p.uses()}
+        fields = job.fields()
         try:
             self.thermal.check(fields)
             return self.thermal.state(fields, motions_of(job), progress)
@@ -137,9 +137,9 @@ class MonitorExperiment:
         """PRNU and DSNU of all area CCDs; the same before and after."""
         return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), _stream(seed, 0))
 
-    def frames_before(self, frames: int, seed: int) -> np.ndarray:
-        """Frames of the nominal state, uint16 (C, frames, rows, columns)."""
-        photons = self.nominal_photons
+    def frames_before(self, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> np.ndarray:
+        """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns)."""
+        photons = self.nominal_photons + stray
         return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 1))
 
     def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int = 0) -> np.ndarray:

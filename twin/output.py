@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
 import xarray as xr
 
+from twin.course import CourseRun
 from twin.report import write_report
 from twin.results import RenderRun
 from twin.run_folder import MANIFEST, RunFolder
@@ -44,6 +46,10 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
             folder.write_bytes(f"{stem}.tiff", _tiff(frames))
             folder.write_with(f"{stem}.png", partial(_write_preview, frames))
     folder.write_bytes("irradiance.nc", _netcdf(_irradiance(run)))
+    if run.stray is not None:
+        folder.write_json("stray.json", {"before": run.stray.before.to_dict(), "after": run.stray.after.to_dict()})
+    if run.course is not None:
+        _write_course(run, run.course, folder)
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
@@ -59,6 +65,15 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
         "sha256": folder.checksums(),
     }
     folder.write_json(MANIFEST, manifest)
+
+
+def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
+    """Numbers, expected images, and of each channel the first frame of every time as one page."""
+    folder.write_json("course.json", course.to_dict())
+    for i, channel in enumerate(run.experiment.path.channels):
+        folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", _tiff(course.frames[:, i]))
+    time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
+    folder.write_bytes("course.nc", _netcdf(_images(run, "time", time, course.photons)))
 
 
 def preview(frames: np.ndarray) -> np.ndarray:
@@ -95,18 +110,28 @@ def _netcdf(data: xr.Dataset) -> bytes:
 
 
 def _irradiance(run: RenderRun) -> xr.Dataset:
-    path = run.experiment.path
     photons = np.stack([run.photons_before, run.photons_after])
+    images = _images(run, "state", ("state", ["before", "after"]), photons)
+    if run.stray is not None:
+        stray = np.stack([run.stray.before.photons, run.stray.after.photons])
+        about = {"long_name": "of these, ghosts and stray light"}
+        images["stray_photons"] = (("state", "channel", "row", "column"), stray, about)
+    return images
+
+
+def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np.ndarray) -> xr.Dataset:
+    """Expected images (N, C, rows, columns) with the coordinate of their first axis."""
+    path = run.experiment.path
     return xr.Dataset(
         {
             "photons": (
-                ("state", "channel", "row", "column"),
+                (first, "channel", "row", "column"),
                 photons,
                 {"long_name": "expected photons per pixel and frame"},
             )
         },
         coords={
-            "state": ["before", "after"],
+            first: coordinate,
             "channel": [c.key for c in path.channels],
             "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x"}),
             "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y"}),

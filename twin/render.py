@@ -13,11 +13,12 @@ import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from analysis.recovery import ESTIMATORS
 from optics.backend import load_backend
+from scenes.course import moment
 from scenes.resolved import ResolvedJob, resolve
 from twin.cli import BACKEND_HELP, LARGEST_SEED, check_backend, exit_on_terminate, explained
 from twin.output import write_run
@@ -81,6 +82,9 @@ def main(
     truth.json, recovered.json, crosstalk.json, a self-contained report.html and scene.glb. A run's own config.yaml
     can be given as the job to repeat it.
 
+    A job with a course, a table of temperatures over time (scenes/examples/orbit.yaml), also gets every time's
+    numbers and images: course.json, course.nc and images/CAMERA_SIDE_course.tiff.
+
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     errors = Console(stderr=True)
@@ -90,7 +94,9 @@ def main(
         folder = RunFolder(out if out is not None else next_free(Path("runs"), job.stem), force)
         run = _run(folder, resolved, backend, frames, seed, silent=as_json or quiet, errors=errors)
     if as_json:
-        json.dump({"truth": run.truth_dict(), "recovered": run.recovered_dict()}, sys.stdout, allow_nan=False)
+        course = {"course": run.course.to_dict()} if run.course is not None else {}
+        result = {"truth": run.truth_dict(), "recovered": run.recovered_dict(), **course}
+        json.dump(result, sys.stdout, allow_nan=False)
         sys.stdout.write("\n")
     elif not quiet:
         _print_result(run, folder.target)
@@ -118,11 +124,17 @@ def _run(
     hidden = silent or not errors.is_terminal
     with exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
         task = bar.add_task("start", total=len(STAGES) + 1)
+        parts: dict[str, TaskID] = {}
 
         def stage(name: str) -> None:
             bar.update(task, description=name, completed=float([*STAGES, WRITE].index(name)))
 
-        run = render_job(resolved, tracer, frames, seed, stage)
+        def advance(part: str, done: int, total: int) -> None:
+            if part not in parts:
+                parts[part] = bar.add_task(part, total=total)
+            bar.update(parts[part], completed=done)
+
+        run = render_job(resolved, tracer, frames, seed, stage, advance)
         stage(WRITE)
         write_run(run, folder, started, time.monotonic() - clock)
         bar.update(task, completed=len(STAGES) + 1)
@@ -141,6 +153,12 @@ def _print_result(run: RenderRun, target: Path) -> None:
         "see crosstalk in the report.",
         style="dim",
     )
+    if run.course is not None:
+        count, ends = len(run.course.times), [moment(float(run.course.times[k])) for k in (0, -1)]
+        console.print(
+            f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
+            highlight=False,
+        )
     for warning in run.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
@@ -151,6 +169,8 @@ def _table(run: RenderRun) -> Table:
     """What every estimator recovered, beside the truth."""
     truth, recovered = run.truth_dict(), run.recovered_dict()
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
+    if run.course is not None:
+        title += f"\nat {moment(float(run.course.times[run.course.shown]))} of the course"
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("", no_wrap=True)
     heads = ("true", "paper\nsingle", "paper\njoint", "derived", "model", "sigma", "model\n- true", "in\nsigma")

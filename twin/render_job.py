@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -11,12 +12,16 @@ from analysis.spot_positions import SpotError
 from optics.aim import AimError
 from optics.backend import Backend
 from optics.trace import BeamMissedError
+from optics.tree import State
 from scenes.errors import InputError
 from scenes.job import check_nodes
 from scenes.resolved import ResolvedJob
+from twin.course import course_states, run_course, too_large
 from twin.crosstalk import crosstalk
 from twin.experiment import MonitorExperiment
-from twin.results import RenderRun
+from twin.path_tracing.stray import NominalPathLost
+from twin.results import RenderRun, StrayPair
+from twin.stray_light import stray_light
 from twin.truth import trace_truth
 
 STAGES = (
@@ -30,10 +35,17 @@ STAGES = (
     "crosstalk",
 )
 
+COURSE = "times of the course"
+"""A long part of jobs with a course."""
+
+STRAY = "trace ghosts and stray light"
+"""A long part of jobs that ask for it."""
+
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
 
 Progress = Callable[[str], None]
+Advance = Callable[[str, int, int], None]
 
 
 def render_job(
@@ -42,8 +54,9 @@ def render_job(
     frames: int | None = None,
     seed: int | None = None,
     progress: Progress = lambda stage: None,
+    advance: Advance = lambda part, done, total: None,
 ) -> RenderRun:
-    """Run a job.
+    """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
 
     Args:
         resolved: the job.
@@ -51,6 +64,7 @@ def render_job(
         frames: per state; overrides the job's.
         seed: of all noise; overrides the job's.
         progress: called with each of STAGES when it begins.
+        advance: told of the long parts COURSE and STRAY how many of how many times or paths are done.
 
     Raises:
         InputError: an unknown node, or a perturbation so large that light misses the mirrors or a spot its CCD.
@@ -63,7 +77,10 @@ def render_job(
     experiment = MonitorExperiment(resolved, backend)
     check_nodes(resolved.job, experiment.instrument.nodes)
     progress(STAGES[1])
-    state = experiment.state(resolved.job)
+    course = resolved.job.course
+    states = [experiment.state(resolved.job)] if course is None else course_states(experiment, resolved.job)
+    shown = 0 if course is None else course.shown
+    state = states[shown]
     try:
         progress(STAGES[2])
         truth = trace_truth(experiment.instrument, backend, [state])
@@ -71,12 +88,21 @@ def render_job(
         calibration = experiment.calibration
         progress(STAGES[4])
         nominal = experiment.nominal_photons
-        photons = experiment.path.expected_photons([state])
+        photons = experiment.path.expected_photons([state]) if course is None else None
     except (AimError, BeamMissedError) as error:
         raise _too_large(resolved, str(error)) from error
+    series = None
+    if photons is None:
+        series = run_course(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
+        # rendered among other states a state differs in the last bit, and with it all noise; the run shows one of both
+        photons = series.shown_photons[None]
+    stray = None
+    if resolved.job.render.stray is not None:
+        stray = _stray(experiment, resolved, state, number, advance)
+        nominal, photons = nominal + stray.before.photons, photons + stray.after.photons
     progress(STAGES[5])
-    before = experiment.frames_before(count, number)
-    after = experiment.frames_after(photons, count, number)
+    before = experiment.frames_before(count, number, 0.0 if stray is None else stray.before.photons)
+    after = experiment.frames_after(photons, count, number, shown)
     progress(STAGES[6])
     try:
         recovery = recover(before, after, calibration, resolved.job.analysis.centroid)
@@ -99,8 +125,38 @@ def render_job(
         after=after[0],
         recovery=recovery,
         crosstalk=tables,
-        warnings=_warnings(experiment, resolved, nominal, photons[0], before, after[0]),
+        warnings=(
+            *_warnings(experiment, resolved, nominal, photons[0], before, after[0]),
+            *(series.warnings if series is not None else ()),
+        ),
+        course=series,
+        stray=stray,
     )
+
+
+def _stray(
+    experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
+) -> StrayPair:
+    """Stray light before and after the perturbation.
+
+    Raises:
+        InputError: no light comes back to a CCD.
+    """
+    assert resolved.job.render.stray is not None
+    paths = resolved.job.render.stray.paths
+    sources = len(experiment.path.channels) * paths
+    try:
+        before = stray_light(experiment, {}, paths, seed, lambda done, _: advance(STRAY, done, 2 * sources))
+        if not state:
+            return StrayPair(before, before)
+        say = partial(_second_half, advance, sources)
+        return StrayPair(before, stray_light(experiment, state, paths, seed, say))
+    except NominalPathLost as error:
+        raise _too_large(resolved, str(error)) from error
+
+
+def _second_half(advance: Advance, first: int, done: int, _: int) -> None:
+    advance(STRAY, first + done, 2 * first)
 
 
 def _covariances(recovery: Recovery) -> dict[str, np.ndarray]:
@@ -108,6 +164,8 @@ def _covariances(recovery: Recovery) -> dict[str, np.ndarray]:
 
 
 def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
+    if resolved.job.course is not None:
+        return too_large(resolved.job, resolved.job.course.shown, reason)
     moved = ", ".join(resolved.job.perturb) or "nothing"
     return resolved.job.error(
         f"the perturbed instrument cannot be rendered: {reason}",

@@ -12,9 +12,19 @@ from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
 from analysis.recovery import Recovery
 from optics.tree import State
 from scenes.resolved import ResolvedJob
+from twin.course import CourseRun
 from twin.crosstalk import CameraCrosstalk
 from twin.experiment import MonitorExperiment
+from twin.stray_light import StrayLight
 from twin.truth import Truth
+
+
+@dataclass(frozen=True, eq=False)
+class StrayPair:
+    """Stray light of the nominal and of the perturbed instrument."""
+
+    before: StrayLight
+    after: StrayLight
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +37,13 @@ class RenderRun:
         state: what was perturbed.
         frames, seed: of the exposures.
         truth: by exact tracing.
-        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns).
+        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns), stray light included.
         before, after: grey values, uint16 (C, frames, rows, columns).
         recovery: what the images say (one state).
         crosstalk: camera -> response to elementary motions.
         warnings: what the user should know.
+        course: all times of the job's course, None if it has none; the rest is then about the time it shows.
+        stray: ghosts and stray light, None if not asked for.
     """
 
     resolved: ResolvedJob
@@ -47,6 +59,8 @@ class RenderRun:
     recovery: Recovery
     crosstalk: Mapping[str, CameraCrosstalk]
     warnings: tuple[str, ...]
+    course: CourseRun | None = None
+    stray: StrayPair | None = None
 
     def true_parameters(self, camera: str) -> dict[str, float]:
         """True change of a camera in the units of the keys."""

@@ -118,7 +118,7 @@ NODE = "  base/forward/M2: "
             2,
             ["not one of the choices", "did you mean 'gaussian'?"],
         ),
-        ("- 1", 1, ["not a mapping", "instrument, perturb, render, analysis"]),
+        ("- 1", 1, ["not a mapping", "instrument, perturb, course, render, analysis"]),
         ("just text", 1, ["not a mapping"]),
     ],
 )

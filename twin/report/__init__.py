@@ -9,7 +9,8 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from twin.light_paths import trace_light_paths
-from twin.report import content, crosstalk_content, labels
+from twin.report import content, course_content, crosstalk_content, labels, stray_content
+from twin.report.course_figure import parameters_svg, temperatures_svg
 from twin.report.light_path_figure import footprints_svg, side_view_svg
 from twin.report.numbers import FAR
 from twin.report.residual_figure import residuals_svg
@@ -44,10 +45,15 @@ def render_report(run: RenderRun) -> str:
         "side": Markup(side_view_svg(experiment.instrument, paths)),
         "footprints": Markup(footprints_svg(experiment.instrument, paths)),
     }
+    if run.course is not None:
+        figures["temperatures"] = Markup(temperatures_svg(run.course))
+        figures["course"] = Markup(parameters_svg(run.course, labels.ESTIMATOR_NAMES))
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
     return template.render(
         setup=content.setup(run),
+        course=course_content.course_content(run),
+        stray=stray_content.stray_content(run),
         tables=tables,
         summary=content.summary(tables),
         spots=content.spots(run),

@@ -8,13 +8,16 @@ import numpy as np
 
 from analysis.monitoring import ARCSEC
 from analysis.recovery import ESTIMATORS
+from optics.heat import Temperature
 from optics.tree import Motion
 from scenes.channel import BASE
+from twin.experiment import motions_of
 from twin.report.labels import CENTROID_NOTES, PARAMETERS
 from twin.report.numbers import FAR, decimals_for, fixed, plain, residual, residual_text
 from twin.report.systematics import joined, systematics
 from twin.results import RenderRun
 
+ZERO_CELSIUS = 273.15
 ANGLE_LABEL = "change of the angle between the two lines of sight"
 
 
@@ -58,8 +61,34 @@ def setup(run: RenderRun) -> dict[str, Any]:
         ("Frames", f"{run.frames} before and {run.frames} after, seed {run.seed}"),
         ("Spot centres", CENTROID_NOTES[run.resolved.job.analysis.centroid]),
     ]
-    moved = [{"node": path, "motion": _motion_text(m), "pivot": m.pivot} for path, m in run.state.items()]
-    return {"cameras": cameras, "facts": facts, "perturbations": moved, "warnings": run.warnings}
+    return {
+        "cameras": cameras,
+        "facts": facts,
+        "perturbations": _perturbations(run),
+        "reference": fixed(spec.temperature - ZERO_CELSIUS, 2),
+        "heated": _heated(run),
+        "warnings": run.warnings,
+    }
+
+
+def _perturbations(run: RenderRun) -> list[dict[str, str]]:
+    """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
+    job = run.resolved.job
+    motions, fields = motions_of(job), job.fields(None if run.course is None else run.course.shown)
+    out = []
+    for path in dict.fromkeys((*motions, *fields)):
+        motion = motions.get(path, Motion())
+        parts = [_motion_text(motion)] if _motion_text(motion) or path not in fields else []
+        parts += [_heat_text(fields[path])] if path in fields else []
+        out.append({"node": path, "motion": "; ".join(parts) or "nothing (all zero)", "pivot": motion.pivot})
+    return out
+
+
+def _heated(run: RenderRun) -> int:
+    """How many bodies have another temperature than nominal, faces of prisms not counted."""
+    job = run.resolved.job
+    fields = run.experiment.thermal.fields(job.fields(None if run.course is None else run.course.shown))
+    return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
 
 
 def _motion_text(motion: Motion) -> str:
@@ -72,7 +101,14 @@ def _motion_text(motion: Motion) -> str:
     terms = [f"Z{j} {plain(1e9 * a)} nm" for j, a in motion.figure.items() if a]
     if terms:
         parts.append(f"figure {', '.join(terms)}")
-    return "; ".join(parts) or "nothing (all zero)"
+    return "; ".join(parts)
+
+
+def _heat_text(field: Temperature) -> str:
+    text = f"temperature {plain(field.change)} K"
+    if any(field.gradient):
+        text += f", gradient ({', '.join(plain(1e3 * g) for g in field.gradient)}) mK/m"
+    return text
 
 
 def results(run: RenderRun) -> list[dict[str, Any]]:

@@ -21,6 +21,10 @@ SHOWN = 1e-3
 """Least amount of a motion, in its table unit, that is spoken of."""
 
 
+HEAT = "temperatures (expansion, bending, change of index)"
+"""How the effects of temperatures are called; a table of motions of single bodies holds only their carried motions."""
+
+
 @dataclass(frozen=True, eq=False)
 class Systematics:
     """What the crosstalk table makes of a run's motions, for one camera.
@@ -74,8 +78,13 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
     own = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
     out = []
+    given = run.resolved.job.perturb
     for path, motion in run.state.items():
         if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
+            continue
+        if motion.stretch or motion.index or any(motion.index_gradient):
+            out.append(HEAT)
+        if path not in given:
             continue
         if path not in bodies and (any(motion.rotate) or any(motion.shift) or motion.scale):
             out.append(path)

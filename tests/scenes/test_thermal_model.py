@@ -1,0 +1,446 @@
+"""Heat in the whole instrument: who inherits which temperature, what expands about what, what glass does to a beam."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.glass import glass
+from optics.heat import Temperature, carried_motion
+from optics.material import material
+from optics.pose import Pose
+from optics.rotation import rotation_matrix
+from optics.system import assemble
+from optics.thermo_elastic import face_change, free_linear_field
+from optics.trace import make_rays, trace
+from optics.tree import Motion
+from scenes.errors import InputError
+from scenes.instrument import MaterialsSpec
+from scenes.instrument_model import Instrument, build_instrument
+from scenes.job import check_nodes
+from scenes.load import load_camera, load_instrument, load_job
+from scenes.resolved import resolve, resolve_job
+from scenes.thermal_model import TERMS, TemperatureError, ThermalModel, compose
+from twin.experiment import MonitorExperiment
+from twin.monitor import MonitorPath
+from twin.truth import trace_truth
+
+SILICA = material("fused silica")
+WAVELENGTH = 650e-9
+PRISM = "base/forward/monitor/left/prism_180"
+PRISMS = {"forward": PRISM, "backward": "base/backward/monitor/left/prism_180"}
+
+
+@pytest.fixture(scope="module")
+def model(gf7_pair) -> ThermalModel:
+    return ThermalModel(gf7_pair)
+
+
+def variant(backend, **changes) -> Instrument:
+    """The pair gf7 with other materials or prisms."""
+    spec = load_instrument("gf7_pair").model_copy(update=changes)
+    return build_instrument(spec, {"gf7": load_camera("gf7")}, backend)
+
+
+@pytest.fixture(scope="module")
+def one_material(backend) -> ThermalModel:
+    """Everything of fused silica."""
+    names = dict.fromkeys(MaterialsSpec.model_fields, SILICA.name)
+    return ThermalModel(variant(backend, materials=MaterialsSpec(**names)))
+
+
+# --- who has which temperature ----------------------------------------------------------------------------------------
+
+
+def test_temperature_is_inherited_until_a_body_has_its_own(model) -> None:
+    field = Temperature(2.0, (0.3, -0.5, 0.7))
+    own = Temperature(-1.0, (0.0, 0.1, 0.0))
+    fields = model.fields({"base/forward": field, "base/forward/monitor/left": own})
+    assert fields["base/forward"] is field
+    assert fields["base/forward/monitor/left"] is own
+    assert fields["base/forward/M1"].change != 2.0
+    assert not any(path.startswith(("base/backward", "base/central")) or path == "base" for path in fields)
+    # what inherits sees the same field at the same place, in its own axes
+    placed = model.instrument.assembly.place()
+    for path, inherited in fields.items():
+        carrier, source = ("base/forward/monitor/left", own) if "monitor/left" in path else ("base/forward", field)
+        for point in ((0.0, 0.0, 0.0), (0.3, -0.2, 0.9)):
+            there = placed.pose(carrier).inverse().apply(placed.pose(path).apply(np.array(point)))
+            assert inherited.at(np.array(point)) == pytest.approx(source.at(there), abs=1e-13)
+
+
+def test_a_gradient_turns_into_the_frame_of_a_turned_child() -> None:
+    child = Pose(rotation_matrix(np.array([0.0, np.pi / 2, 0.0])), np.array([1.0, 2.0, 3.0]))
+    seen = Temperature(10.0, (1.0, 0.0, 0.5)).seen_from(child)
+    assert seen.change == pytest.approx(10.0 + 1.0 + 1.5)
+    # the child's z lies along the parent's x, its x along -z
+    np.testing.assert_allclose(seen.gradient, (-0.5, 0.0, 1.0), atol=1e-15)
+
+
+# --- expansion --------------------------------------------------------------------------------------------------------
+
+
+def test_a_structure_carries_its_children_and_a_mirror_grows_about_its_centre(backend) -> None:
+    """Camera of aluminium, mirrors of N-BK7: the mirror's centre rides on the camera, its vertex follows from that."""
+    heat = ThermalModel(variant(backend, materials=MaterialsSpec(camera="aluminium", mirror="N-BK7")))
+    change, camera, mirror = 3.0, material("aluminium").expansion, material("N-BK7").expansion
+    placed = heat.instrument.assembly.place([{}, heat.state({"base/forward": Temperature(change)})])
+    root = placed.pose("base/forward")
+    for name in ("M1", "M2", "M3"):
+        body = heat.instrument.assembly.tree[f"base/forward/{name}"]
+        centre = np.array(body.pivots["centre"])
+        held = root.apply((1.0 + camera * change) * body.pose.apply(centre))
+        now = placed.pose(body.path, 1)
+        grown = 1.0 + mirror * change
+        assert placed.scale[1, placed.index[body.path]] == pytest.approx(grown, abs=1e-15)
+        np.testing.assert_allclose(now.apply(grown * centre), held, atol=2e-15)
+        np.testing.assert_allclose(now.translation, held - now.rotation @ (grown * centre), atol=2e-15)
+    for name in ("focal_plane", "monitor"):
+        body = heat.instrument.assembly.tree[f"base/forward/{name}"]
+        np.testing.assert_allclose(
+            placed.pose(body.path, 1).translation,
+            root.apply((1.0 + camera * change) * body.pose.translation),
+            atol=2e-15,
+        )
+    np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
+
+
+def test_one_material_at_one_temperature_only_grows(one_material, backend) -> None:
+    change = 10.0
+    grown = 1.0 + SILICA.expansion * change
+    instrument = one_material.instrument
+    state = one_material.state({"base": Temperature(change)})
+    placed = instrument.assembly.place([{}, state])
+    np.testing.assert_allclose(placed.translation[1], grown * placed.translation[0], rtol=0, atol=3e-15)
+    np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
+    truth = trace_truth(instrument, backend, [state])
+    assert abs(truth.angle_change[0]) < 1e-14
+    for name, moved in truth.cameras.items():
+        assert max(abs(moved.d_alpha[0]), abs(moved.d_beta[0]), abs(moved.d_gamma[0])) < 1e-14
+        # the line's points stay where they were in metres, so that distortion enters with 6e-4 of the change
+        assert moved.d_f[0] == pytest.approx((grown - 1.0) * truth.principal_distance[name], rel=1e-3)
+    path = MonitorPath(instrument, backend).coarse
+    rays = path.rays([{}, state])
+    spots = np.einsum("n,bnk->bk", path.nodes.share, rays.position[..., :2]).reshape(4, 2, 2) / path.pitch
+    assert np.all(np.abs(spots[:, 1] / grown - spots[:, 0]) < 1e-6)
+    assert np.all(np.abs(spots[:, 0]) < 0.1)  # the spots stand in the middle, so also look at the rays around them
+    np.testing.assert_allclose(rays.position[1::2] / grown, rays.position[::2], rtol=0, atol=3e-11)
+
+
+def test_carried_motion_is_the_free_field_and_its_rotation() -> None:
+    g, q, a, step = np.array([3.0, -2.0, 5.0]), np.array([0.4, 0.7, -1.1]), 2e-6, 1e-3
+    turn, move = carried_motion(a, g, q)
+    field = free_linear_field(a, 0.0, g)
+    np.testing.assert_allclose(move, field(q[None])[0], rtol=1e-14)
+    # the field is quadratic, so central differences are exact; slope[i, j] = d u_j / d q_i
+    slope = np.array([field((q + e)[None])[0] - field((q - e)[None])[0] for e in step * np.eye(3)]) / (2.0 * step)
+    curl = np.array([slope[1, 2] - slope[2, 1], slope[2, 0] - slope[0, 2], slope[0, 1] - slope[1, 0]])
+    np.testing.assert_allclose(turn, 0.5 * curl, rtol=1e-10)
+
+
+def test_nested_structures_move_as_one_free_body(backend) -> None:
+    """Base, camera, focal plane, boards: of one material, they follow the exact field of a single free body."""
+    field = Temperature(1.5, (3.0, -2.0, 5.0))
+    names = dict.fromkeys(MaterialsSpec.model_fields, SILICA.name) | {"mirror": "Zerodur"}
+    instrument = variant(backend, materials=MaterialsSpec(**names))
+    heat = ThermalModel(instrument)
+    # the prisms' own bending is not looked at here, and takes seconds
+    cold = {solid.path: Temperature() for solid in instrument.solids}
+    placed = instrument.assembly.place([{}, heat.state({"base": field} | cold)])
+    free = free_linear_field(SILICA.expansion, field.change, field.gradient)
+    optics = {s.path for s in instrument.solids} | {f"base/{c}/M{k}" for c in instrument.cameras for k in (1, 2, 3)}
+    checked = 0
+    for path, i in placed.index.items():
+        if any(path == o or path.startswith(f"{o}/") for o in optics):
+            continue
+        before, after = placed.pose(path), placed.pose(path, 1)
+        np.testing.assert_allclose(after.translation - before.translation, free(before.translation[None])[0], atol=1e-9)
+        turn, _ = carried_motion(SILICA.expansion, np.array(field.gradient), before.translation)
+        np.testing.assert_allclose(after.rotation, rotation_matrix(turn) @ before.rotation, atol=1e-9)
+        assert placed.scale[1, i] - 1.0 == pytest.approx(SILICA.expansion * field.at(before.translation), rel=1e-4)
+        checked += 1
+    assert checked == 1 + 2 * 12
+
+
+# --- prisms -----------------------------------------------------------------------------------------------------------
+
+
+def through(instrument: Instrument, camera: str, states, backend, offset=(0.0, 0.0)):
+    """A ray along z of the 180-deg prism's frame, from its window back to it: directions (S, 3) in the prism's frame,
+    optical paths (S,), and the nominal places (5, 3) on the faces that it meets.
+    """
+    prism = PRISMS[camera]
+    names = [n for n in instrument.assembly.sequences[f"{camera}/left/outgoing"] if "/prism_180/" in n]
+    frame = instrument.assembly.nominal_pose(prism)
+    entry = instrument.assembly.nominal_pose(instrument.assembly.elements[names[0]].body).translation
+    start, along = entry + frame.rotation[:, :2] @ np.array(offset), frame.rotation[:, 2]
+    every = range(len(names))
+    systems = assemble(instrument.assembly, [names], states)
+    traced = trace(backend, systems, make_rays(backend, start, along), keep=every, world=True)
+    _, direction, path, valid = traced.numpy(traced.world)
+    assert valid.all()
+    places = []
+    for k, name in enumerate(names):
+        body = instrument.assembly.nominal_pose(instrument.assembly.elements[name].body)
+        places.append(frame.inverse().apply(body.apply(traced.hit(k)[0, 0])))
+    return direction[:, 0] @ frame.rotation, path[:, 0], np.array(places)
+
+
+def only_glass(state, prism: str):
+    """The change of index alone, without any deformation."""
+    motion = state[prism]
+    return {prism: Motion(index=motion.index, index_gradient=motion.index_gradient)}
+
+
+def bulk_turn(instrument: Instrument, camera: str, places: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Change of the direction behind the prism, (3,), by a gradient ``slope`` of its index.
+
+    n d changes by the integral of the gradient along each leg, and is mirrored at all faces that come after it.
+    """
+    frame = instrument.assembly.nominal_pose(PRISMS[camera])
+    total = np.zeros(3)
+    for k in range(4):
+        total = total + np.linalg.norm(places[k + 1] - places[k]) * slope
+        if k < 3:
+            name = ("mirror", "roof_a", "roof_b")[k]
+            normal = frame.rotation.T @ instrument.assembly.nominal_pose(f"{PRISMS[camera]}/{name}").rotation[:, 2]
+            total = total - 2.0 * (total @ normal) * normal
+    return np.array([total[0], total[1], 0.0])
+
+
+def test_a_uniform_change_of_a_perfect_prism_lengthens_the_path_and_turns_nothing(model, gf7_pair, backend) -> None:
+    change = 5.0
+    state = model.state({PRISM: Temperature(change)})
+    step = glass(SILICA.name).vacuum_index(WAVELENGTH, 293.15 + change) - glass(SILICA.name).vacuum_index(WAVELENGTH)
+    direction, path, _ = through(gf7_pair, "forward", [{}, only_glass(state, PRISM), state], backend)
+    np.testing.assert_allclose(direction, np.broadcast_to([0.0, 0.0, -1.0], (3, 3)), atol=1e-14)
+    length = gf7_pair.glass_path["forward/left"]["prism_180"]
+    index = glass(SILICA.name).vacuum_index(WAVELENGTH)
+    assert path[0] == pytest.approx(index * length, rel=1e-13)
+    assert path[1] - path[0] == pytest.approx(step * length, rel=1e-9)
+    # the prism itself grows as well, about a centre on neither face: the start's distance to the window comes in
+    grown = SILICA.expansion * change
+    window = grown * gf7_pair.assembly.tree[PRISM].pivots["centre"][2]
+    assert path[2] - path[0] == pytest.approx(step * length + index * grown * length - window, rel=1e-4)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_index_gradient_deflects_as_its_integral_over_the_legs(model, gf7_pair, backend, axis: int) -> None:
+    gradient = np.eye(3)[axis] * 0.05
+    slope = glass(SILICA.name).dn_dt(WAVELENGTH) * gradient
+    for camera, prism in PRISMS.items():
+        fields = [Temperature(0.0, tuple(k * gradient)) for k in (1.0, 2.0, -1.0)]
+        states = [only_glass(model.state({prism: field}), prism) for field in fields]
+        direction, _, places = through(gf7_pair, camera, [{}, *states], backend)
+        turned = (direction[1:] - direction[0])[:, :2]
+        expected = bulk_turn(gf7_pair, camera, places, slope)[:2]
+        scale = np.linalg.norm(slope) * gf7_pair.glass_path[f"{camera}/left"]["prism_180"]
+        np.testing.assert_allclose(turned[0], expected, atol=1e-5 * scale)
+        np.testing.assert_allclose(turned[1], 2.0 * turned[0], atol=1e-5 * scale)
+        np.testing.assert_allclose(turned[2], -turned[0], atol=1e-5 * scale)
+
+
+def test_the_deflection_grows_with_the_length_of_the_prism(model, gf7_pair, backend) -> None:
+    """The prisms of both cameras differ in their long leg alone, so their deflections differ by dn/dT g times that."""
+    gradient = (0.0, 0.0, 0.05)
+    slope = glass(SILICA.name).dn_dt(WAVELENGTH) * 0.05
+    turned, length = [], []
+    for camera, prism in PRISMS.items():
+        state = only_glass(model.state({prism: Temperature(0.0, gradient)}), prism)
+        direction, _, places = through(gf7_pair, camera, [{}, state], backend)
+        turned.append(np.abs((direction[1] - direction[0])[:2]))
+        length.append(np.linalg.norm(places[2] - places[1]))
+    assert length[1] - length[0] > 0.1
+    np.testing.assert_allclose(turned[1] - turned[0], [slope * (length[1] - length[0]), 0.0], atol=1e-5 * slope)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_glass_and_deformation_together(model, gf7_pair, backend, axis: int) -> None:
+    """Exact geometry of a free prism with a linear temperature.
+
+    Its strain is a T in all directions, so lengths grow by 1 + a T and no angle changes: in the material's own
+    coordinates light sees the undeformed prism with index n (1 + a T), whose gradient is dn/dT g + n a g. Entry and
+    exit are turned by w = a g x q; a retroreflector's output turns by (w_entry - w_exit) x d, whatever holds it.
+    """
+    gradient = np.eye(3)[axis] * 0.05
+    index, slope = glass(SILICA.name).vacuum_index(WAVELENGTH), glass(SILICA.name).dn_dt(WAVELENGTH)
+    a = SILICA.expansion
+    for camera, prism in PRISMS.items():
+        state = model.state({prism: Temperature(0.0, tuple(gradient))})
+        direction, _, places = through(gf7_pair, camera, [{}, state], backend)
+        ends = np.cross(a * np.cross(gradient, places[0] - places[4]), [0.0, 0.0, 1.0])
+        expected = bulk_turn(gf7_pair, camera, places, (slope + index * a) * gradient) + ends
+        scale = slope * 0.05 * gf7_pair.glass_path[f"{camera}/left"]["prism_180"]
+        np.testing.assert_allclose((direction[1] - direction[0])[:2], expected[:2], atol=1e-4 * scale)
+
+
+def test_faces_of_a_prism_follow_the_free_field(model, gf7_pair) -> None:
+    """The finite elements inside the model against the closed form; one rigid motion of the whole prism is free."""
+    gradient = np.array([0.4, -0.7, 0.9])
+    centre = np.array(gf7_pair.assembly.tree[PRISM].pivots["centre"])
+    state = model.state({PRISM: Temperature(float(-gradient @ centre), tuple(gradient))})
+    assert state[PRISM].stretch == pytest.approx(0.0, abs=1e-18)
+
+    class Free:
+        at = staticmethod(free_linear_field(SILICA.expansion, 0.0, gradient, centre))
+
+    placed = gf7_pair.assembly.place()
+    twists = []
+    for element in gf7_pair.assembly.elements.values():
+        if element.solid != PRISM:
+            continue
+        pose = placed.pose(PRISM).inverse() @ placed.pose(element.body)
+        expected = face_change(Free(), element.surface, element.aperture, pose, TERMS)
+        found = state[element.body]
+        for j, amount in expected.figure.items():
+            assert found.figure.get(j, 0.0) == pytest.approx(amount, abs=2e-15)
+        turn = pose.rotation @ (np.array(found.rotate) - np.array(expected.rotate))
+        shift = pose.rotation @ (np.array(found.shift) - np.array(expected.shift)) - np.cross(turn, pose.translation)
+        twists.append(np.concatenate([turn, shift]))
+    assert len(twists) == 5
+    np.testing.assert_allclose(twists, np.broadcast_to(twists[0], (5, 6)), atol=2e-13)
+    assert np.ptp([state[f"{PRISM}/{f}"].rotate[0] for f in ("mirror", "roof_a", "roof_b")]) > 1e-8
+
+
+# --- together with motions --------------------------------------------------------------------------------------------
+
+
+def test_motions_act_on_top_of_heat_exactly(model, gf7_pair) -> None:
+    motions = {
+        "base/forward": Motion(rotate=(2e-3, -1e-3, 3e-3), shift=(1e-4, 2e-4, -3e-4), scale=5e-4),
+        "base/forward/M2": Motion(
+            rotate=(-4e-3, 1e-3, 2e-3), shift=(3e-4, 0.0, -1e-4), pivot="centre", figure={5: 1e-8}
+        ),
+        "base/backward/focal_plane": Motion(rotate=(1e-3, 2e-3, -1e-3), pivot="rear_node"),
+    }
+    heat = {"base": Temperature(20.0), "base/backward/focal_plane": Temperature(10.0, (1.0, -2.0, 3.0))}
+    warm, both = model.state(heat), model.state(heat, motions)
+    placed = gf7_pair.assembly.place([warm, both])
+    for path, motion in motions.items():
+        body = gf7_pair.assembly.tree[path]
+        turn, pivot = rotation_matrix(np.array(motion.rotate)), np.array(body.pivots[motion.pivot])
+        offset = pivot + np.array(motion.shift) - (1.0 + motion.scale) * turn @ pivot
+        own = {**warm, path: both[path]}  # its ancestors moved as by heat alone
+        alone = gf7_pair.assembly.place([warm, own])
+        i = alone.index[path]
+        scale = alone.scale[0, i]
+        np.testing.assert_allclose(alone.rotation[1, i], alone.rotation[0, i] @ turn, atol=1e-15)
+        expected = alone.translation[0, i] + scale * alone.rotation[0, i] @ offset
+        np.testing.assert_allclose(alone.translation[1, i], expected, atol=3e-15)
+        assert alone.scale[1, i] == pytest.approx(scale * (1.0 + motion.scale), rel=1e-15)
+    assert both["base/forward/M2"].figure == {5: 1e-8}  # Zerodur does not bend
+    untouched = placed.index["base/backward/M1"]
+    np.testing.assert_array_equal(placed.translation[0, untouched], placed.translation[1, untouched])
+
+
+def test_composition_adds_figures_and_indices(model, gf7_pair) -> None:
+    bodies = {body.path: body for body in gf7_pair.assembly.tree.bodies}
+    one = {PRISM: Motion(figure={4: 1e-9, 5: 2e-9}, index=1e-6, index_gradient=(1e-6, 0.0, 0.0), stretch=1e-5)}
+    two = {PRISM: Motion(figure={4: 3e-9}, index=2e-6, index_gradient=(0.0, 1e-6, 0.0), stretch=2e-5)}
+    found = compose(one, two, bodies)[PRISM]
+    assert dict(found.figure) == pytest.approx({4: 4e-9, 5: 2e-9})
+    assert found.index == pytest.approx(3e-6)
+    assert found.index_gradient == (1e-6, 1e-6, 0.0)
+    assert found.stretch == pytest.approx(3e-5, rel=1e-4)
+
+
+# --- what cannot be ---------------------------------------------------------------------------------------------------
+
+
+def test_absolute_zero_is_looked_for_in_the_far_corners(model) -> None:
+    model.check({PRISM: Temperature(-293.0)})
+    with pytest.raises(TemperatureError, match=f"{PRISM} would be at -6.85 K") as caught:
+        model.check({PRISM: Temperature(-300.0)})
+    assert caught.value.origin == PRISM
+    # the middle of the prism stays warm, its far end does not
+    steep = Temperature(-200.0, (200.0, 0.0, 0.0))
+    assert steep.at(np.array([0.4, 0.0, 0.0])) > -293.15
+    with pytest.raises(TemperatureError, match="absolute zero") as caught:
+        model.check({PRISM: steep})
+    assert caught.value.origin == PRISM
+
+
+def test_an_inherited_temperature_is_blamed_on_its_origin(model) -> None:
+    with pytest.raises(TemperatureError, match="base/forward") as caught:
+        model.check({"base/forward": Temperature(-200.0, (0.0, 0.0, -100.0))})
+    assert caught.value.origin == "base/forward"
+
+
+def test_a_glass_without_known_dn_dt_cannot_be_warmed(backend) -> None:
+    spec = load_instrument("gf7_pair")
+    prism = spec.monitor.prism_0.model_copy(update={"material": "Zerodur"})
+    heat = ThermalModel(variant(backend, monitor=spec.monitor.model_copy(update={"prism_0": prism})))
+    heat.check({"base/forward/monitor/left/prism_180": Temperature(1.0)})
+    for field in (Temperature(1.0), Temperature(0.0, (0.1, 0.0, 0.0))):
+        with pytest.raises(TemperatureError, match="prism_0: Zerodur: no constants") as caught:
+            heat.check({"base/forward": field})
+        assert caught.value.origin == "base/forward"
+    # what is not warmed needs no dn/dT
+    heat.check({"base/backward/M1": Temperature(1.0)})
+
+
+# --- in a job's file --------------------------------------------------------------------------------------------------
+
+HEAD = "instrument: gf7_pair\nperturb:\n"
+LONG = "{temperature: {change: 2 K, gradient: [0 K/m, 20 mK/m, -0.5 K/m]}, shift: [0 um, 0 um, 3 um]}"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "job.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def test_temperatures_in_yaml_read_back_bit_for_bit(tmp_path) -> None:
+    text = HEAD + "  base: {temperature: 2 K}\n  base/forward/M1: " + LONG + "\n"
+    job = load_job(written(tmp_path, text))
+    assert job.perturb["base"].temperature.field == Temperature(2.0)
+    assert job.perturb["base/forward/M1"].temperature.field == Temperature(2.0, (0.0, 0.02, -0.5))
+    assert job.perturb["base"].uses() == ("temperature",)
+    assert job.perturb["base/forward/M1"].uses() == ("shift", "temperature")
+    resolved = resolve_job(job)
+    (tmp_path / "config.yaml").write_text(resolved.to_yaml(), "utf-8")
+    assert resolve(tmp_path / "config.yaml") == resolved
+
+
+@pytest.mark.parametrize(
+    ("node", "words"),
+    [
+        ("{temperature: 2}", ("temperature.change", "a number without a unit")),
+        ("{temperature: 2 degC}", ("temperature.change", "a temperature, not of a temperature difference")),
+        ("{temperature: {chnge: 2 K}}", ("temperature.chnge", "unknown key", "did you mean 'change'?")),
+        ("{temperature: {gradient: [1 K, 0 K/m, 0 K/m]}}", ("temperature.gradient[0]", "temperature gradient")),
+        ("{temperature: {gradient: [0 K/m, 0 K/m]}}", ("temperature.gradient", "not a list of 3")),
+        ("{temperature: 2000 K}", ("temperature.change", "outside the limits", "1000 K")),
+    ],
+)
+def test_mistakes_in_temperatures(node: str, words, tmp_path) -> None:
+    path = written(tmp_path, HEAD + "  base/forward/M1: " + node)
+    with pytest.raises(InputError) as caught:
+        load_job(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}:3: perturb.base/forward/M1.temperature")
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize("face", ["mirror", "window", "window/entry"])
+def test_a_face_of_a_prism_has_no_temperature_of_its_own(face: str, gf7_pair, tmp_path) -> None:
+    job = load_job(written(tmp_path, HEAD + f"  {PRISM}/{face}: {{temperature: 1 K}}"))
+    with pytest.raises(InputError, match="does not allow temperature") as caught:
+        check_nodes(job, gf7_pair.nodes)
+    assert caught.value.line == 3
+
+
+def test_a_figure_belongs_to_the_footprint_that_the_beam_meets(gf7_pair) -> None:
+    allowing = {path for path, info in gf7_pair.nodes.items() if "figure" in info.allows}
+    assert {f"{PRISM}/window/entry", f"{PRISM}/window/exit", f"{PRISM}/mirror", "base/forward/M1"} <= allowing
+    assert f"{PRISM}/window" not in allowing  # two footprints far apart: nothing stands on the window as a whole
+
+
+def test_too_cold_is_told_with_the_line(backend, tmp_path) -> None:
+    job = load_job(written(tmp_path, HEAD + "  base/forward/M1: {temperature: -300 K}"))
+    experiment = MonitorExperiment(resolve_job(job), backend)
+    with pytest.raises(InputError, match="not above absolute zero") as caught:
+        experiment.state(job)
+    assert (caught.value.line, caught.value.key) == (3, ("perturb", "base/forward/M1", "temperature"))

@@ -1,0 +1,302 @@
+"""A course of temperatures: the same as single renders of its states, whole in the run folder, or not there at all."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+from typer.testing import CliRunner
+
+import twin.render as command
+from optics.heat import Temperature
+from scenes.course import CourseSpec, moment
+from scenes.errors import InputError
+from scenes.job import check_nodes
+from scenes.load import EXAMPLES, load_job
+from scenes.resolved import resolve
+from twin.course import course_states, run_course
+from twin.experiment import MonitorExperiment
+from twin.truth import trace_truth
+
+ROOT = Path(__file__).resolve().parents[2]
+LEFT = "base/forward/monitor/left/prism_180"
+JOB = f"""instrument: gf7_pair
+perturb:
+  base/backward/focal_plane: {{rotate: [2 arcsec, -1.5 arcsec, 10 arcsec], pivot: rear_node}}
+  {LEFT}: {{temperature: 0.5 K}}
+course:
+  times: [0 min, 12 min, 0.5 h]
+  detail: 12 min
+  temperature:
+    base/forward: {{change: [0 K, 0.1 K, -0.2 K]}}
+    {LEFT}:
+      change: [0 K, 0.1 K, 0.2 K]
+      gradient: [[0 K/m, 0 K/m, 0 K/m], [0 K/m, 10 mK/m, 0 K/m], [0 K/m, 20 mK/m, 0 K/m]]
+render: {{frames: 2, seed: 7}}
+"""
+FILES = {"course.json", "course.nc"} | {
+    f"images/{c}_{s}_course.tiff" for c in ("forward", "backward") for s in ("left", "right")
+}
+
+
+def run(*arguments: object):
+    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def written(folder: Path, text: str = JOB) -> Path:
+    path = folder / "job.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A run of the command."""
+    place = tmp_path_factory.mktemp("course")
+    result = run(written(place), "--out", place / "run", "--json")
+    assert result.exit_code == 0, result.stderr
+    (place / "printed.json").write_text(result.stdout)
+    return place / "run"
+
+
+@pytest.fixture(scope="module")
+def found(folder) -> dict:
+    return json.loads((folder / "course.json").read_text())
+
+
+# --- what a course means ----------------------------------------------------------------------------------------------
+
+
+def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
+    job = load_job(written(tmp_path))
+    assert job.course is not None
+    assert job.course.times == (0.0, 720.0, 1800.0)
+    assert job.course.shown == 1
+    assert job.fields() == {LEFT: Temperature(0.5)}
+    assert job.fields(2) == {LEFT: Temperature(0.7, (0.0, 0.02, 0.0)), "base/forward": Temperature(-0.2)}
+    assert [moment(t) for t in job.course.times] == ["0 min", "12 min", "30 min"]
+
+
+def test_a_course_is_its_states_one_by_one(folder, found, backend, tmp_path) -> None:
+    """Truth, images and readings, bit for bit, from jobs that each describe the state of one time."""
+    resolved = resolve(folder / "config.yaml")
+    experiment = MonitorExperiment(resolved, backend)
+    states = []
+    for k in range(3):
+        own = f"{{temperature: {{change: {(0.5, 0.6, 0.7)[k]} K, gradient: [0 K/m, {10 * k} mK/m, 0 K/m]}}}}"
+        text = JOB[: JOB.index("course:")].replace("{temperature: 0.5 K}", own)
+        text += f"  base/forward: {{temperature: {(0.0, 0.1, -0.2)[k]} K}}\n"
+        states.append(experiment.state(load_job(written(tmp_path, text))))
+    truth = trace_truth(experiment.instrument, backend, states)
+    photons = experiment.path.expected_photons(states)
+    after = experiment.frames_after(photons, 2, 7)
+    ((_, recovery),) = experiment.measure(states, 2, 7)
+    with xr.open_dataset(folder / "course.nc", engine="h5netcdf", decode_timedelta=False) as data:
+        assert data.photons.dims == ("time", "channel", "row", "column")
+        assert list(data.time.values) == [0.0, 720.0, 1800.0]
+        assert data.time.attrs["units"] == "s"
+        np.testing.assert_array_equal(data.photons.values, photons.astype(np.float32))
+    for i, channel in enumerate(experiment.path.channels):
+        image = tifffile.imread(folder / f"images/{channel.camera}_{channel.side}_course.tiff")
+        assert image.dtype == np.uint16
+        np.testing.assert_array_equal(image, after[:, i, 0])
+    for name, change in truth.cameras.items():
+        true = found["cameras"][name]["true"]
+        np.testing.assert_allclose(true["d_alpha_arcsec"], np.degrees(change.d_alpha) * 3600, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(true["d_f_um"], 1e6 * change.d_f, rtol=1e-12, atol=1e-12)
+        for estimator, p in recovery.parameters[name].items():
+            for key, value in p.to_dict().items():
+                np.testing.assert_array_equal(found["cameras"][name][estimator][key], value)
+    for estimator, angle in recovery.angle.items():
+        assert found["intersection_angle"][estimator] == angle.to_dict()
+
+
+def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
+    recovered = json.loads((folder / "recovered.json").read_text())
+    truth = json.loads((folder / "truth.json").read_text())
+    for name, camera in found["cameras"].items():
+        for key, values in camera["true"].items():
+            assert values[1] == pytest.approx(truth["cameras"][name][key], abs=1e-8)
+        for estimator, values in recovered["cameras"][name].items():
+            for key, value in values.items():
+                assert camera[estimator][key][1] == pytest.approx(value, rel=1e-6, abs=1e-9)
+    angle = found["intersection_angle"]
+    assert angle["true"]["change_arcsec"][1] == pytest.approx(truth["intersection_angle"]["change_arcsec"], abs=1e-8)
+    single = tifffile.imread(folder / "images/forward_left_after.tiff")
+    np.testing.assert_array_equal(tifffile.imread(folder / "images/forward_left_course.tiff")[1], single[0])
+
+
+def test_small_temperatures_act_linearly(experiment) -> None:
+    """Spots of doubled and of summed temperatures, to second order."""
+    prepared = experiment("gf7_pair")
+    one = {LEFT: Temperature(0.1, (0.0, 0.01, 0.02)), "base/forward": Temperature(0.2)}
+    other = {"base/backward": Temperature(-0.3, (0.0, 0.0, 0.0))}
+    double = {path: field + field for path, field in one.items()}
+    states = [{}, *(prepared.thermal.state(fields) for fields in (one, double, other, one | other))]
+    rays = prepared.path.coarse.rays(states)
+    share = prepared.path.coarse.nodes.share
+    spots = np.einsum("n,bnk->bk", share, rays.position[..., :2]).reshape(4, len(states), 2) / prepared.path.pitch
+    moved = spots[:, 1:] - spots[:, :1]
+    assert np.abs(moved[:, 0]).max() > 0.05
+    # dn/dT itself changes by 1e-3 of its size per kelvin
+    np.testing.assert_allclose(moved[:, 1], 2.0 * moved[:, 0], rtol=4e-4, atol=2e-6)
+    np.testing.assert_allclose(moved[:, 3], moved[:, 0] + moved[:, 2], rtol=1e-5, atol=2e-6)
+
+
+def test_the_series_does_not_depend_on_its_pieces(folder, backend, monkeypatch) -> None:
+    resolved = resolve(folder / "config.yaml")
+    experiment = MonitorExperiment(resolved, backend)
+    states = course_states(experiment, resolved.job)
+    done: list[int] = []
+    monkeypatch.setattr("twin.course.CHUNK", 2)
+    pieces = run_course(experiment, resolved, states, done.append)
+    assert done == [2, 3]
+    whole = json.loads((folder / "course.json").read_text())
+    for name, camera in pieces.to_dict()["cameras"].items():
+        for which, values in camera.items():
+            for key, numbers in values.items():
+                np.testing.assert_allclose(numbers, whole["cameras"][name][which][key], rtol=1e-6, atol=1e-8)
+    monkeypatch.setattr("twin.course.LARGEST_SERIES", 50_000)
+    with pytest.raises(InputError, match="do not fit into memory; found '3 times', allowed: at most 1 "):
+        run_course(experiment, resolved, states)
+
+
+# --- the run folder ---------------------------------------------------------------------------------------------------
+
+
+def test_the_run_folder_holds_the_course(folder, found) -> None:
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files >= FILES | {"recovered.json", "report.html", "manifest.json"}
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(manifest["sha256"]) >= FILES
+    assert set(found) == {"times_s", "detail", "temperatures", "cameras", "intersection_angle"}
+    assert (found["times_s"], found["detail"]) == ([0.0, 720.0, 1800.0], 1)
+    assert found["temperatures"][LEFT]["change_K"] == pytest.approx([0.5, 0.6, 0.7])
+    assert found["temperatures"][LEFT]["gradient_K_per_m"][2] == pytest.approx([0.0, 0.02, 0.0])
+    estimators = {"true", "paper_single", "paper_joint", "derived", "model"}
+    for camera in (*found["cameras"].values(), found["intersection_angle"]):
+        assert estimators <= set(camera)
+    printed = json.loads((folder.parent / "printed.json").read_text())
+    assert printed["course"] == found
+    report = (folder / "report.html").read_text("utf-8")
+    for words in ("Time course", "3 states from 0 min to 30 min", "at 12 min", "course.nc", "temperature 0.6 K"):
+        assert words in report
+
+
+def test_config_holds_the_course(folder) -> None:
+    again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
+    assert again == first
+    assert again.to_yaml() == (folder / "config.yaml").read_text()
+
+
+def test_the_example_is_an_orbit() -> None:
+    resolved = resolve(EXAMPLES / "orbit.yaml")
+    course = resolved.job.course
+    assert isinstance(course, CourseSpec)
+    assert (len(course.times), course.times[-1]) == (21, 6000.0)
+    first, last = course.fields(0), course.fields(20)
+    assert first == last  # a whole period
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+COURSE = "instrument: gf7_pair\ncourse:\n  times: [0 min, 1 min]\n  temperature:\n"
+NODE = "    base/forward: "
+BAD = {
+    "lengths": (COURSE + NODE + "{change: [0 K, 1 K, 2 K]}", 5, ("base/forward.change", "3 entries", "2, as many")),
+    "gradient": (COURSE + NODE + "{gradient: [[0 K/m, 0 K/m, 0 K/m]]}", 5, ("gradient", "1 entries")),
+    "vector": (COURSE + NODE + "{gradient: [[0 K/m, 0 K/m], [0 K/m, 0 K/m]]}", 5, ("gradient[0]", "not a list of 3")),
+    "order": (COURSE.replace("1 min", "0 s") + NODE + "{change: [0 K, 1 K]}", 3, ("times[1]", "do not ascend")),
+    "one": (COURSE.replace(", 1 min", "") + NODE + "{change: [0 K]}", 3, ("course.times", "2 to 1000 times")),
+    "many": (
+        COURSE.replace("0 min, 1 min", ", ".join(f"{k} s" for k in range(1001))) + NODE + "{change: [0 K]}",
+        3,
+        ("course.times", "1001 of them"),
+    ),
+    "unit": (
+        COURSE.replace("1 min", "1") + NODE + "{change: [0 K, 1 K]}",
+        3,
+        ("times[1]", "without a unit", "'12 min'"),
+    ),
+    "kind": (COURSE + NODE + "{change: [0 K, 1 deg]}", 5, ("change[1]", "unit of an angle")),
+    "key": (COURSE + NODE + "{chnge: [0 K, 1 K]}", 5, ("unknown key", "did you mean 'change'?")),
+    "word": (COURSE.replace("times", "time") + NODE + "{change: [0 K, 1 K]}", 2, ("'times' is missing",)),
+    "nothing": (COURSE, 4, ("course.temperature", "nothing changes")),
+    "empty": (COURSE + NODE + "{}", 5, ("course.temperature.base/forward", "change, gradient or both")),
+    "detail": (COURSE + NODE + "{change: [0 K, 1 K]}\n  detail: 50 s", 6, ("course.detail", "did you mean '1 min'?")),
+    "node": (COURSE + "    base/forwards: {change: [0 K, 1 K]}", 5, ("no such node", "did you mean 'base/forward'?")),
+    "face": (COURSE + f"    {LEFT}/mirror: {{change: [0 K, 1 K]}}", 5, ("does not allow temperature",)),
+    "cold": (COURSE + NODE + "{change: [0 K, -300 K]}", 5, ("change[1]", "-6.85 K", "at 1 min", "absolute zero")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_course_is_explained_and_leaves_nothing(case: str, tmp_path) -> None:
+    text, line, words = BAD[case]
+    job = written(tmp_path, text)
+    result = run(job, "--out", tmp_path / "new/run", "--frames", 1)
+    assert result.exit_code == 2, result.stdout + result.stderr
+    assert result.stdout == ""
+    assert f"{job}:{line}: course" in result.stderr
+    for word in words:
+        assert word in result.stderr
+    assert "Traceback" not in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
+
+
+def test_the_cold_of_the_perturbation_is_told_there(experiment, tmp_path) -> None:
+    text = COURSE + NODE + "{change: [0 K, 1 K]}\nperturb:\n  base/backward: {temperature: -294 K}"
+    job = load_job(written(tmp_path, text))
+    check_nodes(job, experiment("gf7_pair").instrument.nodes)
+    with pytest.raises(InputError, match=r"base/backward would be at -0\.85 K.* at 0 min") as caught:
+        course_states(experiment("gf7_pair"), job)
+    assert caught.value.line == 7
+
+
+def test_a_time_at_which_the_light_is_lost_is_named(experiment, tmp_path) -> None:
+    """Also when it is not the time that is shown in full."""
+    prepared = experiment("gf7_pair")
+    gradients = "[[0 K/m, 0 K/m, 0 K/m], [0 K/m, 30 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m]]"
+    text = COURSE.replace("1 min", "1 min, 2 min") + f"    {LEFT}: {{gradient: {gradients}}}"
+    resolved = resolve(written(tmp_path, text)).with_render(1, 1)
+    with pytest.raises(InputError, match="at 1 min of the course cannot be rendered"):
+        run_course(prepared, resolved, course_states(prepared, resolved.job))
+
+
+def test_an_interrupt_leaves_nothing(tmp_path) -> None:
+    """Ctrl-C while the times are under way."""
+    steps = ", ".join(f"{k} s" for k in range(300))
+    warm = ", ".join(["1 K"] * 300)
+    job = written(tmp_path, COURSE.replace("0 min, 1 min", steps) + NODE + f"{{change: [{warm}]}}")
+    code = (
+        "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "runpy.run_module('twin.render', run_name='__main__', alter_sys=True)"
+    )
+    arguments = [sys.executable, "-c", code, str(job), "--out", str(tmp_path / "new/run"), "--quiet"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(arguments, cwd=ROOT, env=environment, start_new_session=True, **pipes)
+    try:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.glob("new/.run.*.partial")):
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        time.sleep(2.5)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]

@@ -1,0 +1,146 @@
+"""Power, ghosts and stray light of the reference instruments.
+
+Statistical tests use fixed seeds; each states its false-alarm rate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm, t
+
+from optics.finish import MIRROR, Finish
+from optics.scatter import total_scatter
+from optics.tree import Motion
+from scenes.scene_surface import Finishes
+from scenes.scenery import build_scenery, focal_plane_housing
+from twin.path_tracing.events import Event
+from twin.path_tracing.integrator import BALANCED, FAINT, Sampling
+from twin.path_tracing.result import Family
+from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
+from twin.path_tracing.stray import NominalPathLost, monitor_families, pinhole, trace_stray
+from twin.path_tracing.tracer import PathTracer
+
+CCD = "forward/left/area_ccd"
+
+
+def test_power_is_conserved_in_every_run_without_roulette(backend, gf7_pair) -> None:
+    housing = focal_plane_housing(gf7_pair, "forward")
+    for seed in range(3):
+        stray = trace_stray(
+            gf7_pair, backend, {}, 50_000, seed, channels=gf7_pair.channels[:2], sampling=BALANCED, baffles=housing
+        )
+        for run in stray.runs.values():
+            balance = run.balance
+            assert abs(balance.error) < 1e-6
+            assert balance.emitted == pytest.approx(1.0, abs=0.02)
+            assert balance.escaped > 0.0
+            assert sum(balance.absorbed.values()) > 0.0
+            assert balance.detected[CCD] >= 0.0
+            assert balance.absorbed["forward/M1"] > 0.0
+
+
+@pytest.mark.parametrize(
+    "sampling", [FAINT, Sampling(roulette=0.5), Sampling(floor=0.2)], ids=["faint", "roulette", "floor"]
+)
+def test_roulette_and_floors_are_unbiased(backend, gf7_pair, sampling: Sampling) -> None:
+    """Mean error of the balance over 24 seeds within its standard error by Student's t; false alarm 1e-3."""
+    scenery = build_scenery(gf7_pair, {}, Finishes(mirror=Finish(reflectance=0.9, scatter=MIRROR.scatter)))
+    families = monitor_families(scenery, gf7_pair)
+    source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
+    tracer = PathTracer(backend, scenery, families, sampling)
+    runs = [tracer.run(source, 20_000, seed, look_up=0) for seed in range(24)]
+    errors = np.array([run.balance.error for run in runs])
+    assert errors.std() > 1e-6  # it is switched on
+    assert abs(errors.mean()) < t.ppf(1.0 - 5e-4, 23) * errors.std(ddof=1) / np.sqrt(24)
+    energy = np.array([run.nominal(CCD).energy for run in runs])
+    exact = PathTracer(backend, scenery, families).run(source, 400_000, 99, look_up=0).nominal(CCD)
+    error = np.hypot(energy.std(ddof=1) / np.sqrt(24), exact.error)
+    assert abs(energy.mean() - exact.energy) < norm.ppf(1.0 - 5e-4) * error
+
+
+def test_neither_chunks_nor_threads_change_a_run(backend, gf7_pair) -> None:
+    scenery = build_scenery(gf7_pair, {})
+    source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
+    tracer = PathTracer(backend, scenery, monitor_families(scenery, gf7_pair))
+    whole, parts = tracer.run(source, 30_000, 5), tracer.run(source, 30_000, 5, chunk=7_000)
+    first, second = (sorted(run.families, key=lambda f: (f.text, f.detector)) for run in (whole, parts))
+    assert [(f.text, f.count) for f in first] == [(f.text, f.count) for f in second]
+    assert len(first) > 1
+    for a, b in zip(first, second, strict=True):
+        assert a.energy == pytest.approx(b.energy, rel=1e-12)
+    np.testing.assert_allclose(whole.images[CCD], parts.images[CCD], atol=1e-18)
+    assert parts.balance.escaped == pytest.approx(whole.balance.escaped, rel=1e-12)
+    other = tracer.run(source, 30_000, 6)
+    assert other.balance.escaped != whole.balance.escaped
+
+
+def test_progress_is_told(backend, gf7_pair) -> None:
+    told = []
+    trace_stray(
+        gf7_pair,
+        backend,
+        {},
+        30_000,
+        0,
+        channels=gf7_pair.channels[:2],
+        chunk=20_000,
+        progress=lambda *n: told.append(n),
+    )
+    assert told == [(20_000, 60_000), (30_000, 60_000), (50_000, 60_000), (60_000, 60_000)]
+
+
+def share_of(family: Family, finishes: Finishes) -> float:
+    """What reflections and transmissions leave of a family that no edge cuts."""
+    assert finishes.mirror.scatter is not None
+    mirror = finishes.mirror.reflectance * (1.0 - total_scatter(finishes.mirror.scatter))
+    share = 1.0
+    for touch in family.touches:
+        face = touch.part.rpartition("/")[2]
+        if touch.event is Event.TRANSMIT:
+            share *= finishes.coated.transmission
+        elif face in ("window", "entry", "exit"):
+            share *= finishes.coated.reflectance
+        elif not face.startswith(("roof", "mirror_")):  # these reflect totally
+            share *= mirror
+    return share
+
+
+def test_ghosts_name_what_the_light_met_and_have_its_losses(backend, gf7_pair) -> None:
+    """The prisms are tilted: on the CCD are left pairs of residual reflections, each R^2 of the nominal spot."""
+    run = trace_stray(gf7_pair, backend, {}, 400_000, 1, channels=gf7_pair.channels[:1]).runs["forward/left"]
+    nominal = run.nominal(CCD)
+    sequence = gf7_pair.assembly.sequences["forward/left/monitor"][:-1]
+    assert len(nominal.touches) == len(sequence) == 25
+    assert [touch.part.split("/")[-1] for touch in nominal.touches[:4]] == ["M3", "M2", "M1", "window"]
+    strong = [f for f in run.of(CCD, "ghost") if f.count > 100]
+    assert len(strong) >= 3
+    for family in strong:
+        assert len(family.touches) > 25
+        assert not any(touch.outside for touch in family.touches)
+        expected = share_of(family, Finishes()) / share_of(nominal, Finishes())
+        assert expected < 1e-5
+        # false alarm 1e-4
+        assert abs(family.energy / nominal.energy - expected) < 3.89 * family.error / nominal.energy
+    for family in run.families:
+        assert (family.kind == "stray") == any(touch.event >= Event.DIFFUSE for touch in family.touches)
+
+
+def test_stray_light_in_photons(backend, gf7_pair) -> None:
+    stray = trace_stray(gf7_pair, backend, {}, 100_000, 1, channels=gf7_pair.channels[:1])
+    run = stray.runs["forward/left"]
+    photons = gf7_pair.spec.monitor.reticle.photons_per_frame
+    scale = stray.photons_per_power["forward/left"]
+    assert scale * run.nominal(CCD).energy == pytest.approx(photons, rel=1e-12)
+    assert scale * run.images[CCD][NOMINAL].sum() == pytest.approx(photons, rel=1e-9)
+    ghosts = sum(relative for family, relative in stray.relative("forward/left") if family.detector == CCD)
+    assert stray.photons[CCD].sum() == pytest.approx(ghosts * photons, rel=1e-9)
+    assert set(stray.photons) == {f"{c.key}/area_ccd" for c in gf7_pair.channels}
+    image = run.images[CCD]
+    np.testing.assert_allclose(stray.photons[CCD], scale * (image[GHOST] + image[STRAY]), rtol=1e-9)
+
+
+def test_a_lost_beam_is_said_so(backend, gf7_pair) -> None:
+    state = {"base/forward/M1": Motion(rotate=(0.2, 0.0, 0.0), pivot="centre")}
+    with pytest.raises(NominalPathLost, match="forward/left came back"):
+        trace_stray(gf7_pair, backend, state, 1000, 0, channels=gf7_pair.channels[:1])
