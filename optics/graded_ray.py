@@ -71,7 +71,7 @@ class GradedRay:
             dr.detach(self.origin),
             dr.detach(self.tangent),
             dr.detach(self.index),
-            tuple(dr.detach(g) for g in self.gradient),  # type: ignore[arg-type]
+            tuple(dr.detach(g) for g in self.gradient),
             dr.detach(self.along),
             dr.detach(self.square),
         )

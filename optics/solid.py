@@ -50,7 +50,7 @@ class Face:
     name: str
     body: str
     coating: Coating
-    pose: Pose = Pose()
+    pose: Pose = Pose()  # noqa: RUF009 - immutable
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,7 @@ def solid_mesh(solid: Solid, placed: PlacedBodies, state: int = 0) -> SolidMesh:
     normals = np.array([own.rotation @ n for _, n in planes])
     offsets = np.einsum("fi,fi->f", normals, np.array([own.apply(p) for p, _ in planes]))
     corners = _corners(solid.path, normals, offsets)
-    polygons = tuple(
-        _polygon(solid, k, corners, normals[k], offsets[k]) for k in range(len(solid.faces))
-    )
+    polygons = tuple(_polygon(solid, k, corners, normals[k], offsets[k]) for k in range(len(solid.faces)))
     vertices, triangles, face_of = _triangulate(polygons)
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     if not mesh.is_watertight or mesh.volume <= 0.0:

@@ -364,7 +364,9 @@ def _redirect(
     _, nx, ny, nz = _level(p.x, p.y, p.z, g, structure, grid)
     square = dr.fma(nx, nx, dr.fma(ny, ny, nz * nz))
     along = dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
-    before, after = (_index_at(p, g, name, graded) for name, graded in zip(("n", "n_after"), structure.graded))
+    before, after = (
+        _index_at(p, g, name, graded) for name, graded in zip(("n", "n_after"), structure.graded, strict=True)
+    )
     if structure.interaction in (Interaction.REFLECT, Interaction.TOTAL):
         beyond: Any = True
         if structure.interaction is Interaction.TOTAL:

@@ -10,7 +10,7 @@ origin in the middle of its window:
                              window
 
 A ray that enters at (x, y) leaves at (-x, -y), antiparallel: the point reflection at the apex (0, 0, z_apex), whatever
-the prism's attitude. The beam passes at a distance ``roof_offset`` from the ridge, so that all of it meets roof_a first.
+the prism's attitude. The beam passes at a distance ``roof_offset`` from the ridge: all of it meets roof_a first.
 
 The 0-deg prism is a rhomboid, its frame's z along the beam, x along the displacement, the origin in its middle.
 """
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from math import sqrt
 
 import numpy as np
@@ -92,7 +93,8 @@ def prism_180(
     """The lateral-transfer prism.
 
     Args:
-        path: of its body; pose: in the body that carries it, as the module says.
+        path: of its body.
+        pose: in the body that carries it, as the module says.
         key: prefix of its elements' names.
         material: its glass.
         length: from the middle of the entering to that of the leaving beam along x, metres.
@@ -238,9 +240,7 @@ def _parts(
                 solid=path,
             )
         )
-    inside = sum(
-        float(np.linalg.norm(b.place - a.place)) for a, b in zip(passages[:-1], passages[1:], strict=True)
-    )
+    inside = sum(float(np.linalg.norm(b.place - a.place)) for a, b in pairwise(passages))
     return PrismParts(tuple(bodies), tuple(elements), Solid(path, material, tuple(faces)), inside, apex)
 
 
@@ -266,7 +266,9 @@ def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def facet_block(path: str, material: str, facets: Mapping[str, str], spread: tuple[float, float], height: float) -> Solid:
+def facet_block(
+    path: str, material: str, facets: Mapping[str, str], spread: tuple[float, float], height: float
+) -> Solid:
     """The central prism: mirror facets on bodies of their own (name -> path), closed by side walls and a bottom.
 
     The walls stand as far behind the middles of the facets as those are from the apex.

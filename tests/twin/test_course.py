@@ -70,6 +70,12 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def prepared(folder, backend) -> MonitorExperiment:
+    """The experiment of the run, from its own config.yaml."""
+    return MonitorExperiment(resolve(folder / "config.yaml"), backend)
+
+
+@pytest.fixture(scope="module")
 def found(folder) -> dict:
     return json.loads((folder / "course.json").read_text())
 
@@ -87,17 +93,15 @@ def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
     assert [moment(t) for t in job.course.times] == ["0 min", "12 min", "30 min"]
 
 
-def test_a_course_is_its_states_one_by_one(folder, found, backend, tmp_path) -> None:
+def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) -> None:
     """Truth, images and readings, bit for bit, from jobs that each describe the state of one time."""
-    resolved = resolve(folder / "config.yaml")
-    experiment = MonitorExperiment(resolved, backend)
-    states = []
+    experiment, states = prepared, []
     for k in range(3):
         own = f"{{temperature: {{change: {(0.5, 0.6, 0.7)[k]} K, gradient: [0 K/m, {10 * k} mK/m, 0 K/m]}}}}"
         text = JOB[: JOB.index("course:")].replace("{temperature: 0.5 K}", own)
         text += f"  base/forward: {{temperature: {(0.0, 0.1, -0.2)[k]} K}}\n"
         states.append(experiment.state(load_job(written(tmp_path, text))))
-    truth = trace_truth(experiment.instrument, backend, states)
+    truth = trace_truth(experiment.instrument, experiment.backend, states)
     photons = experiment.path.expected_photons(states)
     after = experiment.frames_after(photons, 2, 7)
     ((_, recovery),) = experiment.measure(states, 2, 7)
@@ -136,9 +140,8 @@ def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> 
     np.testing.assert_array_equal(tifffile.imread(folder / "images/forward_left_course.tiff")[1], single[0])
 
 
-def test_small_temperatures_act_linearly(experiment) -> None:
+def test_small_temperatures_act_linearly(prepared) -> None:
     """Spots of doubled and of summed temperatures, to second order."""
-    prepared = experiment("gf7_pair")
     one = {LEFT: Temperature(0.1, (0.0, 0.01, 0.02)), "base/forward": Temperature(0.2)}
     other = {"base/backward": Temperature(-0.3, (0.0, 0.0, 0.0))}
     double = {path: field + field for path, field in one.items()}
@@ -153,9 +156,8 @@ def test_small_temperatures_act_linearly(experiment) -> None:
     np.testing.assert_allclose(moved[:, 3], moved[:, 0] + moved[:, 2], rtol=1e-5, atol=2e-6)
 
 
-def test_the_series_does_not_depend_on_its_pieces(folder, backend, monkeypatch) -> None:
-    resolved = resolve(folder / "config.yaml")
-    experiment = MonitorExperiment(resolved, backend)
+def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch) -> None:
+    resolved, experiment = resolve(folder / "config.yaml"), prepared
     states = course_states(experiment, resolved.job)
     done: list[int] = []
     monkeypatch.setattr("twin.course.CHUNK", 2)
@@ -254,18 +256,17 @@ def test_a_bad_course_is_explained_and_leaves_nothing(case: str, tmp_path) -> No
     assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
 
 
-def test_the_cold_of_the_perturbation_is_told_there(experiment, tmp_path) -> None:
+def test_the_cold_of_the_perturbation_is_told_there(prepared, tmp_path) -> None:
     text = COURSE + NODE + "{change: [0 K, 1 K]}\nperturb:\n  base/backward: {temperature: -294 K}"
     job = load_job(written(tmp_path, text))
-    check_nodes(job, experiment("gf7_pair").instrument.nodes)
+    check_nodes(job, prepared.instrument.nodes)
     with pytest.raises(InputError, match=r"base/backward would be at -0\.85 K.* at 0 min") as caught:
-        course_states(experiment("gf7_pair"), job)
+        course_states(prepared, job)
     assert caught.value.line == 7
 
 
-def test_a_time_at_which_the_light_is_lost_is_named(experiment, tmp_path) -> None:
+def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
     """Also when it is not the time that is shown in full."""
-    prepared = experiment("gf7_pair")
     gradients = "[[0 K/m, 0 K/m, 0 K/m], [0 K/m, 30 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m]]"
     text = COURSE.replace("1 min", "1 min, 2 min") + f"    {LEFT}: {{gradient: {gradients}}}"
     resolved = resolve(written(tmp_path, text)).with_render(1, 1)
