@@ -22,7 +22,9 @@ from optics.surface import plane
 from optics.tree import Body, PlacedBodies, RigidTree
 from scenes.camera_model import CameraModel, derive_camera
 from scenes.channel import BASE, CENTRAL_PRISM, SIDES, Channel
+from scenes.clearance import check_clearance
 from scenes.job import NodeInfo
+from scenes.misplaced import told_by_file
 from scenes.monitor_chain import MonitorChain, check_solids, leaving_beams, monitor_chain, square_facets
 from scenes.prism_model import facet_block
 
@@ -77,6 +79,7 @@ class Instrument:
         return out
 
 
+@told_by_file
 def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend) -> Instrument:
     """Build an instrument.
 
@@ -133,6 +136,7 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
         spec, assembly, cameras, tuple(channels), MappingProxyType(nodes), solids, MappingProxyType(lengths)
     )
     check_solids(instrument.assembly, solids)
+    check_clearance(instrument)
     return instrument
 
 

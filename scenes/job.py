@@ -110,7 +110,11 @@ def _some(images: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class StraySpec(Spec):
-    """Path tracing of ghosts and stray light: number of paths from every source."""
+    """Path tracing of ghosts and stray light.
+
+    Attributes:
+        paths: from every source.
+    """
 
     paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
 

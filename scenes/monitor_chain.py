@@ -190,7 +190,7 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
             small.angle_errors,
         )
     except ValueError as error:
-        raise MisplacedError(str(error), ("monitor", "prism_0", "shift")) from error
+        raise spec.error(str(error), ("monitor", "prism_0", "shift")) from error
     face = Element(
         f"{channel.key}/return_face",
         channel.face_body,
@@ -289,7 +289,8 @@ def _aimed(
     try:
         return aim(backend, systems, fan, target, start)[0]
     except (AimError, np.linalg.LinAlgError) as error:
-        raise MisplacedError(f"no light of {channels} gets to where it has to go: {error}", key) from error
+        why = f": {error}" if isinstance(error, AimError) else ""
+        raise MisplacedError(f"no light of {channels} gets to where it has to go{why}", key) from error
 
 
 def _missed(

@@ -8,8 +8,8 @@ from optics.aperture import Aperture, Circle
 from optics.surface import Surface
 
 CELLS = 10
-"""Cells across a curved surface: few, because Mitsuba's search costs most; the triangles of a metre-sized mirror are then
-up to a millimetre off, which the refinement does not mind."""
+"""Cells across a curved surface: few, because Mitsuba's search costs most. The triangles of a metre-sized mirror are
+then up to a millimetre off; the refinement does not mind."""
 
 MARGIN = 0.01
 LEAST_MARGIN = 2e-4

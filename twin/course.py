@@ -128,7 +128,7 @@ def run_course(
         experiment: the instrument.
         resolved: a job with a course; its frames and seed are used.
         states: of ``course_states``.
-        advance: called with the number of times that are done.
+        advance: called with the number of times that are done, first with 0.
 
     Raises:
         InputError: at some time light misses the mirrors or a spot cannot be measured, or there are too many pixels.
@@ -144,6 +144,7 @@ def run_course(
             found=f"{len(states)} times",
             allowed=f"at most {LARGEST_SERIES // each} with area CCDs of {shape[0]} x {shape[1]} pixels",
         )
+    advance(0)
     before = experiment.frames_before(frames, seed)
     photons = np.empty((len(states), len(channels), *shape), np.float32)
     first = np.empty(photons.shape, np.uint16)

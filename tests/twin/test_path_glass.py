@@ -225,3 +225,17 @@ def test_a_screen_sees_the_plate_move_the_beam(backend) -> None:
     np.testing.assert_allclose(without.place[:, 1] - with_glass.place[:, 1], aside, rtol=0, atol=1e-15)
     longer = THICKNESS * (INDEX / np.cos(bent) - 1.0 / np.cos(angle))
     np.testing.assert_allclose(with_glass.length - without.length, longer, rtol=0, atol=1e-14)
+
+
+def test_more_detections_than_expected_are_all_kept(backend) -> None:
+    """The room for records grows: a launch that overflows it is done again."""
+    surface, grid = screen("behind", facing(0.5), 1.0)
+    tracer = PathTracer(backend, Scenery((surface,), (grid,)))
+    source = DiskSource.along(np.zeros(3), np.array([0.0, 0.0, 1.0]), 1e-3)
+    result = tracer.run(source, 70_000, chunk=60_000)
+    (family,) = result.families
+    assert family.count == 70_000
+    assert family.energy == pytest.approx(1.0, rel=1e-12)
+    assert result.detections.path.size == 0
+    kept = tracer.run(source, 70_000, chunk=60_000, keep=True).detections
+    np.testing.assert_array_equal(kept.path, np.arange(70_000))

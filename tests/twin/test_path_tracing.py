@@ -256,3 +256,21 @@ def test_oblique_hits_are_exact_as_well(backend, gf7_pair, degrees: float) -> No
     np.testing.assert_allclose(found.place[same], place[found.path[same], :2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(found.length[same], length[found.path[same]], rtol=0, atol=1e-12)
     assert same.mean() > 0.95
+
+
+def test_a_line_ccd_gets_its_star(backend, gf7_pair) -> None:
+    """Light of a point on the line's field falls on the pixel where the sequential trace has it."""
+    scenery = without_prisms(build_scenery(gf7_pair, {}, IDEAL))
+    tracer = PathTracer(
+        backend, scenery, {"forward/line": nominal_codes(scenery, gf7_pair.assembly, "forward/imaging")}
+    )
+    middle, heading, across = scene_beam(gf7_pair, backend, 0.0005, 0.0)
+    systems = assemble(gf7_pair.assembly, ["forward/imaging"])
+    chief = trace(backend, systems, make_rays(backend, middle, heading)).numpy()[0][0, 0]
+    line = gf7_pair.cameras["forward"].spec.line
+    assert abs(chief[0]) < 0.4 * line.pitch  # the smile of the field is small here
+    result = tracer.run(DiskSource(middle, heading, across, 0.25), 20_000)
+    image = result.images["forward/line"][NOMINAL][:, 0]
+    assert result.balance.detected["forward/line"] > 0.9
+    row = chief[1] / line.pitch + 0.5 * (line.pixels - 1)
+    assert np.sum(image * np.arange(line.pixels)) / image.sum() == pytest.approx(row, abs=0.5)

@@ -5,7 +5,7 @@ triangles) says which surface that is; Newton's method then finds the point on t
 glass body no triangles are needed: the body is convex and its faces are flat, so the next face is the nearest one
 ahead, exactly, and no path leaks through an edge. Back in the open a triangle that only rounding puts there (the
 surface just left, the inside of a glass face, the rim of a mesh beyond a mirror's edge) is passed over, and the flight
-goes on behind it.
+goes on behind it. Paths start in the open, outside all glass.
 """
 
 from __future__ import annotations
