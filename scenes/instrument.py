@@ -6,7 +6,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from optics.frozen_map import FrozenMap
 from optics.material import MATERIALS, material
+from scenes.baffle_spec import BaffleSpec
 from scenes.errors import Problem, names_text, nearest, shown
 from scenes.prism import CentralPrismSpec, Prism0Spec, Prism180Spec
 from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
@@ -141,6 +143,7 @@ class InstrumentSpec(Spec):
         monitor: of every camera.
         temperature: at which everything has its nominal shape, kelvin.
         materials: what the parts are made of.
+        baffles: by name; none by default.
     """
 
     name: Name
@@ -150,3 +153,4 @@ class InstrumentSpec(Spec):
     monitor: MonitorSpec
     temperature: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="1000 K")] = 293.15
     materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec()
+    baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)

@@ -20,9 +20,11 @@ from optics.rotation import about_axis
 from optics.solid import Solid
 from optics.surface import plane
 from optics.tree import Body, PlacedBodies, RigidTree
+from scenes.baffle import Plate
 from scenes.camera_model import CameraModel, derive_camera
 from scenes.channel import BASE, CENTRAL_PRISM, SIDES, Channel
 from scenes.clearance import check_clearance
+from scenes.errors import names_text, nearest
 from scenes.job import NodeInfo
 from scenes.misplaced import told_by_file
 from scenes.monitor_chain import MonitorChain, check_solids, leaving_beams, monitor_chain, square_facets
@@ -46,6 +48,7 @@ class Instrument:
         nodes: body path -> what may be done to it.
         solids: the prisms of all channels, camera by camera, and the central prism.
         glass_path: channel key -> prism -> length of the beam inside its glass, one way, metres.
+        baffles: black plates that only the path tracer and pictures know.
     """
 
     spec: InstrumentSpec
@@ -55,6 +58,7 @@ class Instrument:
     nodes: Mapping[str, NodeInfo]
     solids: tuple[Solid, ...]
     glass_path: Mapping[str, Mapping[str, float]]
+    baffles: tuple[Plate, ...] = ()
 
     def camera_axes(self, camera: str) -> np.ndarray:
         """Nominal camera X, Y, Z in the base frame as columns, (3, 3)."""
@@ -118,7 +122,11 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
             forward = tuple(f"{name}/{m}" for m in model.mirrors)
             sequences[f"{channel.key}/outgoing"] = (*forward[::-1], *way)
             sequences[f"{channel.key}/monitor"] = (
-                *forward[::-1], *way, *way[-2::-1], *forward, f"{channel.key}/area_ccd"
+                *forward[::-1],
+                *way,
+                *way[-2::-1],
+                *forward,
+                f"{channel.key}/area_ccd",
             )
             chains[channel.key] = chain
         channels += own
@@ -133,7 +141,14 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
     instrument = Instrument(
-        spec, assembly, cameras, tuple(channels), MappingProxyType(nodes), solids, MappingProxyType(lengths)
+        spec,
+        assembly,
+        cameras,
+        tuple(channels),
+        MappingProxyType(nodes),
+        solids,
+        MappingProxyType(lengths),
+        _baffles(spec, assembly.tree),
     )
     check_solids(instrument.assembly, solids)
     check_clearance(instrument)
@@ -199,9 +214,27 @@ def _camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...
     }
 
 
-def _nodes(
-    assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]
-) -> dict[str, NodeInfo]:
+def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
+    """Plates of all baffles.
+
+    Raises:
+        InputError: a baffle stands on a body that does not exist.
+    """
+    out: list[Plate] = []
+    for name, baffle in spec.baffles.items():
+        if baffle.body not in tree.paths:
+            raise spec.error(
+                "no such body",
+                ("baffles", name, "body"),
+                found=baffle.body,
+                allowed=names_text(tree.paths),
+                suggestion=nearest(baffle.body, tree.paths),
+            )
+        out += baffle.plates(name)
+    return tuple(out)
+
+
+def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
     """What may be done to each body; the base itself is the frame of everything and is not moved."""
     # a figure belongs to the element's own body: a face that the beam meets twice has one for each passage
     shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}

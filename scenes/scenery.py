@@ -86,7 +86,7 @@ def build_scenery(
         instrument: the instrument.
         state: what is perturbed.
         finishes: what surfaces do with light; by default those of ``Finishes``.
-        baffles: more parts.
+        baffles: more parts than the instrument's own.
         whole_focal_planes: make each focal plane one large detector, named as the focal plane's element, in the place
             of its CCDs and its board: for light from the scene.
     """
@@ -95,7 +95,7 @@ def build_scenery(
     placed = assembly.place([state])
     glass = [
         surface
-        for solid in getattr(instrument, "solids", ())
+        for solid in instrument.solids
         for surface in solid_surfaces(solid, assembly, placed, state, finishes)
     ]
     on_glass = {name for surface in glass for name in surface.elements}
@@ -110,7 +110,7 @@ def build_scenery(
         more, grids = _focal_plane(instrument, camera, placed, finishes, whole_focal_planes)
         surfaces += more
         detectors += grids
-    surfaces += plate_surfaces(baffles, placed)
+    surfaces += plate_surfaces((*instrument.baffles, *baffles), placed)
     return Scenery(tuple(surfaces), tuple(detectors))
 
 

@@ -17,6 +17,7 @@ from trimesh.visual.material import PBRMaterial
 from optics.aperture import Circle
 from optics.solid import solid_mesh
 from optics.tree import State
+from scenes.baffle import Plate
 from scenes.channel import BASE, Channel
 from scenes.instrument_model import Instrument
 from scenes.mirror_mesh import BOARD, CHIP, behind, board_size, mirror_mesh
@@ -26,6 +27,8 @@ from twin.light_paths import RIM, Beam, LightPaths, trace_light_paths
 LINE_WIDTH = 0.002
 RETICLE = 0.0005
 """Width of the line CCD and radius of the reticle as drawn, metres."""
+SHEET = 0.001
+"""Thickness of baffles as drawn, metres."""
 TUBE = 0.0015
 TUBE_SIDES = 5
 """Radius of drawn rays, metres, and their number of sides."""
@@ -47,6 +50,7 @@ def _metal(
 
 MIRROR = _metal(205, 208, 214)
 DARK = _metal(60, 64, 72, 0.2, 0.7)
+BAFFLE = _metal(30, 32, 36, 0.0, 0.9)
 SILICON = _metal(40, 60, 130, 0.3, 0.3)
 BRASS = _metal(200, 160, 60)
 GLASS = _metal(120, 190, 210, 0.1, 0.1, 110)
@@ -67,8 +71,8 @@ def write_scene(experiment: MonitorExperiment, state: State, place: Path) -> Non
     place.write_bytes(build_scene(experiment.instrument, paths).export(file_type="glb"))
 
 
-def build_scene(instrument: Instrument, paths: LightPaths) -> trimesh.Scene:
-    """The scene as a tree of nodes with the bodies' names."""
+def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -> trimesh.Scene:
+    """The scene as a tree of nodes with the bodies' names; rays are tubes of radius ``tube``, metres."""
     meshes = body_meshes(instrument, paths)
     scene = trimesh.Scene(base_frame=_WORLD)
     placed = paths.placed
@@ -84,9 +88,13 @@ def build_scene(instrument: Instrument, paths: LightPaths) -> trimesh.Scene:
             mesh.vertices = mesh.vertices * placed.scale[0, placed.index[body.path]].real
             scene.geometry[body.path] = mesh
             scene.graph.update(body.path, parent, matrix=matrix, geometry=body.path)
+    for name, (body, mesh) in baffle_meshes(instrument.baffles).items():
+        node = f"baffles/{name}"
+        scene.geometry[node] = mesh
+        scene.graph.update(node, body, matrix=np.eye(4), geometry=node)
     for beam in paths.beams:
         name = f"light/{beam.camera}/{beam.name.replace(' ', '_')}"
-        scene.geometry[name] = _tubes(beam, list(instrument.cameras).index(beam.camera))
+        scene.geometry[name] = _tubes(beam, list(instrument.cameras).index(beam.camera), tube)
         scene.graph.update(name, _WORLD, matrix=np.eye(4), geometry=name)
     return scene
 
@@ -113,6 +121,25 @@ def body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.
         mesh.vertices = mesh.vertices / placed.scale[0, placed.index[solid.path]].real
         out[solid.path] = _painted(mesh, GLASS if solid.transparent else BLOCK)
     return out
+
+
+def baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
+    """Name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
+    parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
+    for plate in plates:
+        outline = plate.outline
+        if isinstance(outline, Circle):
+            mesh = trimesh.creation.annulus(outline.inner, outline.radius, SHEET, sections=64)
+        else:
+            mesh = trimesh.creation.box(extents=(2.0 * outline.half_x, 2.0 * outline.half_y, SHEET))
+        matrix = np.eye(4)
+        matrix[:3, :3] = plate.pose.rotation
+        matrix[:3, 3] = plate.pose.apply(np.array([*outline.centre, 0.0]))
+        mesh.apply_transform(matrix)
+        parts.setdefault(plate.name, (plate.body, []))[1].append(mesh)
+    return {
+        name: (body, _painted(trimesh.util.concatenate(meshes), BAFFLE)) for name, (body, meshes) in parts.items()
+    }
 
 
 def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trimesh.Trimesh]:
@@ -143,7 +170,7 @@ def _painted(mesh: trimesh.Trimesh, material: PBRMaterial) -> trimesh.Trimesh:
     return mesh
 
 
-def _tubes(beam: Beam, camera: int) -> trimesh.Trimesh:
+def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
     """The middle ray and some edge rays of a beam as thin tubes."""
     rays = beam.vertices[[0, *(1 + k * RIM // 4 for k in range(4))]]
     start, end = rays[:, :-1].reshape(-1, 3), rays[:, 1:].reshape(-1, 3)
@@ -153,7 +180,7 @@ def _tubes(beam: Beam, camera: int) -> trimesh.Trimesh:
     e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
     e2 = np.cross(along, e1)
     t = 2.0 * np.pi * np.arange(TUBE_SIDES) / TUBE_SIDES
-    ring = TUBE * (np.cos(t)[:, None] * e1[:, None] + np.sin(t)[:, None] * e2[:, None])
+    ring = radius * (np.cos(t)[:, None] * e1[:, None] + np.sin(t)[:, None] * e2[:, None])
     vertices = np.concatenate([start[:, None] + ring, end[:, None] + ring], axis=1)
     k = np.arange(TUBE_SIDES)
     next_k = np.roll(k, -1)

@@ -1,0 +1,234 @@
+"""The instrument in a photographer's studio, for Mitsuba: bodies with materials, beams that glow, a floor, soft light.
+
+Bodies come from ``twin.scene_file``, so that a picture and ``scene.glb`` show the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from scenes.channel import BASE
+from scenes.instrument_model import Instrument
+from scenes.mirror_mesh import behind
+from twin.light_paths import LightPaths
+from twin.picture_view import View
+from twin.scene_file import BLOCK, BRASS, DARK, GLASS, IMAGING, MIRROR, MONITOR, SILICON, build_scene
+
+SMOOTH = 0.35
+"""Edges flatter than this are not edges but facets of a curved surface, radians."""
+BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
+"""Radius of beams and of the drawn edges of glass, in pixels at the middle of the picture."""
+GLOW = 1.15
+"""Radiance of beams; the floor's is about 0.9."""
+FLOOR = "floor"
+GAP = 0.05
+"""From the lowest point of the instrument to the floor, metres."""
+
+_GLASS_EDGE = (0.03, 0.12, 0.15)
+_BSDF: dict[str, dict[str, Any]] = {
+    "mirror": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "conductor",
+            "material": "none",
+            "specular_reflectance": {"type": "rgb", "value": [0.93, 0.935, 0.94]},
+        },
+    },
+    "substrate": {"type": "twosided", "bsdf": {"type": "principled", "roughness": 0.45, "specular": 0.4}},
+    "block": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.32, 0.42, 0.48]},
+            "roughness": 0.25,
+            "specular": 0.5,
+        },
+    },
+    "board": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.025, 0.028, 0.034]},
+            "roughness": 0.45,
+        },
+    },
+    "silicon": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.06, 0.16, 0.62]},
+            "metallic": 0.6,
+            "roughness": 0.35,
+        },
+    },
+    "gold": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.95, 0.66, 0.2]},
+            "metallic": 0.9,
+            "roughness": 0.3,
+        },
+    },
+    "glass": {
+        "type": "dielectric",
+        "int_ior": 1.457,
+        "ext_ior": 1.0,
+        "specular_transmittance": {"type": "rgb", "value": [0.80, 0.93, 0.95]},
+    },
+    "edge": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": _GLASS_EDGE}}},
+    "floor": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.80, 0.80, 0.80]}},
+}
+_BSDF["substrate"]["bsdf"]["base_color"] = {"type": "rgb", "value": [0.30, 0.29, 0.275]}
+_MATERIALS = ((MIRROR, "mirror"), (DARK, "board"), (SILICON, "silicon"), (BRASS, "gold"), (GLASS, "glass"), (BLOCK, "block"))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A mesh of one material.
+
+    Attributes:
+        body: path of the body that it belongs to; ``light/...`` for beams, ``floor``.
+        mesh: in the base frame, metres.
+        bsdf: Mitsuba's description of the material.
+        radiance: red, green, blue that it emits.
+    """
+
+    body: str
+    mesh: trimesh.Trimesh
+    bsdf: Mapping[str, Any]
+    radiance: tuple[float, float, float] | None = None
+
+
+def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> list[Part]:
+    """All that stands in the studio.
+
+    Args:
+        instrument: the instrument.
+        paths: its beams and where its bodies stand.
+        pixel: size of a picture's pixel at the instrument, metres; it decides how thick lines are drawn.
+    """
+    scene = build_scene(instrument, paths, tube=BEAM_PIXELS * pixel)
+    backs = {
+        f"{BASE}/{camera}/{mirror}": behind(model, mirror)
+        for camera, model in instrument.cameras.items()
+        for mirror in model.mirrors
+    }
+    parts: list[Part] = []
+    lowest = np.inf
+    for name in scene.graph.nodes_geometry:
+        matrix, geometry = scene.graph.get(name)
+        own = scene.geometry[geometry]
+        world = trimesh.Trimesh(own.vertices, own.faces, process=False)
+        world.apply_transform(matrix)
+        lowest = min(lowest, float(world.bounds[0, 2]))
+        material = own.visual.material
+        if name.startswith("light/"):
+            colour = _linear(material.baseColorFactor[:3])
+            parts.append(Part(name, world, _BSDF["edge"], tuple(GLOW * colour)))  # type: ignore[arg-type]
+            continue
+        kind = next(kind for known, kind in _MATERIALS if known is material)
+        if name in backs:
+            polished = own.face_normals[:, 2] * backs[name] < -0.5
+            parts.append(Part(name, _part_of(world, polished), _BSDF["mirror"]))
+            parts.append(Part(name, _part_of(world, ~polished), _BSDF["substrate"]))
+        else:
+            parts.append(Part(name, world, _BSDF[kind]))
+        if kind in ("glass", "block"):
+            parts.append(Part(name, _edges(world, EDGE_PIXELS * pixel), _BSDF["edge"]))
+    parts.append(Part(FLOOR, _floor(lowest - GAP), _BSDF["floor"]))
+    return parts
+
+
+def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[faces], process=False)
+
+
+def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
+    """The sharp edges of a body as thin rods."""
+    sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > SMOOTH]
+    rods = [
+        trimesh.creation.cylinder(radius=radius, segment=mesh.vertices[ends], sections=6)
+        for ends in sharp
+        if np.ptp(mesh.vertices[ends], axis=0).max() > 0.0
+    ]
+    joined = trimesh.util.concatenate(rods)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
+
+
+def _floor(height: float, reach: float = 500.0) -> trimesh.Trimesh:
+    corners = np.array([[-reach, -reach, height], [reach, -reach, height], [reach, reach, height], [-reach, reach, height]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def _linear(colour: Any) -> np.ndarray:
+    """sRGB 0..255 -> linear 0..1."""
+    value = np.asarray(colour, dtype=float) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
+    """Soft neutral light from all sides: a bright ceiling, two large soft boxes, a dim horizon.
+
+    The boxes stand as a photographer's would, beside and above the camera.
+    """
+    theta = np.pi * (np.arange(rows) + 0.5) / rows
+    phi = 2.0 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
+    polar, azimuth = np.meshgrid(theta, phi, indexing="ij")
+    # Mitsuba's maps have +Y up; to_world below turns it to +Z, and longitude then runs from +Y toward +X
+    toward = np.stack(
+        [np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], axis=-1
+    )
+    height = toward[..., 2]
+    level = 0.42 + 0.55 * np.clip(height, 0.0, 1.0) ** 0.7
+    flat = -np.array([view.forward[0], view.forward[1], 0.0])
+    flat /= np.linalg.norm(flat)  # horizontally toward the camera
+    side = np.array([view.right[0], view.right[1], 0.0])
+    for place, reach, strength in (
+        (0.55 * flat - 0.75 * side + 0.75 * np.array([0, 0, 1]), 0.50, 1.3),
+        (-0.8 * flat + 0.6 * side + 0.9 * np.array([0, 0, 1]), 0.40, 1.0),
+        (-0.3 * flat - 0.5 * side + 1.0 * np.array([0, 0, 1]), 0.3, 0.8),
+    ):
+        off = np.arccos(np.clip(toward @ (place / np.linalg.norm(place)), -1.0, 1.0))
+        level = level + strength / (1.0 + np.exp((off - reach) / 0.05))
+    colour = np.repeat(level[..., None], 3, axis=-1).astype(np.float32)
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(colour),
+        "to_world": mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0),
+    }
+
+
+def load_studio(mi: Any, parts: list[Part], view: View) -> Any:
+    """A ``mi.Scene`` of the parts under the studio's light; Mitsuba's index of a shape is the number of the part."""
+    names = [f"part{i:04d}" for i in range(len(parts))]
+    description: dict[str, Any] = {"type": "scene", "light": studio_light(mi, view)}
+    for name, part in zip(names, parts, strict=True):
+        description[name] = _mesh(mi, name, part)
+    scene = mi.load_dict(description, optimize=False)
+    if [shape.id() for shape in scene.shapes()] != names:
+        raise RuntimeError("mitsuba has put the shapes of a scene in another order")
+    return scene
+
+
+def _mesh(mi: Any, name: str, part: Part) -> Any:
+    smooth = trimesh.graph.smooth_shade(part.mesh, angle=SMOOTH)
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(dict(part.bsdf))
+    if part.radiance is not None:
+        # no light is sampled toward the many thin beams; a ray that meets one sees it
+        light = {"type": "area", "sampling_weight": 0.0, "radiance": {"type": "rgb", "value": list(part.radiance)}}
+        properties["emitter"] = mi.load_dict(light)
+    mesh = mi.Mesh(name, len(smooth.vertices), len(smooth.faces), has_vertex_normals=True, props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(smooth.vertices, dtype=np.float32).ravel())
+    parameters["vertex_normals"] = mi.Float(np.ascontiguousarray(smooth.vertex_normals, dtype=np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.ascontiguousarray(smooth.faces, dtype=np.uint32).ravel())
+    parameters.update()
+    return mesh
