@@ -132,17 +132,30 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
             colour = _linear(material.baseColorFactor[:3])
             parts.append(Part(name, world, _BSDF["edge"], tuple(GLOW * colour)))  # type: ignore[arg-type]
             continue
-        kind = next(kind for known, kind in _MATERIALS if known is material)
+        kind = next((kind for known, kind in _MATERIALS if known is material), "")
         if name in backs:
             polished = own.face_normals[:, 2] * backs[name] < -0.5
             parts.append(Part(name, _part_of(world, polished), _BSDF["mirror"]))
             parts.append(Part(name, _part_of(world, ~polished), _BSDF["substrate"]))
         else:
-            parts.append(Part(name, world, _BSDF[kind]))
+            parts.append(Part(name, world, _BSDF.get(kind) or _paint(material)))
         if kind in ("glass", "block"):
             parts.append(Part(name, _edges(world, EDGE_PIXELS * pixel), _BSDF["edge"]))
     parts.append(Part(FLOOR, _floor(lowest - GAP), _BSDF["floor"]))
     return parts
+
+
+def _paint(material: Any) -> dict[str, Any]:
+    """What ``scene.glb`` has a body painted with."""
+    return {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": _linear(material.baseColorFactor[:3]).tolist()},
+            "metallic": float(material.metallicFactor),
+            "roughness": float(material.roughnessFactor),
+        },
+    }
 
 
 def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
@@ -186,14 +199,16 @@ def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
         [np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], axis=-1
     )
     height = toward[..., 2]
-    level = 0.42 + 0.55 * np.clip(height, 0.0, 1.0) ** 0.7
     flat = -np.array([view.forward[0], view.forward[1], 0.0])
     flat /= np.linalg.norm(flat)  # horizontally toward the camera
     side = np.array([view.right[0], view.right[1], 0.0])
+    # mirrors show what is behind the instrument: it is dark near the floor, so that they stand out from the floor
+    behind_it = np.clip(toward @ -flat, 0.0, 1.0)
+    level = 0.55 + 0.45 * np.clip(height, 0.0, 1.0) - 0.62 * behind_it * (1.0 - np.clip(height, 0.0, 1.0)) ** 0.5
+    level = np.clip(level, 0.05, None)
     for place, reach, strength in (
-        (0.55 * flat - 0.75 * side + 0.75 * np.array([0, 0, 1]), 0.50, 1.3),
-        (-0.8 * flat + 0.6 * side + 0.9 * np.array([0, 0, 1]), 0.40, 1.0),
-        (-0.3 * flat - 0.5 * side + 1.0 * np.array([0, 0, 1]), 0.3, 0.8),
+        (0.60 * flat - 0.75 * side + 0.85 * np.array([0, 0, 1]), 0.55, 1.5),
+        (0.45 * flat + 0.90 * side + 0.80 * np.array([0, 0, 1]), 0.40, 0.9),
     ):
         off = np.arccos(np.clip(toward @ (place / np.linalg.norm(place)), -1.0, 1.0))
         level = level + strength / (1.0 + np.exp((off - reach) / 0.05))
