@@ -22,7 +22,7 @@ from optics.diffraction import Grid, PupilField, image
 from optics.pixel_response import PixelResponse
 from optics.quadrature import PupilNodes
 from optics.system import assemble
-from optics.trace import BeamMissedError, make_rays, require_some, trace
+from optics.trace import BeamMissedError, make_rays, trace
 from optics.tree import PlacedBodies, State
 from optics.wavefront import eikonal
 from scenes.channel import Channel
@@ -174,9 +174,27 @@ class MonitorPath:
         rays = CcdRays(*traced.numpy())
         for i, channel in enumerate(self.channels):
             own = slice(i * len(states), (i + 1) * len(states))
-            require_some(rays.valid[own], f"the monitor channel {channel.key}")
+            if not np.all(np.any(rays.valid[own], axis=1)):
+                lost = int(np.argmin(np.any(rays.valid[own], axis=1)))
+                first = own.start + lost
+                where = self._where_lost(channel, states[lost], aimed.position[first], aimed.direction[first])
+                raise BeamMissedError(f"the whole beam of the monitor channel {channel.key} misses {where}")
             self._require_on_ccd(channel, rays.position[own])
         return rays
+
+    def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
+        """The element, and its body, at which the last of a channel's rays (N, 3) are lost."""
+        names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
+        rays = make_rays(self.backend, position, direction)
+        for count in range(1, len(names) + 1):
+            if (
+                not trace(self.backend, assemble(self.instrument.assembly, [names[:count]], [state]), rays)
+                .numpy()[3]
+                .any()
+            ):
+                break
+        element = self.instrument.assembly.elements[names[count - 1]]
+        return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
 
     def fields(self, states: Sequence[State]) -> PupilField:
         """Plane waves at the CCDs for C channels x S states, channel-major, in each CCD's x, y about its centre.

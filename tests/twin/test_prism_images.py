@@ -7,6 +7,7 @@ error has the effect of turning the facet by -V, and a spot moves by twice that 
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from analysis.recovery import measure_spots
 from optics.glass import glass
@@ -17,6 +18,7 @@ from scenes.instrument_model import build_instrument
 from scenes.load import load_camera
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 from twin.monitor import MonitorPath
+from twin.render import app
 
 ARCSEC = np.pi / 648000.0
 NAMES = ("gf7_pair", "monitor_pair")
@@ -235,3 +237,13 @@ def test_angle_errors_in_images(measured) -> None:
         assert np.abs(want).max() > 2.0
         checked += 1
     assert checked == 5
+
+
+def test_a_beam_that_misses_its_prism_is_told_by_name(tmp_path):
+    job = tmp_path / "job.yaml"
+    prism = "base/forward/monitor/left/prism_180"
+    job.write_text(f"instrument: gf7_pair\nperturb:\n  {prism}: {{shift: [0 mm, 60 mm, 0 mm]}}\n")
+    done = CliRunner().invoke(app, [str(job), "--out", str(tmp_path / "run")])
+    assert done.exit_code == 2
+    assert f"misses forward/left/prism_180/entry on {prism}/window/entry" in done.output
+    assert not (tmp_path / "run").exists()
