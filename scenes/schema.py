@@ -16,15 +16,19 @@ from pydantic_core import SchemaSerializer, core_schema
 
 from scenes.camera import CameraSpec
 from scenes.detector import DetectorSpec
+from scenes.error_budget import ErrorBudgetSpec
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.spec import Spec
+from scenes.turntable import PrincipleExperimentSpec
 
 MODELS: dict[str, type[Spec]] = {
     "job": JobSpec,
     "instrument": InstrumentSpec,
     "camera": CameraSpec,
     "detector": DetectorSpec,
+    "error_budget": ErrorBudgetSpec,
+    "principle_experiment": PrincipleExperimentSpec,
 }
 _ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")
@@ -35,7 +39,7 @@ def json_schema(name: str) -> dict[str, Any]:
     """The JSON Schema of one sort of file.
 
     Args:
-        name: "job", "instrument", "camera" or "detector".
+        name: one of MODELS.
 
     Raises:
         KeyError: another name.

@@ -97,12 +97,14 @@ class Part:
         mesh: in the base frame, metres.
         bsdf: Mitsuba's description of the material.
         radiance: red, green, blue that it emits.
+        matt: whether light on it changes slowly: neither mirror nor glass, and no thin line.
     """
 
     body: str
     mesh: trimesh.Trimesh
     bsdf: Mapping[str, Any]
     radiance: tuple[float, float, float] | None = None
+    matt: bool = True
 
 
 def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> list[Part]:
@@ -130,19 +132,30 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
         material = own.visual.material
         if name.startswith("light/"):
             colour = _linear(material.baseColorFactor[:3])
-            parts.append(Part(name, world, _BSDF["edge"], tuple(GLOW * colour)))  # type: ignore[arg-type]
+            parts.append(Part(name, world, _BSDF["edge"], tuple(GLOW * colour), False))  # type: ignore[arg-type]
             continue
         kind = next((kind for known, kind in _MATERIALS if known is material), "")
         if name in backs:
             polished = own.face_normals[:, 2] * backs[name] < -0.5
-            parts.append(Part(name, _part_of(world, polished), _BSDF["mirror"]))
+            parts.append(Part(name, _part_of(world, polished), _BSDF["mirror"], matt=False))
             parts.append(Part(name, _part_of(world, ~polished), _BSDF["substrate"]))
         else:
-            parts.append(Part(name, world, _BSDF.get(kind) or _paint(material)))
+            matt = kind not in ("mirror", "glass")
+            parts.append(Part(name, world, _BSDF.get(kind) or _paint(material), matt=matt))
         if kind in ("glass", "block"):
-            parts.append(Part(name, _edges(world, EDGE_PIXELS * pixel), _BSDF["edge"]))
+            parts.append(Part(name, _edges(world, EDGE_PIXELS * pixel), _BSDF["edge"], matt=False))
     parts.append(Part(FLOOR, _floor(lowest - GAP), _BSDF["floor"]))
     return parts
+
+
+def bounds_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
+    """Name of a node with a mesh -> its lowest and highest corner in the base frame, (2, 3) metres."""
+    out = {}
+    for name in scene.graph.nodes_geometry:
+        matrix, geometry = scene.graph.get(name)
+        points = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
+        out[name] = np.array([points.min(axis=0), points.max(axis=0)])
+    return out
 
 
 def _paint(material: Any) -> dict[str, Any]:
@@ -204,8 +217,9 @@ def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
     side = np.array([view.right[0], view.right[1], 0.0])
     # mirrors show what is behind the instrument: it is dark near the floor, so that they stand out from the floor
     behind_it = np.clip(toward @ -flat, 0.0, 1.0)
-    level = 0.55 + 0.45 * np.clip(height, 0.0, 1.0) - 0.62 * behind_it * (1.0 - np.clip(height, 0.0, 1.0)) ** 0.5
-    level = np.clip(level, 0.05, None)
+    rise = np.clip(height / 0.75, 0.0, 1.0)
+    level = 0.55 + 0.45 * np.clip(height, 0.0, 1.0)
+    level = level + np.sqrt(behind_it) * (0.10 + 1.0 * rise**1.5 - level)
     for place, reach, strength in (
         (0.60 * flat - 0.75 * side + 0.85 * np.array([0, 0, 1]), 0.55, 1.5),
         (0.45 * flat + 0.90 * side + 0.80 * np.array([0, 0, 1]), 0.40, 0.9),
