@@ -148,13 +148,12 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
     return parts
 
 
-def bounds_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
-    """Name of a node with a mesh -> its lowest and highest corner in the base frame, (2, 3) metres."""
+def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
+    """Name of a node with a mesh -> its vertices in the base frame, (N, 3) metres."""
     out = {}
     for name in scene.graph.nodes_geometry:
         matrix, geometry = scene.graph.get(name)
-        points = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
-        out[name] = np.array([points.min(axis=0), points.max(axis=0)])
+        out[name] = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
     return out
 
 

@@ -93,7 +93,7 @@ def _differences(axes: Axes, tables: Sequence[PrincipleTable], axis: str, last: 
         result = table[axis]
         first, second = result.columns
         start = result.series.angles if axis == "Z" else first
-        label = f"rendered, {len(tables)} benches" if k == 0 else None
+        label = f"rendered, {len(tables)} bench{'es' if len(tables) > 1 else ''}" if k == 0 else None
         axes.plot(result.series.angles / ARCSEC, (start - second) / ARCSEC, color=BLUE, lw=0.9, alpha=0.6, label=label)
     start = np.array(printed.ANGLES if axis == "Z" else printed.MIRROR_1[axis])
     difference = start - np.array(printed.MIRROR_2[axis])
