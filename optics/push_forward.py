@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -62,13 +61,15 @@ def push_forward(
     # interior gradients are kept: a hit on the way is an input of the rays at the end
     dr.forward_to(local.position, local.direction, local.path, list(traced.hits.values()), flags=dr.ADFlag.ClearEdges)
 
-    def steps(vector: Any) -> np.ndarray:
-        return rows(dr.grad(vector), traced.count)
-
+    vectors = (local.position, local.direction, *traced.hits.values())
+    slopes, path = [dr.grad(vector) for vector in vectors], dr.grad(local.path)
+    # one launch for all: each array evaluated by itself would trace everything again in a kernel of its own
+    dr.eval(slopes, path, vectors, local.path, local.valid)
+    at_position, at_direction, *at_hits = (rows(slope, traced.count) for slope in slopes)
     return RayTangents(
-        steps(local.position),
-        steps(local.direction),
-        dr.grad(local.path).numpy().reshape(traced.count, -1),
-        {element: steps(hit) for element, hit in traced.hits.items()},
+        at_position,
+        at_direction,
+        path.numpy().reshape(traced.count, -1),
+        dict(zip(traced.hits, at_hits, strict=True)),
         traced,
     )
