@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,9 @@ STRETCH = 30.0
 """Steepness of the asinh stretch of previews: it shows the faint diffraction rings beside the core."""
 
 
-def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -> None:
+def write_run(
+    run: RenderRun, folder: RunFolder, started: float, clock: float, also: Callable[[], None] = lambda: None
+) -> None:
     """Write all files of a run into an open run folder.
 
     Args:
@@ -33,6 +36,7 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
         folder: where.
         started: time of the start, seconds since the epoch.
         clock: seconds that the computation took.
+        also: writes more files into the folder, before the manifest lists them all.
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
@@ -53,6 +57,7 @@ def write_run(run: RenderRun, folder: RunFolder, started: float, clock: float) -
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
+    also()
     manifest = {
         "program": "twin.render",
         "versions": versions(),

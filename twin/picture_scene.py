@@ -17,13 +17,13 @@ from scenes.instrument_model import Instrument
 from scenes.mirror_mesh import behind
 from twin.light_paths import LightPaths
 from twin.picture_view import View
-from twin.scene_file import BLOCK, BRASS, DARK, GLASS, IMAGING, MIRROR, MONITOR, SILICON, build_scene
+from twin.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON, build_scene
 
 SMOOTH = 0.35
 """Edges flatter than this are not edges but facets of a curved surface, radians."""
 BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
 """Radius of beams and of the drawn edges of glass, in pixels at the middle of the picture."""
-GLOW = 1.15
+GLOW = 1.3
 """Radiance of beams; the floor's is about 0.9."""
 FLOOR = "floor"
 GAP = 0.05
@@ -39,7 +39,15 @@ _BSDF: dict[str, dict[str, Any]] = {
             "specular_reflectance": {"type": "rgb", "value": [0.93, 0.935, 0.94]},
         },
     },
-    "substrate": {"type": "twosided", "bsdf": {"type": "principled", "roughness": 0.45, "specular": 0.4}},
+    "substrate": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.30, 0.29, 0.275]},
+            "roughness": 0.45,
+            "specular": 0.4,
+        },
+    },
     "block": {
         "type": "twosided",
         "bsdf": {
@@ -82,10 +90,18 @@ _BSDF: dict[str, dict[str, Any]] = {
         "specular_transmittance": {"type": "rgb", "value": [0.80, 0.93, 0.95]},
     },
     "edge": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": _GLASS_EDGE}}},
+    "lamp": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
     "floor": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.80, 0.80, 0.80]}},
 }
-_BSDF["substrate"]["bsdf"]["base_color"] = {"type": "rgb", "value": [0.30, 0.29, 0.275]}
-_MATERIALS = ((MIRROR, "mirror"), (DARK, "board"), (SILICON, "silicon"), (BRASS, "gold"), (GLASS, "glass"), (BLOCK, "block"))
+_MATERIALS = (
+    (MIRROR, "mirror"),
+    (DARK, "board"),
+    (SILICON, "silicon"),
+    (BRASS, "gold"),
+    (GLASS, "glass"),
+    (BLOCK, "block"),
+)
+"""What a body is painted with in ``scene.glb``, and what it is made of here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +148,7 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
         material = own.visual.material
         if name.startswith("light/"):
             colour = _linear(material.baseColorFactor[:3])
-            parts.append(Part(name, world, _BSDF["edge"], tuple(GLOW * colour), False))  # type: ignore[arg-type]
+            parts.append(Part(name, world, _BSDF["lamp"], tuple(GLOW * colour), False))
             continue
         kind = next((kind for known, kind in _MATERIALS if known is material), "")
         if name in backs:
@@ -188,28 +204,24 @@ def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
 
 
 def _floor(height: float, reach: float = 500.0) -> trimesh.Trimesh:
-    corners = np.array([[-reach, -reach, height], [reach, -reach, height], [reach, reach, height], [-reach, reach, height]])
+    corners = reach * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    corners[:, 2] = height
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
 def _linear(colour: Any) -> np.ndarray:
-    """sRGB 0..255 -> linear 0..1."""
+    """Grey values of sRGB, 0..255, -> linear 0..1."""
     value = np.asarray(colour, dtype=float) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
-    """Soft neutral light from all sides: a bright ceiling, two large soft boxes, a dim horizon.
-
-    The boxes stand as a photographer's would, beside and above the camera.
-    """
+    """Soft neutral light from all sides, two large soft boxes beside and above the camera, a dark horizon opposite."""
     theta = np.pi * (np.arange(rows) + 0.5) / rows
     phi = 2.0 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
     polar, azimuth = np.meshgrid(theta, phi, indexing="ij")
     # Mitsuba's maps have +Y up; to_world below turns it to +Z, and longitude then runs from +Y toward +X
-    toward = np.stack(
-        [np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], axis=-1
-    )
+    toward = np.stack([np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], axis=-1)
     height = toward[..., 2]
     flat = -np.array([view.forward[0], view.forward[1], 0.0])
     flat /= np.linalg.norm(flat)  # horizontally toward the camera

@@ -66,7 +66,8 @@ def framed(
 
     Args:
         points: (N, 3), metres.
-        azimuth, elevation: of the camera as seen from the points, degrees.
+        azimuth: of the camera as seen from the points, from +X toward +Y, degrees.
+        elevation: likewise, toward +Z, degrees.
         field: horizontal field of view, degrees.
         size: width and height, pixels.
         margin: share of the width that stays free on every side.

@@ -20,8 +20,10 @@ from analysis.recovery import ESTIMATORS
 from optics.backend import load_backend
 from scenes.course import moment
 from scenes.resolved import ResolvedJob, resolve
-from twin.cli import BACKEND_HELP, LARGEST_SEED, check_backend, exit_on_terminate, explained
+from twin.cli import BACKEND_HELP, FAILURE, LARGEST_SEED, check_backend, exit_on_terminate, explained, print_error
 from twin.output import write_run
+from twin.picture import write_pictures
+from twin.picture_light import PictureError
 from twin.render_job import STAGES, render_job
 from twin.results import RenderRun
 from twin.run_folder import RunFolder, next_free
@@ -57,6 +59,10 @@ def main(
         int | None, typer.Option(min=1, max=10_000, help="Frames per state; overrides the file's.")
     ] = None,
     backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
+    picture: Annotated[
+        bool,
+        typer.Option("--picture", help="Also render pictures of the instrument itself: picture.png and two close-ups."),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print truth and recovered as JSON on stdout, and nothing else.")
@@ -85,6 +91,10 @@ def main(
     A job with a course, a table of temperatures over time (scenes/examples/orbit.yaml), also gets every time's
     numbers and images: course.json, course.nc and images/CAMERA_SIDE_course.tiff.
 
+    With --picture the run folder also gets picture.png (the instrument), picture_prisms.png and
+    picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba cannot, the rest of the
+    run is kept and the exit code is 1.
+
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     errors = Console(stderr=True)
@@ -92,7 +102,7 @@ def main(
         check_backend(backend)
         resolved = resolve(job)
         folder = RunFolder(out if out is not None else next_free(Path("runs"), job.stem), force)
-        run = _run(folder, resolved, backend, frames, seed, silent=as_json or quiet, errors=errors)
+        run, problem = _run(folder, resolved, backend, frames, seed, picture, silent=as_json or quiet, errors=errors)
     if as_json:
         course = {"course": run.course.to_dict()} if run.course is not None else {}
         result = {"truth": run.truth_dict(), "recovered": run.recovered_dict(), **course}
@@ -100,6 +110,9 @@ def main(
         sys.stdout.write("\n")
     elif not quiet:
         _print_result(run, folder.target)
+    if problem:
+        print_error(errors, f"the pictures are not complete: {problem}; all else is in {folder.target}")
+        raise typer.Exit(FAILURE)
 
 
 def _run(
@@ -108,9 +121,11 @@ def _run(
     backend: str,
     frames: int | None,
     seed: int | None,
+    picture: bool,
     silent: bool,
     errors: Console,
-) -> RenderRun:
+) -> tuple[RenderRun, str]:
+    """The run, and why its pictures are not complete (empty when they are, or nobody asked for them)."""
     started, clock = time.time(), time.monotonic()
     columns = (
         SpinnerColumn(),
@@ -121,6 +136,7 @@ def _run(
         TimeRemainingColumn(),
     )
     tracer = load_backend(backend)
+    problems: list[str] = []
     hidden = silent or not errors.is_terminal
     with exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
         task = bar.add_task("start", total=len(STAGES) + 1)
@@ -136,9 +152,18 @@ def _run(
 
         run = render_job(resolved, tracer, frames, seed, stage, advance)
         stage(WRITE)
-        write_run(run, folder, started, time.monotonic() - clock)
+
+        def pictures() -> None:
+            experiment = run.experiment
+            try:
+                write_pictures(experiment.instrument, tracer, run.state, folder.write_with, run.seed, advance)
+            except PictureError as error:  # what took minutes to compute is not thrown away for a picture
+                problems.append(str(error))
+
+        clock = time.monotonic() - clock
+        write_run(run, folder, started, clock, pictures if picture else lambda: None)
         bar.update(task, completed=len(STAGES) + 1)
-    return run
+    return run, " ".join(problems)
 
 
 def _print_result(run: RenderRun, target: Path) -> None:

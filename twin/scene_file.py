@@ -88,10 +88,10 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
             mesh.vertices = mesh.vertices * placed.scale[0, placed.index[body.path]].real
             scene.geometry[body.path] = mesh
             scene.graph.update(body.path, parent, matrix=matrix, geometry=body.path)
-    for name, (body, mesh) in baffle_meshes(instrument.baffles).items():
+    for name, (carrier, mesh) in baffle_meshes(instrument.baffles).items():
         node = f"baffles/{name}"
         scene.geometry[node] = mesh
-        scene.graph.update(node, body, matrix=np.eye(4), geometry=node)
+        scene.graph.update(node, carrier, matrix=np.eye(4), geometry=node)
     for beam in paths.beams:
         name = f"light/{beam.camera}/{beam.name.replace(' ', '_')}"
         scene.geometry[name] = _tubes(beam, list(instrument.cameras).index(beam.camera), tube)

@@ -1,0 +1,253 @@
+"""Pictures of the instrument: everything is where the prescription puts it, the same again, and nothing is lost."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import twin.picture_light as picture_light
+import twin.render as command
+from scenes.load import EXAMPLES
+from twin.light_paths import trace_light_paths
+from twin.picture import SHOTS, PictureError, Shot, render_shot, staged, which_body, write_pictures
+from twin.picture_clean import displayed, still_patches, without_grain
+from twin.picture_light import colour_variant
+from twin.picture_scene import points_in_world
+from twin.picture_view import framed, looking
+from twin.scene_file import build_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = EXAMPLES / "perturb.yaml"
+SMALL = tuple(Shot(s.name, s.width // 10, s.height // 10, 2, 2, s.shows) for s in SHOTS)
+NAMES = {"picture.png", "picture_prisms.png", "picture_focal_plane.png"}
+LINE = 3.0
+"""How far lines of light reach beyond the rays, pixels."""
+
+
+@pytest.fixture(scope="module")
+def paths(backend, gf7_pair):
+    return trace_light_paths(gf7_pair, backend, {})
+
+
+@pytest.fixture(scope="module")
+def seen(backend, gf7_pair, paths):
+    """What the pictures show -> number of the part in every pixel, their bodies, and the view; half the real size."""
+    out = {}
+    for shot in SHOTS:
+        half = Shot(shot.name, shot.width // 2, shot.height // 2, 2, 2, shot.shows)
+        out[shot.shows] = (*which_body(gf7_pair, paths, backend, half), staged(gf7_pair, paths, half)[0])
+    return out
+
+
+def pixels_of(index: np.ndarray, bodies: list[str], wanted: str) -> np.ndarray:
+    """Columns and rows of the pixels that show a body, (N, 2)."""
+    numbers = [i for i, body in enumerate(bodies) if body == wanted]
+    row, column = np.nonzero(np.isin(index, numbers))
+    return np.stack([column, row], axis=-1) + 0.5
+
+
+# --- where things are -------------------------------------------------------------------------------------------------
+
+
+def test_the_camera_of_a_direction_holds_all_points():
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (200, 3)) * [3.0, 0.5, 1.0]
+    view = framed(points, azimuth=-66.0, elevation=24.0, field=28.0, size=(1600, 1000), margin=0.04)
+    place = view.project(points)
+    free = 0.04 * 1600
+    assert place.min() >= free - 1e-6
+    assert np.all(place.max(axis=0) <= [1600 - free + 1e-6, 1000 - free + 1e-6])
+    # and it cannot come nearer: one pair of opposite edges is touched on both sides
+    gaps = [place.min(axis=0) - free, [1600 - free, 1000 - free] - place.max(axis=0)]
+    assert np.any(np.abs(gaps).max(axis=0) < 1e-6)
+    forward, right, up = looking(-66.0, 24.0)
+    assert forward[2] == pytest.approx(-np.sin(np.radians(24.0)))
+    assert right @ np.cross(forward, up) == pytest.approx(1.0)
+    assert view.pixel_at(points) == pytest.approx(
+        1.0 / np.hypot(*(view.project([right]) - view.project([[0.0, 0.0, 0.0]]))[0]), rel=0.01
+    )
+
+
+def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
+    """First hits of rays through Mitsuba's camera against vertices through ours."""
+    points = points_in_world(build_scene(gf7_pair, paths))
+    checked = 0
+    for index, bodies, view in seen.values():
+        for body, corners in points.items():
+            found = pixels_of(index, bodies, body)
+            depth = (corners - view.eye) @ view.forward
+            if len(found) == 0 or depth.min() < 0.01:
+                continue
+            where = view.project(corners)
+            assert np.all(found >= where.min(axis=0) - LINE), body
+            assert np.all(found <= where.max(axis=0) + LINE), body
+            checked += 1
+    assert checked > 50
+
+
+def test_bodies_fill_their_outline(gf7_pair, paths, seen):
+    """The sign of every axis and the scale: what stands in full view reaches to all sides of its projected box."""
+    points = points_in_world(build_scene(gf7_pair, paths))
+    index, bodies, view = seen["instrument"]
+    for body in ("base/backward/M1", "base/backward/M2", "base/forward/M2", "base/forward/monitor/left/prism_180"):
+        found, where = pixels_of(index, bodies, body), view.project(points[body])
+        assert found.min(axis=0) == pytest.approx(where.min(axis=0), abs=3.0), body
+        assert found.max(axis=0) == pytest.approx(where.max(axis=0), abs=3.0), body
+
+
+@pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
+def test_all_that_matters_can_be_seen(backend, instrument, name, seen):
+    model = instrument(name)
+    visible: dict[str, int] = {}
+    looks = list(seen.values())
+    if name != "gf7_pair":
+        rays = trace_light_paths(model, backend, {})
+        half = (Shot(s.name, s.width // 2, s.height // 2, 2, 2, s.shows) for s in SHOTS)
+        looks = [(*which_body(model, rays, backend, shot), None) for shot in half]
+    for index, bodies, _ in looks:
+        for number, count in zip(*np.unique(index[index >= 0], return_counts=True), strict=True):
+            visible[bodies[number]] = visible.get(bodies[number], 0) + int(count)
+    mirrors = [f"base/{camera}/{m}" for camera, built in model.cameras.items() for m in built.mirrors]
+    first = next(iter(model.cameras))
+    wanted = [*mirrors, *(s.path for s in model.solids), *(c.face_body for c in model.channels)]
+    wanted += [f"base/{first}/focal_plane", f"base/{first}/focal_plane/line"]
+    for body in wanted:
+        assert visible.get(body, 0) >= 20, body
+    # of a focal plane one sees either the board or its housing
+    for camera in model.cameras:
+        assert visible.get(f"base/{camera}/focal_plane", 0) + visible.get(f"baffles/{camera}_housing", 0) >= 20
+        assert {b for b in visible if b.startswith(f"light/{camera}/monitor")}
+        assert {b for b in visible if b.startswith(f"light/{camera}/imaging")}
+
+
+# --- how they look ----------------------------------------------------------------------------------------------------
+
+
+def test_colours(backend, gf7_pair, paths):
+    """Light background, blue and orange light."""
+    image = render_shot(gf7_pair, paths, backend, SMALL[0], seed=3).astype(int)
+    assert image.shape == (SMALL[0].height, SMALL[0].width, 3)
+    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    assert border.min() > 200
+    assert np.ptp(border.mean(axis=0)) < 6  # neutral
+    red, _, blue = np.moveaxis(image, -1, 0)
+    assert (red - blue > 80).sum() > 50  # monitor
+    assert (blue - red > 80).sum() > 50  # imaging
+    assert (image.max(axis=-1) < 80).sum() > 5  # black housings
+
+
+def test_a_seed_gives_the_same_picture(backend, gf7_pair, paths):
+    first, again, other = (render_shot(gf7_pair, paths, backend, SMALL[1], seed).astype(int) for seed in (7, 7, 8))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert np.abs(first - other).mean() < 6.0
+
+
+def test_grain_is_taken_off_matt_patches_only():
+    noise = np.random.default_rng(2).normal(0.5, 0.1, (60, 80, 3))
+    noise[:, 40:] += 0.4
+    part, normal = np.zeros((60, 80), int), np.zeros((60, 80, 3))
+    part[:, 40:], part[:, 70:] = 1, 2
+    patches = still_patches([(part, normal)], [True, True, False])
+    smooth = without_grain(noise, patches)
+    assert np.all(patches[:, 69:] == -1)  # no matt surface
+    assert np.all(patches[:, 39:41] == -1)  # a border
+    assert np.array_equal(smooth[patches == -1], noise[patches == -1].astype(np.float32))
+    assert smooth[:, :39].std() < 0.03
+    assert smooth[:, :39].mean() == pytest.approx(0.5, abs=0.01)  # nothing comes over the border
+    assert smooth[:, 41:69].mean() == pytest.approx(0.9, abs=0.01)
+
+
+def test_grey_values_rise_with_light():
+    grey = displayed(np.linspace(0.0, 4.0, 400)).astype(int)
+    assert grey[0] == 0
+    assert grey[-1] == 255
+    assert np.all(np.diff(grey) >= 0)
+
+
+# --- Mitsuba's variants -----------------------------------------------------------------------------------------------
+
+
+def test_the_former_variant_is_set_again(backend):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_mono")
+    with colour_variant(backend):
+        assert mi.variant() == "llvm_ad_rgb"
+    assert mi.variant() == "llvm_ad_mono"
+    with pytest.raises(PictureError, match="out of memory"), colour_variant(backend):
+        raise RuntimeError("out of memory")
+    assert mi.variant() == "llvm_ad_mono"
+
+
+def test_a_variant_that_is_not_there_is_an_error(backend, monkeypatch):
+    import mitsuba as mi
+
+    before = mi.variant()
+    monkeypatch.setitem(picture_light.VARIANTS, "llvm", "llvm_ad_teal")
+    with pytest.raises(PictureError, match="llvm_ad_teal"), colour_variant(backend):
+        pytest.fail("no other variant may be taken")
+    assert mi.variant() == before
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "write_pictures", lambda *a: write_pictures(*a, shots=SMALL))
+    result = CliRunner().invoke(
+        command.app, [str(EXAMPLE), "--out", str(tmp_path / "run"), "--frames", "1", "--picture"]
+    )
+    assert result.exit_code == 0, result.output
+    listed = json.loads((tmp_path / "run" / "manifest.json").read_text())["sha256"]
+    assert set(listed) >= NAMES
+    for shot in SMALL:
+        read = cv2.imread(str(tmp_path / "run" / shot.name))
+        assert read.shape == (shot.height, shot.width, 3)
+        assert read.std() > 5.0
+
+
+def test_without_pictures_the_rest_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setitem(picture_light.VARIANTS, "llvm", "llvm_ad_teal")
+    arguments = [str(EXAMPLE), "--out", str(tmp_path / "run"), "--frames", "1", "--picture", "--quiet"]
+    result = CliRunner().invoke(command.app, arguments)
+    assert result.exit_code == 1
+    assert re.search(r"error: the pictures are not complete: .*llvm_ad_teal", result.stderr)
+    kept = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"manifest.json", "truth.json", "recovered.json", "scene.glb", "report.html"} <= kept
+    assert not kept & NAMES
+
+
+def test_an_interrupt_leaves_nothing(tmp_path):
+    """Ctrl-C while Mitsuba renders."""
+    code = (
+        "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "runpy.run_module('twin.render', run_name='__main__', alter_sys=True)"
+    )
+    arguments = [str(EXAMPLE), "--out", str(tmp_path / "runs" / "run"), "--frames", "1", "--picture"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            end = time.monotonic() + 60.0
+            while not list(tmp_path.glob("runs/.run.*.partial/summary.png")):  # the last file before the pictures
+                assert process.poll() is None
+                assert time.monotonic() < end
+                time.sleep(0.05)
+            time.sleep(1.0)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 130, errors
+    assert "interrupted" in errors
+    assert not list(tmp_path.iterdir())
