@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from optics.frozen_map import FrozenMap
 from optics.pose import Pose
@@ -215,3 +216,42 @@ def _local_motion(
     turned = rotation_matrix(rotate)
     offset = pivot + shift - (growth * stretch)[:, None] * np.einsum("sij,sj->si", turned, pivot)
     return turned, offset, growth, stretch
+
+
+def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
+    """One state that does ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
+
+    Exact for the rigid parts; figures and indices add.
+    """
+    out = dict(first)
+    for path, motion in then.items():
+        before = out.get(path)
+        if before is None:
+            out[path] = motion
+            continue
+        body = bodies[path]
+        turn_1, offset_1 = _affine(before, body)
+        turn_2, offset_2 = _affine(motion, body)
+        turn, offset = turn_1 @ turn_2, turn_1 @ ((1.0 + before.stretch) * (1.0 + before.scale) * offset_2) + offset_1
+        out[path] = Motion(
+            rotate=_vector(Rotation.from_matrix(turn).as_rotvec()),
+            shift=_vector(offset),
+            scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
+            figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
+            stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
+            index=before.index + motion.index,
+            index_gradient=_vector(np.array(before.index_gradient) + np.array(motion.index_gradient)),
+        )
+    return out
+
+
+def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and offset (3,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
+    turn = rotation_matrix(np.array(motion.rotate))
+    pivot = np.array(body.pivots[motion.pivot])
+    growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
+    return turn, pivot + np.array(motion.shift) - growth * (turn @ pivot)
+
+
+def _vector(v: np.ndarray) -> tuple[float, float, float]:
+    return (float(v[0]), float(v[1]), float(v[2]))

@@ -6,7 +6,7 @@ move. Parts of one camera are not compared with each other: the prescription giv
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -15,11 +15,15 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from optics.solid import solid_mesh
+from optics.assembly import Assembly
+from optics.element import Element
+from optics.pose import Pose
+from optics.solid import Solid, SolidError, solid_mesh
 from optics.tree import PlacedBodies
 from scenes.channel import BASE, CENTRAL_PRISM
 from scenes.errors import InputError, Issue, KeyPath
 from scenes.mirror_mesh import BOARD, CHIP, behind, board_size, mirror_mesh
+from scenes.misplaced import MisplacedError, key_of
 
 if TYPE_CHECKING:
     from scenes.instrument_model import Instrument
@@ -136,3 +140,37 @@ def _remedy(path: str) -> tuple[int, KeyPath, str]:
 def _camera(path: str) -> str:
     """Name of the camera that a body belongs to; "" for the central prism."""
     return "" if path == CENTRAL_PRISM else path.split("/")[1]
+
+
+def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
+    """Check that every solid is closed and that clear apertures lie on their faces.
+
+    Raises:
+        MisplacedError: names the body and the face.
+    """
+    placed = assembly.place()
+    for solid in solids:
+        try:
+            mesh = solid_mesh(solid, placed)
+        except SolidError as error:
+            raise MisplacedError(str(error), key_of(solid.path)) from error
+        own = placed.pose(solid.path)
+        for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
+            for element in assembly.elements.values():
+                if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
+                    _check_inside(element, placed.pose(element.body), own.apply(polygon), solid.path)
+
+
+def _check_inside(element: Element, frame: Pose, polygon: np.ndarray, path: str) -> None:
+    """Check that an element's clear aperture lies inside the polygon (K, 3), world, of its face."""
+    assert element.aperture is not None
+    corners = frame.inverse().apply(polygon)[:, :2]
+    rim = element.aperture.outline()
+    edge = np.roll(corners, -1, axis=0) - corners
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
+    room = float(np.min((rim[:, None] - corners) * inward @ np.ones(2)))
+    if room < 0.0:
+        key = ("monitor", "return_face", "aperture") if path == CENTRAL_PRISM else key_of(path)
+        raise MisplacedError(
+            f"{path}: the clear aperture of {element.name} reaches {-1e3 * room:.3g} mm over the edge of its face", key
+        )

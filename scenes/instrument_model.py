@@ -23,11 +23,11 @@ from optics.tree import Body, PlacedBodies, RigidTree
 from scenes.baffle import Plate
 from scenes.camera_model import CameraModel, derive_camera
 from scenes.channel import BASE, CENTRAL_PRISM, SIDES, Channel
-from scenes.clearance import check_clearance
+from scenes.clearance import check_clearance, check_solids
 from scenes.errors import names_text, nearest
 from scenes.job import NodeInfo
 from scenes.misplaced import told_by_file
-from scenes.monitor_chain import MonitorChain, check_solids, leaving_beams, monitor_chain, square_facets
+from scenes.monitor_chain import MonitorChain, leaving_beams, monitor_chain, square_facets
 from scenes.prism_model import facet_block
 
 if TYPE_CHECKING:

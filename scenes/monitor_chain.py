@@ -24,7 +24,7 @@ from optics.element import Element, Interaction
 from optics.glass import glass
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
-from optics.solid import Solid, SolidError, solid_mesh
+from optics.solid import Solid
 from optics.surface import plane
 from optics.system import SystemBatch, assemble
 from optics.trace import make_rays, trace
@@ -309,40 +309,6 @@ def _missed(
                 what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
             return MisplacedError(what, key_of(element.body))
     return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
-
-
-def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
-    """Check that every solid is closed and that clear apertures lie on their faces.
-
-    Raises:
-        MisplacedError: names the body and the face.
-    """
-    placed = assembly.place()
-    for solid in solids:
-        try:
-            mesh = solid_mesh(solid, placed)
-        except SolidError as error:
-            raise MisplacedError(str(error), key_of(solid.path)) from error
-        own = placed.pose(solid.path)
-        for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
-            for element in assembly.elements.values():
-                if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
-                    _check_inside(element, placed.pose(element.body), own.apply(polygon), solid.path)
-
-
-def _check_inside(element: Element, frame: Pose, polygon: np.ndarray, path: str) -> None:
-    """Check that an element's clear aperture lies inside the polygon (K, 3), world, of its face."""
-    assert element.aperture is not None
-    corners = frame.inverse().apply(polygon)[:, :2]
-    rim = element.aperture.outline()
-    edge = np.roll(corners, -1, axis=0) - corners
-    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
-    room = float(np.min((rim[:, None] - corners) * inward @ np.ones(2)))
-    if room < 0.0:
-        key = ("monitor", "return_face", "aperture") if path == CENTRAL_PRISM else key_of(path)
-        raise MisplacedError(
-            f"{path}: the clear aperture of {element.name} reaches {-1e3 * room:.3g} mm over the edge of its face", key
-        )
 
 
 def _toward_optics(assembly: Assembly, channel: Channel, focal_plane: str) -> np.ndarray:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from optics.aperture import Aperture
 from optics.elastic_mesh import mirror_mesh, polyhedron_mesh
@@ -22,10 +21,9 @@ from optics.glass import glass
 from optics.heat import Temperature, carried_motion
 from optics.material import Material, material
 from optics.pose import Pose
-from optics.rotation import rotation_matrix
 from optics.solid import Solid, solid_mesh
 from optics.thermo_elastic import ElasticBody, Kinematic
-from optics.tree import ORIGIN, Body, Motion, State
+from optics.tree import ORIGIN, Body, Motion, State, compose
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from scenes.mirror_mesh import THICKNESS, behind
@@ -309,38 +307,3 @@ def _superposed(units: tuple[FaceChange, FaceChange, FaceChange], gradient: np.n
     figure = {j: float(sum(g * u.figure.get(j, 0.0) for g, u in zip(gradient, units, strict=True))) for j in terms}
     figure = {j: a for j, a in figure.items() if a}
     return Motion(rotate=_triple(np.asarray(rotate)), shift=_triple(np.asarray(shift)), figure=figure)
-
-
-def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
-    """One state that does ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
-
-    Exact for the rigid parts; figures and indices add.
-    """
-    out = dict(first)
-    for path, motion in then.items():
-        before = out.get(path)
-        if before is None:
-            out[path] = motion
-            continue
-        body = bodies[path]
-        turn_1, offset_1 = _affine(before, body)
-        turn_2, offset_2 = _affine(motion, body)
-        turn, offset = turn_1 @ turn_2, turn_1 @ ((1.0 + before.stretch) * (1.0 + before.scale) * offset_2) + offset_1
-        out[path] = Motion(
-            rotate=_triple(Rotation.from_matrix(turn).as_rotvec()),
-            shift=_triple(offset),
-            scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
-            figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
-            stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
-            index=before.index + motion.index,
-            index_gradient=_triple(np.array(before.index_gradient) + np.array(motion.index_gradient)),
-        )
-    return out
-
-
-def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and offset (3,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
-    turn = rotation_matrix(np.array(motion.rotate))
-    pivot = np.array(body.pivots[motion.pivot])
-    growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
-    return turn, pivot + np.array(motion.shift) - growth * (turn @ pivot)

@@ -18,11 +18,10 @@ from analysis.recovery import ESTIMATORS, Recovery, measure_spots, recover
 from optics.backend import Backend
 from optics.heat import Temperature
 from optics.threads import cores, one_blas_thread
-from optics.tree import Motion, State
+from optics.tree import Motion, State, compose
 from scenes.channel import BASE, CENTRAL_PRISM
 from scenes.error_budget import ErrorBudgetSpec
 from scenes.resolved import ResolvedJob
-from scenes.thermal_model import compose
 from twin.experiment import MonitorExperiment
 
 LINES = (

@@ -13,14 +13,14 @@ from optics.rotation import rotation_matrix
 from optics.system import assemble
 from optics.thermo_elastic import face_change, free_linear_field
 from optics.trace import make_rays, trace
-from optics.tree import Motion
+from optics.tree import Motion, compose
 from scenes.errors import InputError
 from scenes.instrument import MaterialsSpec
 from scenes.instrument_model import Instrument, build_instrument
 from scenes.job import check_nodes
 from scenes.load import load_camera, load_instrument, load_job
 from scenes.resolved import resolve, resolve_job
-from scenes.thermal_model import TERMS, TemperatureError, ThermalModel, compose
+from scenes.thermal_model import TERMS, TemperatureError, ThermalModel
 from twin.experiment import MonitorExperiment
 from twin.monitor import MonitorPath
 from twin.truth import trace_truth
