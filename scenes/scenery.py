@@ -94,9 +94,7 @@ def build_scenery(
     assembly = instrument.assembly
     placed = assembly.place([state])
     glass = [
-        surface
-        for solid in instrument.solids
-        for surface in solid_surfaces(solid, assembly, placed, state, finishes)
+        surface for solid in instrument.solids for surface in solid_surfaces(solid, assembly, placed, state, finishes)
     ]
     on_glass = {name for surface in glass for name in surface.elements}
     surfaces = [

@@ -137,9 +137,7 @@ def baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Tri
         matrix[:3, 3] = plate.pose.apply(np.array([*outline.centre, 0.0]))
         mesh.apply_transform(matrix)
         parts.setdefault(plate.name, (plate.body, []))[1].append(mesh)
-    return {
-        name: (body, _painted(trimesh.util.concatenate(meshes), BAFFLE)) for name, (body, meshes) in parts.items()
-    }
+    return {name: (body, _painted(trimesh.util.concatenate(meshes), BAFFLE)) for name, (body, meshes) in parts.items()}
 
 
 def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trimesh.Trimesh]:
