@@ -51,7 +51,7 @@ def write_run(
             folder.write_with(f"{stem}.png", partial(_write_preview, frames))
     folder.write_bytes("irradiance.nc", _netcdf(_irradiance(run)))
     if run.stray is not None:
-        folder.write_json("stray.json", {"before": run.stray.before.to_dict(), "after": run.stray.after.to_dict()})
+        folder.write_json("stray.json", run.stray.to_dict())
     if run.course is not None:
         _write_course(run, run.course, folder)
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))

@@ -15,6 +15,7 @@ from optics.trace import BeamMissedError
 from optics.tree import State
 from scenes.errors import InputError
 from scenes.job import check_nodes
+from scenes.obstruction import find_obstructions
 from scenes.resolved import ResolvedJob
 from twin.course import course_states, run_course, too_large
 from twin.crosstalk import crosstalk
@@ -128,6 +129,7 @@ def render_job(
         warnings=(
             *_warnings(experiment, resolved, nominal, photons[0], before, after[0]),
             *(series.warnings if series is not None else ()),
+            *(_in_the_way(stray) if stray is not None else ()),
         ),
         course=series,
         stray=stray,
@@ -147,12 +149,21 @@ def _stray(
     sources = len(experiment.path.channels) * paths
     try:
         before = stray_light(experiment, {}, paths, seed, lambda done, _: advance(STRAY, done, 2 * sources))
+        taken = find_obstructions(experiment.instrument, experiment.backend)
         if not state:
-            return StrayPair(before, before)
+            return StrayPair(before, before, taken)
         say = partial(_second_half, advance, sources)
-        return StrayPair(before, stray_light(experiment, state, paths, seed, say))
+        return StrayPair(before, stray_light(experiment, state, paths, seed, say), taken)
     except NominalPathLost as error:
         raise _too_large(resolved, str(error)) from error
+
+
+def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
+    return tuple(
+        f"{o.body} stands in the beam {o.beam} and takes {100.0 * o.share:.1f}% of it"
+        for o in stray.obstructions
+        if o.used == 0.0
+    )
 
 
 def _second_half(advance: Advance, first: int, done: int, _: int) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
 from analysis.recovery import Recovery
 from optics.tree import State
+from scenes.obstruction import Obstruction
 from scenes.resolved import ResolvedJob
 from twin.course import CourseRun
 from twin.crosstalk import CameraCrosstalk
@@ -21,10 +22,16 @@ from twin.truth import Truth
 
 @dataclass(frozen=True, eq=False)
 class StrayPair:
-    """Stray light of the nominal and of the perturbed instrument."""
+    """Stray light of the nominal and of the perturbed instrument, and which prisms stand in whose beam."""
 
     before: StrayLight
     after: StrayLight
+    obstructions: tuple[Obstruction, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Contents of stray.json."""
+        taken = [{"body": o.body, "beam": o.beam, "share": o.share, "used": o.used} for o in self.obstructions]
+        return {"before": self.before.to_dict(), "after": self.after.to_dict(), "obstructions": taken}
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,7 +79,10 @@ def test_the_job_adds_it_to_the_images(tmp_path):
     job.write_text(f"instrument: gf7_pair\nrender: {{frames: 2, stray: {{paths: {PATHS}}}}}\n")
     done = CliRunner().invoke(app, [str(job), "--out", str(tmp_path / "run")])
     assert done.exit_code == 0, done.output
-    found = json.loads((tmp_path / "run" / "stray.json").read_text())["after"]
+    stray = json.loads((tmp_path / "run" / "stray.json").read_text())
+    assert {o["beam"] for o in stray["obstructions"]} == {"forward/imaging", "backward/imaging"}
+    assert all(0.02 < o["share"] < 0.1 and o["used"] > 0.0 for o in stray["obstructions"])
+    found = stray["after"]
     assert found["paths_per_source"] == PATHS
     assert set(found["sources"]) == {"forward/left", "forward/right", "backward/left", "backward/right"}
     with xr.open_dataset(tmp_path / "run" / "irradiance.nc") as images:

@@ -36,7 +36,11 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
                 "families": [_family(f, share, name) for f, share in families[:STRONGEST]],
             }
         )
-    return {"paths": f"{after.paths:,}".replace(",", "\N{THIN SPACE}"), "rows": rows}
+    taken = [
+        {"body": o.body, "beam": o.beam, "share": fixed(100.0 * o.share, 1), "used": fixed(100.0 * o.used, 1)}
+        for o in run.stray.obstructions
+    ]
+    return {"paths": f"{after.paths:,}".replace(",", "\N{THIN SPACE}"), "rows": rows, "taken": taken}
 
 
 def _family(family: Family, share: float, detector: str) -> dict[str, str]:
