@@ -8,12 +8,14 @@ from analysis.monitoring import MonitorGeometry
 from optics import zernike
 from optics.assembly import points_to_world
 from optics.diffraction import Grid, PupilField, image
+from optics.heat import Temperature
 from optics.rotation import rotation_matrix, rotation_vector
 from optics.system import assemble
 from optics.trace import make_rays, trace
 from optics.tree import Body, Motion, RigidTree
 from optics.wavefront import path_difference
 from scenes.camera_model import collimated, field_direction
+from scenes.thermal_model import ThermalModel
 from twin.monitor import MonitorPath
 from twin.monitor_derivative import spot_jacobian
 from twin.motions import ElementaryMotion, line_family
@@ -371,3 +373,28 @@ def test_phase_grows_with_the_path():
     irradiance = image(field, grid, grid)[0]
     row, column = np.unravel_index(np.argmax(irradiance), irradiance.shape)
     assert (grid.points()[row], grid.points()[column]) == pytest.approx((0.0, target), abs=1e-9)
+
+
+def test_an_index_gradient_bends_toward_the_higher_index(backend, instrument):
+    """In the 180-deg prism of one channel; the beam runs along its x for most of the way."""
+    model = instrument("gf7_pair")
+    prism = model.channels[0].prism_body("prism_180")
+    names = model.assembly.sequences[f"{model.channels[0].key}/outgoing"]
+    inside = [n for n in names if n.endswith(("prism_180/entry", "prism_180/mirror", "prism_180/roof_a"))]
+    entry = model.assembly.elements[inside[0]]
+    frame = model.assembly.nominal_pose(entry.body)
+    start = frame.apply(np.array([*entry.aperture.centre, 1e-3]))
+    rays = make_rays(backend, start, -frame.rotation[:, 2])
+    states = [{}, {prism: Motion(index_gradient=(0.0, 1e-6, 0.0))}]
+    traced = trace(backend, assemble(model.assembly, [inside], states), rays, world=True)
+    place = traced.numpy(traced.world)[0][:, 0]
+    across = model.assembly.nominal_pose(prism).rotation[:, 1]
+    assert (place[1] - place[0]) @ across > 0.0
+
+
+def test_a_warm_structure_is_longer(instrument):
+    model = instrument("gf7_pair")
+    state = ThermalModel(model).state({"base/forward": Temperature(10.0)})
+    nominal, warm = (model.assembly.place([s]) for s in ({}, state))
+    away = [p.pose("base/forward/M2").translation - p.pose("base/forward").translation for p in (nominal, warm)]
+    assert np.linalg.norm(away[1]) > np.linalg.norm(away[0])
