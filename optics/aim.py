@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from optics.assembly import Assembly
 from optics.backend import Backend
-from optics.system import SystemBatch
+from optics.element import Element
+from optics.system import SystemBatch, assemble
 from optics.trace import make_rays, trace
+from optics.tree import State
 
 DEFAULT_TOLERANCE = 1e-11
 MAX_ITERATIONS = 25
@@ -120,3 +124,30 @@ def aim(
         f"aiming at the last element did not converge: {float(np.max(np.abs(goal - here))):.3g} m off after "
         f"{MAX_ITERATIONS} steps; the perturbation may move the beam off the mirrors"
     )
+
+
+def alive_along(
+    backend: Backend,
+    assembly: Assembly,
+    names: Sequence[str],
+    position: np.ndarray,
+    direction: np.ndarray,
+    state: State | None = None,
+) -> Iterator[tuple[Element, np.ndarray]]:
+    """Which rays are still alive after each element of a sequence, to tell where they get lost; traced step by step.
+
+    Args:
+        backend: where to trace.
+        assembly: the instrument.
+        names: elements in the order in which light meets them.
+        position: of the rays, world, metres, broadcastable to (N, 3).
+        direction: unit vectors, likewise.
+        state: what is perturbed.
+
+    Yields:
+        The element and a mask (N,).
+    """
+    rays = make_rays(backend, position, direction)
+    for count in range(1, len(names) + 1):
+        traced = trace(backend, assemble(assembly, [names[:count]], [state or {}]), rays)
+        yield assembly.elements[names[count - 1]], traced.numpy()[3][0]

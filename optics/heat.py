@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.pose import Pose
+from optics.pose import Pose, triple
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class Temperature:
 
     def seen_from(self, child: Pose) -> Temperature:
         """The same field in the frame of a body that stands at ``child`` in this one's frame."""
-        g = child.rotation.T @ np.array(self.gradient)
-        return Temperature(self.at(child.translation), (float(g[0]), float(g[1]), float(g[2])))
+        return Temperature(self.at(child.translation), triple(child.rotation.T @ np.array(self.gradient)))
 
 
 def carried_motion(expansion: float, gradient: np.ndarray, arm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,12 @@ from typing import Any
 import numpy as np
 
 
+def triple(vector: Any) -> tuple[float, float, float]:
+    """A vector (3,) as plain numbers, for immutable values that are compared."""
+    x, y, z = vector
+    return (float(x), float(y), float(z))
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Rigid transform x_parent = rotation @ x_body + translation.

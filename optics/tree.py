@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from optics.frozen_map import FrozenMap
-from optics.pose import Pose
+from optics.pose import Pose, triple
 from optics.rotation import rotation_matrix
 
 ORIGIN = "origin"
@@ -234,13 +234,13 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
         turn_2, offset_2 = _affine(motion, body)
         turn, offset = turn_1 @ turn_2, turn_1 @ ((1.0 + before.stretch) * (1.0 + before.scale) * offset_2) + offset_1
         out[path] = Motion(
-            rotate=_vector(Rotation.from_matrix(turn).as_rotvec()),
-            shift=_vector(offset),
+            rotate=triple(Rotation.from_matrix(turn).as_rotvec()),
+            shift=triple(offset),
             scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
             figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
             stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
             index=before.index + motion.index,
-            index_gradient=_vector(np.array(before.index_gradient) + np.array(motion.index_gradient)),
+            index_gradient=triple(np.array(before.index_gradient) + np.array(motion.index_gradient)),
         )
     return out
 
@@ -251,7 +251,3 @@ def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
     pivot = np.array(body.pivots[motion.pivot])
     growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
     return turn, pivot + np.array(motion.shift) - growth * (turn @ pivot)
-
-
-def _vector(v: np.ndarray) -> tuple[float, float, float]:
-    return (float(v[0]), float(v[1]), float(v[2]))

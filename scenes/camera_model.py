@@ -77,6 +77,12 @@ class CameraModel:
         """Vertex of a mirror's parent surface in the prescription frame, metres."""
         return np.array([0.0, 0.0, self.spec.mirrors[mirror].z])
 
+    def toward_optics(self, focal_plane: np.ndarray) -> np.ndarray:
+        """Direction from the line's centre along its chief ray, upstream, for rotations (..., 3, 3) of the focal plane
+        in the world.
+        """
+        return np.asarray(focal_plane @ (self.focal_plane.rotation.T @ -self.image_direction))
+
     def bare_assembly(self, apertures: bool = True) -> Assembly:
         """The camera alone, in the prescription frame: mirrors and image plane."""
         return _bare(self.spec, self.surfaces, self.apertures if apertures else {})

@@ -4,26 +4,17 @@ it.
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from optics.frozen_map import FrozenMap
 from optics.material import MATERIALS, material
 from scenes.baffle_spec import BaffleSpec
-from scenes.errors import Problem, names_text, nearest, shown
 from scenes.prism import CentralPrismSpec, Prism0Spec, Prism180Spec
 from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
-from scenes.spec import Name, Named, NothingIsEmpty, Number, Spec, Text, Whole
+from scenes.spec import Name, Named, NothingIsEmpty, Number, Spec, Text, Whole, name_in
 from scenes.units import ANGLE, TEMPERATURE, TIME
 
-
-def _known_material(name: str) -> str:
-    try:
-        return material(name).name
-    except KeyError:
-        raise Problem("no such material", shown(name), names_text(MATERIALS), nearest(name, MATERIALS)) from None
-
-
-MaterialName = Annotated[str, Field(strict=True), AfterValidator(_known_material)]
+MaterialName = Annotated[str, Field(strict=True), name_in("material", MATERIALS, material)]
 Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
 MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]

@@ -27,7 +27,7 @@ from scenes.clearance import check_clearance, check_solids
 from scenes.errors import names_text, nearest
 from scenes.job import NodeInfo
 from scenes.misplaced import told_by_file
-from scenes.monitor_chain import MonitorChain, leaving_beams, monitor_chain, square_facets
+from scenes.monitor_chain import MonitorChain, check_prisms, leaving_beams, monitor_chain, square_facets
 from scenes.prism_model import facet_block
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ class Instrument:
         Where rays that start at the focal plane are first sent; it rides on the focal plane.
         """
         model = self.cameras[camera]
-        local = model.focal_plane.rotation.T @ -model.image_direction
-        return np.asarray(placed.rotation[:, placed.index[f"{BASE}/{camera}/focal_plane"]].real @ local)
+        return model.toward_optics(placed.rotation[:, placed.index[f"{BASE}/{camera}/focal_plane"]].real)
 
     @property
     def separation(self) -> Mapping[str, float]:
@@ -95,6 +94,7 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     Raises:
         InputError: prisms or central prism cannot stand as the file says.
     """
+    check_prisms(spec)
     derived: dict[str, CameraModel] = {}
     for site in spec.cameras.values():
         if site.camera not in derived:
@@ -135,9 +135,9 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     block = spec.central_prism
     solids = (*solids, facet_block(CENTRAL_PRISM, block.material, facets, block.spread, block.height))
     index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
-    assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
-    assembly = square_facets(assembly, channels, chains, backend)
     cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
+    assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
+    assembly = square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
     instrument = Instrument(

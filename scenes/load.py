@@ -52,11 +52,9 @@ def instrument_path(job: JobSpec) -> Path:
     return _find(INSTRUMENTS, job.instrument, job, ("instrument",))
 
 
-def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
-    """Read an error budget: a name in scenes/budgets, or a path. Raises InputError as `load_job`."""
-    path = Path(name_or_path)
-    own = "/" in str(name_or_path) or path.suffix in (".yaml", ".yml")
-    return validate(ErrorBudgetSpec, read_yaml(path if own else LIBRARY / BUDGETS / f"{name_or_path}.yaml"))
+def load_error_budget(name_or_path: str | Path, relative_to: str | Path | None = None) -> ErrorBudgetSpec:
+    """Read an error budget; arguments and errors as `load_instrument`."""
+    return _load(ErrorBudgetSpec, BUDGETS, name_or_path, relative_to)
 
 
 def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = None) -> InstrumentSpec:

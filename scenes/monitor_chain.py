@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.aim import AimError, RayFan, aim, transverse_axes
+from optics.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.aperture import Circle
 from optics.assembly import Assembly
 from optics.backend import Backend
@@ -131,10 +131,9 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         to_base: the camera's pose in the base.
 
     Raises:
-        InputError, MisplacedError: a prism's glass or width does not suit the beam; the central prism is too near the
-            camera's beam for the rhomboid's displacement, or that is too small for the rhomboid's width.
+        InputError: the central prism is too near the camera's beam for the rhomboid's displacement, or that is too
+            small for the rhomboid's width.
     """
-    _check_prisms(spec)
     monitor, up = spec.monitor, beam.direction
     apex = np.array(spec.central_prism.position)
     spread = np.array(spec.central_prism.spread)
@@ -156,7 +155,6 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
             ("central_prism", "position"),
             allowed=f"places that leave it at least {1e3 * shortest:.4g} mm",
         )
-    root = f"{BASE}/{channel.camera}/monitor/{channel.side}"
     into_camera = to_base.inverse()
     length = sqrt(transfer**2 - (2.0 * off) ** 2)
     turned = np.cross(up, toward)
@@ -199,7 +197,6 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         Circle(0.5 * monitor.return_face.aperture),
     )
     facet = Body(channel.face_body, Pose(_facet_axes(up), centre - apex))
-    assert first.bodies[0].parent == root
     return MonitorChain(
         (*first.bodies, *second.bodies, facet),
         (*first.elements, *second.elements, face),
@@ -214,8 +211,12 @@ def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
     return Pose(turn, np.array(about) - turn @ np.array(about))
 
 
-def _check_prisms(spec: InstrumentSpec) -> None:
-    """Check that the prisms' glasses have an index at the monitor's wavelength and that they let the beam pass."""
+def check_prisms(spec: InstrumentSpec) -> None:
+    """Check that the prisms' glasses have an index at the monitor's wavelength and that they let the beam pass.
+
+    Raises:
+        InputError: one of them does not.
+    """
     monitor, face = spec.monitor, spec.monitor.return_face.aperture
     for name, prism in (("prism_180", monitor.prism_180), ("prism_0", monitor.prism_0)):
         known = glass(prism.material)
@@ -238,7 +239,7 @@ def _check_prisms(spec: InstrumentSpec) -> None:
 
 
 def square_facets(
-    assembly: Assembly, channels: Sequence[Channel], chains: Mapping[str, MonitorChain], backend: Backend
+    assembly: Assembly, channels: Sequence[Channel], cameras: Mapping[str, CameraModel], backend: Backend
 ) -> Assembly:
     """Turn every facet so that it sends the pinhole's beam to the middle of its area CCD, as found by tracing.
 
@@ -251,12 +252,11 @@ def square_facets(
     poses = {}
     placed = assembly.place()
     for channel in channels:
-        root = f"{BASE}/{channel.camera}/focal_plane"
         names = assembly.sequences[f"{channel.key}/outgoing"]
         start = np.array([placed.translation[0, placed.index[b]] for b in (channel.reticle_body, channel.ccd_body)])[
             None
         ]
-        guess = _toward_optics(assembly, channel, root)
+        guess = cameras[channel.camera].toward_optics(placed.pose(f"{BASE}/{channel.camera}/focal_plane").rotation)
         guess = np.broadcast_to(guess, start.shape)
         fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
         arriving = assembly.with_element(Element("arriving", channel.face_body, plane(), Interaction.PASS))
@@ -298,10 +298,8 @@ def _missed(
 ) -> MisplacedError:
     """Which element of a channel's way out rays (1, N, 3) from the pinhole and from the CCD miss first."""
     names = assembly.sequences[f"{channel.key}/outgoing"]
-    for count in range(1, len(names) + 1):
-        traced = trace(backend, assemble(assembly, [names[:count]]), make_rays(backend, position, direction))
-        if not traced.numpy()[3].all():
-            element = assembly.elements[names[count - 1]]
+    for element, alive in alive_along(backend, assembly, names, position, direction):
+        if not alive.all():
             what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
             if element.interaction is Interaction.TOTAL:
                 what += ", or is not totally reflected there"
@@ -309,16 +307,6 @@ def _missed(
                 what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
             return MisplacedError(what, key_of(element.body))
     return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
-
-
-def _toward_optics(assembly: Assembly, channel: Channel, focal_plane: str) -> np.ndarray:
-    """Rough direction from the focal plane to the last mirror, world."""
-    last = assembly.elements[assembly.sequences[f"{channel.key}/outgoing"][0]]
-    assert last.aperture is not None
-    x, y = last.aperture.centre
-    frame = assembly.nominal_pose(last.body)
-    way = frame.apply(np.array([x, y, float(last.surface.sag(x, y))])) - assembly.nominal_pose(focal_plane).translation
-    return np.asarray(way / np.linalg.norm(way))
 
 
 def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:

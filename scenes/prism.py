@@ -8,20 +8,13 @@ from optics.frozen_map import FrozenMap
 from optics.glass import GLASSES, glass
 from scenes.errors import Problem, names_text, nearest, shown
 from scenes.quantity import PositiveLength, Quantity, Vector, Vector3
-from scenes.spec import Name, NothingIsEmpty, Spec
+from scenes.spec import Name, NothingIsEmpty, Spec, name_in
 from scenes.units import ANGLE, LENGTH
 
 Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]
 
 
-def _known_glass(name: str) -> str:
-    try:
-        return glass(name).name
-    except KeyError:
-        raise Problem("no such glass", shown(name), names_text(GLASSES), nearest(name, GLASSES)) from None
-
-
-GlassName = Annotated[str, Field(strict=True), AfterValidator(_known_glass)]
+GlassName = Annotated[str, Field(strict=True), name_in("glass", GLASSES, glass)]
 """A glass of the catalogue in optics/glass.py."""
 
 

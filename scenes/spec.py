@@ -5,7 +5,7 @@ A specification is what a YAML file says, checked. Quantities are text with a un
 model.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from dataclasses import field as data_field
 from typing import Annotated, Any, TypeVar
@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, StringConstraints
 
 from optics.frozen_map import FrozenMap
-from scenes.errors import InputError, Issue, KeyPath, shown
+from scenes.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
 
 Value = TypeVar("Value")
 
@@ -25,6 +25,24 @@ Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z][A-Za-z0
 """A name: letters, digits, _ and -, beginning with a letter."""
 Text = Annotated[str, Field(strict=True, max_length=2000)]
 """Free text."""
+
+
+def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], Any]) -> AfterValidator:
+    """A name that a catalogue knows, brought to the catalogue's own spelling.
+
+    Args:
+        what: is named, for the error message.
+        catalogue: the names that may be given.
+        look_up: name -> entry with a ``name``; KeyError for an unknown one.
+    """
+
+    def check(name: str) -> str:
+        try:
+            return str(look_up(name).name)
+        except KeyError:
+            raise Problem(f"no such {what}", shown(name), names_text(catalogue), nearest(name, catalogue)) from None
+
+    return AfterValidator(check)
 
 
 def _nothing_is_empty(value: Any) -> Any:

@@ -20,7 +20,7 @@ from optics.face_change import FaceChange, face_change
 from optics.glass import glass
 from optics.heat import Temperature, carried_motion
 from optics.material import Material, material
-from optics.pose import Pose
+from optics.pose import Pose, triple
 from optics.solid import Solid, solid_mesh
 from optics.thermo_elastic import ElasticBody, Kinematic
 from optics.tree import ORIGIN, Body, Motion, State, compose
@@ -203,7 +203,7 @@ class ThermalModel:
             # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
             shift = inward @ move + own.stretch * mount
             if np.any(turn) or np.any(shift):
-                out[child.path] = Motion(rotate=_triple(inward @ turn), shift=_triple(shift), pivot=_mount(child))
+                out[child.path] = Motion(rotate=triple(inward @ turn), shift=triple(shift), pivot=_mount(child))
         return out
 
     def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
@@ -214,7 +214,7 @@ class ThermalModel:
         here = self.reference + field.change
         change = kind.vacuum_index(wavelength, here) - kind.vacuum_index(wavelength, self.reference)
         slope = kind.dn_dt(wavelength, here)
-        return change, _triple(slope * np.array(field.gradient))
+        return change, triple(slope * np.array(field.gradient))
 
     def _response(self, path: str, progress: Callable[[str], None]) -> Response:
         if path not in self._responses:
@@ -296,14 +296,10 @@ def _unit_load(axis: int, about: np.ndarray) -> Callable[[np.ndarray], np.ndarra
     return lambda points: points[:, axis] - about[axis]
 
 
-def _triple(v: np.ndarray) -> tuple[float, float, float]:
-    return (float(v[0]), float(v[1]), float(v[2]))
-
-
 def _superposed(units: tuple[FaceChange, FaceChange, FaceChange], gradient: np.ndarray) -> Motion:
     rotate = sum(g * np.array(u.rotate) for g, u in zip(gradient, units, strict=True))
     shift = sum(g * np.array(u.shift) for g, u in zip(gradient, units, strict=True))
     terms = sorted({j for u in units for j in u.figure})
     figure = {j: float(sum(g * u.figure.get(j, 0.0) for g, u in zip(gradient, units, strict=True))) for j in terms}
     figure = {j: a for j, a in figure.items() if a}
-    return Motion(rotate=_triple(np.asarray(rotate)), shift=_triple(np.asarray(shift)), figure=figure)
+    return Motion(rotate=triple(np.asarray(rotate)), shift=triple(np.asarray(shift)), figure=figure)

@@ -85,7 +85,7 @@ class ErrorBudget:
 
     Args:
         spec: its inputs.
-        resolved: a job on its instrument (without perturbation), the budget's light and angle errors applied.
+        resolved: a job on its instrument without perturbation; the budget's light and angle errors are applied here.
         backend: where to trace.
         seed: of all random numbers.
     """

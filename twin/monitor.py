@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from optics import quadrature, zernike
-from optics.aim import RayFan, aim, transverse_axes
+from optics.aim import RayFan, aim, alive_along, transverse_axes
 from optics.aperture import Circle
 from optics.backend import Backend
 from optics.diffraction import Grid, PupilField, image
@@ -185,15 +185,8 @@ class MonitorPath:
     def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
         """The element, and its body, at which the last of a channel's rays (N, 3) are lost."""
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
-        rays = make_rays(self.backend, position, direction)
-        for count in range(1, len(names) + 1):
-            if (
-                not trace(self.backend, assemble(self.instrument.assembly, [names[:count]], [state]), rays)
-                .numpy()[3]
-                .any()
-            ):
-                break
-        element = self.instrument.assembly.elements[names[count - 1]]
+        steps = alive_along(self.backend, self.instrument.assembly, names, position, direction, state)
+        count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
         return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
 
     def fields(self, states: Sequence[State]) -> PupilField:

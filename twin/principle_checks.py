@@ -98,6 +98,7 @@ def principle_checks(
     seed: int = 0,
     benches: int = 8,
     progress: Callable[[str], None] | None = None,
+    reader: Reader | None = None,
 ) -> tuple[PrincipleCheck, ...]:
     """Render Table 2, on the ideal bench and on some with errors, and set it beside the printed one.
 
@@ -114,10 +115,11 @@ def principle_checks(
         seed: of the first bench's errors and noise; the others have the seeds that follow.
         benches: how many are rendered. A bench's errors are shared by all its rows, so that one alone says little.
         progress: told what is being done.
+        reader: the calibrated autocollimators, by default calibrated here.
     """
     say = progress or (lambda text: None)
     say("calibrate the autocollimators")
-    reader = Reader(setup, backend)
+    reader = reader or Reader(setup, backend)
     say("the ideal bench")
     ideal = run_principle_experiment(setup, backend, seed=seed, ideal=True, reader=reader)
     real = []

@@ -91,6 +91,9 @@ def main(
     A job with a course, a table of temperatures over time (scenes/examples/orbit.yaml), also gets every time's
     numbers and images: course.json, course.nc and images/CAMERA_SIDE_course.tiff.
 
+    With `render: {stray: true}` ghosts and scattered light are path-traced and added to the images; stray.json lists
+    them.
+
     With --picture the run folder also gets picture.png (the instrument), picture_prisms.png and
     picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba cannot, the rest of the
     run is kept and the exit code is 1.

@@ -11,17 +11,21 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from typer.testing import CliRunner
 
 import twin.render as command
 from scenes.load import EXAMPLES
+from tests.twin.commands import files, invoke
 from twin.render_job import render_job
+
+run = partial(invoke, command.app)
+"""The command inside this process."""
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = EXAMPLES / "perturb.yaml"
@@ -56,18 +60,6 @@ def start(*arguments: object, **options: object) -> "subprocess.Popen[str]":
     code = [sys.executable, "-c", AS_FROM_A_TERMINAL, *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(code, cwd=ROOT, env=environment, start_new_session=True, **pipes, **options)
-
-
-def run(*arguments: object):
-    """The command inside this process: exit_code, stdout, stderr."""
-    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
-
-
-def files(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
 def frames_of(folder: Path) -> dict[str, np.ndarray]:

@@ -10,19 +10,23 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import twin.validate as command
+from tests.twin.commands import files, invoke
 from twin.validation import formulas_001, registry
 from twin.validation.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, VERDICTS, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context, matches
 from twin.validation.registry import UnknownCheck, select
 from twin.validation.runner import run_checks
+
+run = partial(invoke, command.app)
+"""The command inside this process."""
 
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = [
@@ -69,18 +73,6 @@ OTHER = group("004.eq3", "f", "p")
 def fake(monkeypatch):
     """Function: these groups in place of the real ones."""
     return lambda *groups: monkeypatch.setattr(registry, "GROUPS", groups)
-
-
-def run(*arguments: object):
-    """The command inside this process: exit_code, stdout, stderr."""
-    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
-
-
-def files(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
 # --- which checks run -------------------------------------------------------------------------------------------------

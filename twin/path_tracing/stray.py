@@ -20,7 +20,7 @@ from scenes.channel import Channel
 from scenes.instrument_model import Instrument
 from scenes.scene_surface import Finishes
 from scenes.scenery import Scenery, build_scenery
-from twin.monitor import MonitorPath
+from twin.monitor import Aimed, MonitorPath
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.integrator import FAINT, Sampling
 from twin.path_tracing.result import Family, PathResult
@@ -63,7 +63,12 @@ class StrayResult:
 
 
 def pinhole(
-    instrument: Instrument, backend: Backend, state: State, channel: Channel, cone: float | None = None
+    instrument: Instrument,
+    backend: Backend,
+    state: State,
+    channel: Channel,
+    cone: float | None = None,
+    aimed: Aimed | None = None,
 ) -> DiskSource:
     """The light source of a channel: its pinhole, evenly lit into a cone that covers the camera's pupil.
 
@@ -75,6 +80,7 @@ def pinhole(
         state: what is perturbed.
         channel: which channel.
         cone: sine of the cone's half angle; by default that of the pupil with ``CONE_ROOM``.
+        aimed: all channels' nominal rays to the return faces, by default worked out here.
     """
     placed = instrument.assembly.place([state])
     model = instrument.cameras[channel.camera]
@@ -83,9 +89,14 @@ def pinhole(
     place = placed.pose(channel.reticle_body).translation
     axis = instrument.toward_optics(placed, channel.camera)[0]
     radius = 0.5 * instrument.spec.monitor.reticle.pinhole
-    aimed = MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
+    aimed = aimed or nominal_rays(instrument, backend)
     number = instrument.channels.index(channel)
     return DiskSource.along(place, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_ROOM)
+
+
+def nominal_rays(instrument: Instrument, backend: Backend) -> Aimed:
+    """Rays from every pinhole to its return face in the unperturbed instrument."""
+    return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
 
 
 def monitor_families(scenery: Scenery, instrument: Instrument) -> dict[str, tuple[int, ...]]:
@@ -132,12 +143,13 @@ def trace_stray(
     chosen = tuple(instrument.channels if channels is None else channels)
     scenery = build_scenery(instrument, state, finishes, baffles)
     tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument), sampling)
+    aimed = nominal_rays(instrument, backend)
     ccd = instrument.spec.monitor.area_ccd
     photons = {f"{c.key}/area_ccd": np.zeros((ccd.rows, ccd.columns)) for c in instrument.channels}
     runs: dict[str, PathResult] = {}
     scale: dict[str, float] = {}
     for number, channel in enumerate(chosen):
-        source = pinhole(instrument, backend, state, channel, cone)
+        source = pinhole(instrument, backend, state, channel, cone, aimed)
         own = int(np.random.SeedSequence([seed, instrument.channels.index(channel)]).generate_state(1)[0])
 
         def tell(done: int, _: int, before: int = number) -> None:

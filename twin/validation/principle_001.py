@@ -41,7 +41,9 @@ def run(context: Context) -> Iterator[CheckResult]:
         told += 1
         context.progress(min(0.9, 0.08 * told), text)
 
-    found = {check.id: check for check in principle_checks(setup, context.backend, context.seed, progress=progress)}
+    reader = Reader(setup, context.backend)
+    checks = principle_checks(setup, context.backend, context.seed, progress=progress, reader=reader)
+    found = {check.id: check for check in checks}
     for identifier, finding in found.items():
         if identifier not in context.selected:
             continue
@@ -55,7 +57,6 @@ def run(context: Context) -> Iterator[CheckResult]:
         how = finding.how + "."
         yield context.check(identifier).judge(finding.measured, finding.sigma, how, None, reasons)
     context.progress(0.95, "draw")
-    reader = Reader(setup, context.backend)
     table = run_principle_experiment(setup, context.backend, seed=context.seed, reader=reader)
     context.add(
         Table(
