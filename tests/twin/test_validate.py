@@ -18,8 +18,8 @@ import pytest
 
 import twin.validate as command
 from tests.twin.commands import files, invoke
+from twin.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import formulas_001, registry
-from twin.validation.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, VERDICTS, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context, matches
 from twin.validation.registry import UnknownCheck, select

@@ -9,8 +9,8 @@ from analysis.monitoring import ARCSEC
 from scenes.job import JobSpec
 from scenes.load import load_error_budget
 from scenes.resolved import resolve_job
+from twin.artefact import Cell, Data, SvgFigure, Table
 from twin.error_budget import LINES, BudgetLine, ErrorBudget
-from twin.validation.artefact import Cell, Data, SvgFigure, Table
 from twin.validation.check import Check, CheckResult
 from twin.validation.error_budget_figure import budget_svg
 from twin.validation.group import CheckGroup, Context

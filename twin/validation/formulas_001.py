@@ -18,7 +18,7 @@ from optics.surface import plane
 from optics.system import assemble
 from optics.trace import make_rays, trace
 from optics.tree import Body, Motion, RigidTree
-from twin.validation.artefact import Cell, SvgFigure, Table
+from twin.artefact import Cell, SvgFigure, Table
 from twin.validation.check import DIFFERS, DOUBTFUL, Check, CheckResult, Explanation
 from twin.validation.formulas_001_figure import ratios_svg
 from twin.validation.formulas_001_images import FACE, FRAMES, PISTON, SCALE, SHIFT, TURN, Ratio, SingleMotions

@@ -9,8 +9,8 @@ from pathlib import Path
 from optics.backend import Backend
 from scenes.job import JobSpec
 from scenes.resolved import resolve_job
+from twin.artefact import Artefact
 from twin.experiment import MonitorExperiment
-from twin.validation.artefact import Artefact
 from twin.validation.check import Check, CheckResult
 
 

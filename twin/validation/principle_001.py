@@ -8,12 +8,12 @@ from tempfile import TemporaryDirectory
 
 from analysis.monitoring import ARCSEC
 from scenes.load import load_principle_experiment
+from twin.artefact import Cell, PngFigure, Table
 from twin.principle_checks import principle_checks
 from twin.principle_experiment import Reader, run_principle_experiment
 from twin.principle_figure import write_principle_figure
 from twin.principle_printed import ANGLES
 from twin.principle_table import PrincipleTable
-from twin.validation.artefact import Cell, PngFigure, Table
 from twin.validation.check import DOUBTFUL, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context
 

@@ -9,8 +9,8 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from twin.artefact import Artefact, Data, PngFigure, SvgFigure, Table
 from twin.report.numbers import decimals_for, fixed, plain, significant
-from twin.validation.artefact import Artefact, Data, PngFigure, SvgFigure, Table
 from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
 from twin.validation.runner import GroupRun, Validation
 from twin.versions import versions

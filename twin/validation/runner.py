@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from optics.backend import Backend
+from twin.artefact import Artefact
 from twin.experiment import MonitorExperiment
-from twin.validation.artefact import Artefact
 from twin.validation.check import FAILED, VERDICTS, CheckResult, Verdict
 from twin.validation.group import CheckGroup, Context
 from twin.validation.registry import Selection
