@@ -11,6 +11,8 @@ with both Jacobians by forward-mode AD through the trace. Paths count from the i
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from optics.aim import RayFan, aim, transverse_axes
@@ -69,6 +71,7 @@ def imaging_field(
     nodes: PupilNodes,
     wavelength: float,
     origin: np.ndarray | None = None,
+    incoming: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> PupilField:
     """Plane waves at the detector for B systems that image a far point.
 
@@ -82,6 +85,8 @@ def imaging_field(
         nodes: quadrature over the unit disk.
         wavelength: metres.
         origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
+        incoming: optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse
+            coordinates (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
 
     Returns:
         Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
@@ -91,16 +96,16 @@ def imaging_field(
         BeamMissedError: no ray reaches the detector.
     """
     target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
-    position, axes = aim_collimated(backend, to_stop, direction, launch, target)
-    count = len(position)
-    heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], position.shape)
+    launched, axes = aim_collimated(backend, to_stop, direction, launch, target)
+    count = len(launched)
+    heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], launched.shape)
     stop_index = len(to_stop.structure) - 1
     # every ray twice, once for each axis of the wavefront along which its launch point is moved
-    twice, heading = (np.repeat(array, 2, axis=1) for array in (position, heading))
-    moves = np.broadcast_to(axes[:, None], (*position.shape[:2], 2, 3)).reshape(twice.shape)
+    twice, heading = (np.repeat(array, 2, axis=1) for array in (launched, heading))
+    moves = np.broadcast_to(axes[:, None], (*launched.shape[:2], 2, 3)).reshape(twice.shape)
     out = push_forward(backend, systems, twice, heading, moves, keep=(stop_index,))
     hit, turn = (
-        np.swapaxes(step[..., :2].reshape(*position.shape[:2], 2, 2), -1, -2)
+        np.swapaxes(step[..., :2].reshape(*launched.shape[:2], 2, 2), -1, -2)
         for step in (out.hits[stop_index], out.direction)
     )
     place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
@@ -109,4 +114,7 @@ def imaging_field(
     amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (count, 3))[:, None]
     phase = eikonal(place, leaving, path, centre)
+    if incoming is not None:
+        middle = np.einsum("bn,bnx->bx", launch_area, launched) / np.sum(launch_area, axis=-1, keepdims=True)
+        phase = phase + incoming(np.einsum("bnx,bkx->bnk", launched - middle[:, None], axes))
     return PupilField(leaving[..., 0], leaving[..., 1], phase - phase[:, :1], amplitude, wavelength)

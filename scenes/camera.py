@@ -5,6 +5,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from optics.frozen_map import FrozenMap
+from scenes.band import BandSpec
 from scenes.errors import Problem, names_text, nearest, shown
 from scenes.quantity import AsphereTerms, Length, PositiveLength, Quantity, Wavelength
 from scenes.spec import Name, Named, Number, Spec, Text, Whole
@@ -70,6 +71,7 @@ class CameraSpec(Spec):
         mirrors: by name, in the order in which the light meets them.
         image: focal plane.
         line: line CCD.
+        bands: line CCDs by spectral band, for images of targets; empty when none is described.
         edge_margin: by how much a mirror's clear aperture is wider than the beams that use it, metres.
     """
 
@@ -84,6 +86,7 @@ class CameraSpec(Spec):
     mirrors: Annotated[Named[MirrorSpec], Field(min_length=1)]
     image: ImageSpec
     line: LineSpec
+    bands: Named[BandSpec] = Field(default_factory=FrozenMap)
     edge_margin: Annotated[float, Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
 
     @model_validator(mode="after")

@@ -5,10 +5,10 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from optics.frozen_map import FrozenMap
-from scenes.instrument import Frames, InstrumentSpec, Reference
+from scenes.instrument import Frames, InstrumentSpec
 from scenes.prism import Tilt
 from scenes.quantity import Quantity
-from scenes.spec import Name, NothingIsEmpty, Number, Spec, Text, Whole
+from scenes.spec import Name, NothingIsEmpty, Number, Reference, Spec, Text, Whole
 from scenes.units import ANGLE, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT
 
 Steadiness = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, above_zero=True, largest="100 K")]

@@ -11,16 +11,13 @@ from optics.material import MATERIALS, material
 from scenes.baffle_spec import BaffleSpec
 from scenes.prism import CentralPrismSpec, Prism0Spec, Prism180Spec
 from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
-from scenes.spec import Name, Named, NothingIsEmpty, Number, Spec, Text, Whole, name_in
+from scenes.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, Whole, name_in
 from scenes.units import ANGLE, TEMPERATURE, TIME
 
 MaterialName = Annotated[str, Field(strict=True), name_in("material", MATERIALS, material)]
 Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
 MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
-Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
-"""Name of a file in the library (`gf7`), or path of a file of one's own, relative to the file that names it."""
-
 MOST_FRAMES = 10_000
 Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
 

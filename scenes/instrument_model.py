@@ -21,6 +21,7 @@ from optics.solid import Solid
 from optics.surface import plane
 from optics.tree import Body, PlacedBodies, RigidTree
 from scenes.baffle import Plate
+from scenes.camera_assembly import camera_bodies, camera_elements, camera_sequences, focal_plane_body
 from scenes.camera_model import CameraModel, derive_camera
 from scenes.channel import BASE, CENTRAL_PRISM, SIDES, Channel
 from scenes.clearance import check_clearance, check_solids
@@ -109,9 +110,9 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
         root = f"{BASE}/{name}"
         to_base = Pose(about_axis(1, site.look), np.array(site.position))
         own = _channels(spec, name, model)
-        bodies += _camera_bodies(root, to_base, model, own)
-        elements.update(_camera_elements(name, root, model, own))
-        sequences.update(_camera_sequences(name, model))
+        bodies += [*camera_bodies(root, to_base, model), *_monitor_bodies(focal_plane_body(root), own)]
+        elements.update({**camera_elements(name, root, model), **_ccd_elements(own)})
+        sequences.update(camera_sequences(name, model))
         bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.side}") for channel in own)]
         beams = leaving_beams(spec.monitor, model, own, np.array(site.pupil_offset), to_base, backend)
         for channel, beam in zip(own, beams, strict=True):
@@ -165,53 +166,20 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
     ]
 
 
-def _camera_bodies(root: str, to_base: Pose, model: CameraModel, channels: list[Channel]) -> list[Body]:
-    into_camera = model.camera_frame.inverse()
-    bodies = [Body(root, to_base)]
-    for mirror in model.mirrors:
-        aperture = model.apertures[mirror]
-        x, y = aperture.centre
-        centre = (x, y, float(model.surfaces[mirror].sag(x, y)))
-        pose = into_camera @ Pose(np.eye(3), model.vertex(mirror))
-        bodies.append(Body(f"{root}/{mirror}", pose, pivots={"centre": centre}))
-    node = model.focal_plane.inverse().apply(model.rear_node)
-    plane_root = f"{root}/focal_plane"
-    pivots = {"rear_node": tuple(node), "line_centre": (0.0, 0.0, 0.0)}
-    bodies.append(Body(plane_root, into_camera @ model.focal_plane, pivots=pivots, scales=False))
-    bodies.append(Body(f"{plane_root}/line"))
+def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
+    """Boards at the ends of the line CCD, with their reticles and area CCDs."""
+    bodies = []
     for channel in channels:
-        board = f"{plane_root}/{channel.side}"
-        bodies.append(Body(board, Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
+        bodies.append(Body(f"{plane_root}/{channel.side}", Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
         offset = np.array([channel.pinhole[0] - channel.ccd[0], channel.pinhole[1] - channel.ccd[1], 0.0])
         bodies.append(Body(channel.reticle_body, Pose(np.eye(3), offset)))
         bodies.append(Body(channel.ccd_body, Pose(_FLIP, np.zeros(3))))
     return bodies
 
 
-def _camera_elements(name: str, root: str, model: CameraModel, channels: list[Channel]) -> dict[str, Element]:
-    out = {}
-    for mirror in model.mirrors:
-        key = f"{name}/{mirror}"
-        out[key] = Element(
-            key, f"{root}/{mirror}", model.surfaces[mirror], Interaction.REFLECT, model.apertures[mirror]
-        )
-    key = f"{name}/focal_plane"
-    out[key] = Element(key, f"{root}/focal_plane", plane(), Interaction.PASS)
-    for channel in channels:
-        key = f"{channel.key}/area_ccd"
-        out[key] = Element(key, channel.ccd_body, plane(), Interaction.PASS)
-    return out
-
-
-def _camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]]:
-    forward = tuple(f"{name}/{m}" for m in model.mirrors)
-    backward = forward[::-1]
-    stop = backward.index(f"{name}/{model.spec.stop}")
-    return {
-        f"{name}/imaging": (*forward, f"{name}/focal_plane"),
-        f"{name}/image_to_stop": backward[: stop + 1],
-        f"{name}/image_to_object": backward,
-    }
+def _ccd_elements(channels: list[Channel]) -> dict[str, Element]:
+    keys = {channel: f"{channel.key}/area_ccd" for channel in channels}
+    return {key: Element(key, channel.ccd_body, plane(), Interaction.PASS) for channel, key in keys.items()}
 
 
 def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:

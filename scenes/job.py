@@ -14,9 +14,9 @@ from optics.heat import Temperature
 from optics.zernike import MAX_NOLL
 from scenes.course import CourseSpec, TemperatureChange, TemperatureGradient
 from scenes.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
-from scenes.instrument import Frames, Reference
+from scenes.instrument import Frames
 from scenes.quantity import Quantity, Vector
-from scenes.spec import Name, NothingIsEmpty, Paths, Spec, Whole
+from scenes.spec import Name, NothingIsEmpty, Paths, Reference, Spec, Whole
 from scenes.units import ANGLE, LENGTH, SCALE
 
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
@@ -206,7 +206,11 @@ def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
     Raises:
         InputError: one issue for each fault, with the nearest valid name.
     """
-    issues = [issue for path, what in job.perturb.items() for issue in _node_issues(job, nodes, path, what)]
+    issues = [
+        issue
+        for path, what in job.perturb.items()
+        for issue in perturbation_issues(job, nodes, path, what, ("perturb", path))
+    ]
     for path in job.course.temperature if job.course is not None else ():
         key = ("course", "temperature", path)
         if path not in nodes:
@@ -217,27 +221,37 @@ def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
         raise InputError(*issues)
 
 
-def _node_issues(job: JobSpec, nodes: Mapping[str, NodeInfo], path: str, what: PerturbationSpec) -> list[Issue]:
+def perturbation_issues(
+    owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PerturbationSpec, key: KeyPath
+) -> list[Issue]:
+    """What is wrong with a perturbation of the node ``path`` that stands at ``key`` of a specification.
+
+    Args:
+        owner: the specification.
+        nodes: node path -> what may be done to it.
+        path: of the node.
+        what: is done to it.
+        key: where it is written.
+    """
     if path not in nodes:
-        return [_no_such_node(job, nodes, path, ("perturb", path))]
+        return [_no_such_node(owner, nodes, path, key)]
     info, issues = nodes[path], []
     for action in what.uses():
         if action not in info.allows:
-            issues.append(_not_allowed(job, info, action, ("perturb", path, action)))
+            issues.append(_not_allowed(owner, info, action, (*key, action)))
     if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
         known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))
-        key, meant = ("perturb", path, "pivot"), nearest(what.pivot, known)
-        issues.append(
-            job.issue("this node has no such pivot", key, found=what.pivot, allowed=names_text(known), suggestion=meant)
-        )
+        meant = nearest(what.pivot, known)
+        text = "this node has no such pivot"
+        issues.append(owner.issue(text, (*key, "pivot"), found=what.pivot, allowed=names_text(known), suggestion=meant))
     return issues
 
 
-def _no_such_node(job: JobSpec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
+def _no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
     meant = nearest(path, nodes)
-    return job.issue("no such node", key, found=path, allowed=names_text(sorted(nodes)), suggestion=meant)
+    return owner.issue("no such node", key, found=path, allowed=names_text(sorted(nodes)), suggestion=meant)
 
 
-def _not_allowed(job: JobSpec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
+def _not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
     allowed = names_text(sorted(info.allows)) or "nothing"
-    return job.issue(f"this node does not allow {action}", key, allowed=allowed)
+    return owner.issue(f"this node does not allow {action}", key, allowed=allowed)

@@ -54,6 +54,9 @@ def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
     return FrozenMap(value)
 
 
+Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
+"""Name of a file in the library (`gf7`), or path of a file of one's own, relative to the file that names it."""
+
 Named = Annotated[dict[Name, Value], AfterValidator(_freeze)]
 """A mapping from names to values of one sort."""
 Paths = Annotated[dict[str, Value], BeforeValidator(_nothing_is_empty), AfterValidator(_freeze)]

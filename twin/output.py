@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import tifffile
 import xarray as xr
 
 from twin.course import CourseRun
+from twin.image_file import preview_png, tiff
 from twin.report import write_report
 from twin.results import RenderRun
 from twin.run_folder import MANIFEST, RunFolder
 from twin.scene_file import write_scene
 from twin.summary_figure import write_summary
 from twin.versions import versions
-
-PREVIEW_SCALE = 4
-STRETCH = 30.0
-"""Steepness of the asinh stretch of previews: it shows the faint diffraction rings beside the core."""
 
 
 def write_run(
@@ -47,8 +39,8 @@ def write_run(
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             stem = f"images/{channel.camera}_{channel.side}_{when}"
-            folder.write_bytes(f"{stem}.tiff", _tiff(frames))
-            folder.write_with(f"{stem}.png", partial(_write_preview, frames))
+            folder.write_bytes(f"{stem}.tiff", tiff(frames))
+            folder.write_bytes(f"{stem}.png", preview_png(frames))
     folder.write_bytes("irradiance.nc", _netcdf(_irradiance(run)))
     if run.stray is not None:
         folder.write_json("stray.json", run.stray.to_dict())
@@ -76,32 +68,9 @@ def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
     """Numbers, expected images, and of each channel the first frame of every time as one page."""
     folder.write_json("course.json", course.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
-        folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", _tiff(course.frames[:, i]))
+        folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", tiff(course.frames[:, i]))
     time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
     folder.write_bytes("course.nc", _netcdf(_images(run, "time", time, course.photons)))
-
-
-def preview(frames: np.ndarray) -> np.ndarray:
-    """Eight-bit picture of the mean of frames (N, H, W) with an asinh stretch, enlarged."""
-    mean = frames.mean(axis=0)
-    low, high = np.percentile(mean, 5), mean.max()
-    level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)
-    shade = np.uint8(np.rint(255.0 * np.arcsinh(STRETCH * level) / np.arcsinh(STRETCH)))
-    return np.kron(shade, np.ones((PREVIEW_SCALE, PREVIEW_SCALE), np.uint8))
-
-
-def _tiff(frames: np.ndarray) -> bytes:
-    """Frames (N, H, W) as a TIFF file of N pages."""
-    stream = io.BytesIO()
-    tifffile.imwrite(stream, frames, photometric="minisblack")
-    return stream.getvalue()
-
-
-def _write_preview(frames: np.ndarray, place: Path) -> None:
-    ok, encoded = cv2.imencode(".png", preview(frames))
-    if not ok:
-        raise OSError(f"cannot encode {place.name}")
-    place.write_bytes(encoded.tobytes())
 
 
 def _netcdf(data: xr.Dataset) -> bytes:

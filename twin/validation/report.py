@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import re
-from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
-
-from twin.artefact import Artefact, Data, PngFigure, SvgFigure, Table
 from twin.report.numbers import decimals_for, fixed, plain, significant
+from twin.report.page import artefact_content, environment
 from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
 from twin.validation.runner import GroupRun, Validation
 from twin.versions import versions
@@ -27,8 +23,7 @@ MARKS: dict[Verdict, tuple[str, str]] = {
 
 def render_report(validation: Validation) -> str:
     """The page as text."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
+    template = environment(__package__).get_template(TEMPLATE)
     results = validation.results
     papers = [
         {"number": number, "title": title, "rows": [_row(r) for r in results if r.paper == number]}
@@ -103,37 +98,6 @@ def _group(run: GroupRun) -> dict[str, Any]:
     return {
         "prefix": run.group.prefix,
         "title": run.group.title,
-        "artefacts": [_artefact(run, a) for a in run.artefacts],
+        "artefacts": [artefact_content(a, run.place(a)) for a in run.artefacts],
         "files": list(run.files),
     }
-
-
-def _artefact(run: GroupRun, artefact: Artefact) -> dict[str, Any]:
-    out: dict[str, Any] = {
-        "title": artefact.title,
-        "caption": artefact.caption,
-        "file": run.place(artefact),
-        "svg": None,
-        "image": None,
-        "table": None,
-    }
-    if isinstance(artefact, SvgFigure):
-        # drawn by this program, not by a user
-        out["svg"] = Markup(artefact.svg)
-    elif isinstance(artefact, PngFigure):
-        out["image"] = artefact.address
-    elif isinstance(artefact, Table):
-        rows = [[_cell(value) for value in row] for row in artefact.rows]
-        texts = [all(isinstance(row[k], str) for row in artefact.rows) for k in range(len(artefact.heads))]
-        out["table"] = {"heads": artefact.heads, "rows": rows, "texts": texts}
-    elif not isinstance(artefact, Data):
-        raise TypeError(f"the report cannot show {type(artefact).__name__}")
-    return out
-
-
-def _cell(value: str | float | int | None) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        return value
-    return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)

@@ -1,0 +1,253 @@
+"""From the defocus measured at many places to the motion that brings a focal-plane assembly into focus (paper 004,
+section 2).
+
+The frame is the assembly's own, O'-X'Y'Z': X' flight direction, Y' along the line CCD, Z' along the normal, with the
+light; O' is the line's centre. The defocus of a place is how far the best focus lies from the CCD along +Z', so the
+assembly has to move onto the plane
+
+    defocus = piston + slope_x X' + slope_y Y'.
+
+A small rotation (wx, wy, wz) lifts a point by wx Y' - wy X'; the correction is therefore wx = +slope_y,
+wy = -slope_x, the shift (0, 0, piston), and wz = -(measured level of the line). `FocalPlaneFit.correction` is the
+finite rotation for which this holds exactly. Metres and radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from analysis.rigid_motion import RigidMotion
+
+__all__ = ["FocalPlaneFit", "LineLevel", "ObservabilityError", "fit_focal_plane", "line_level"]
+
+Array = NDArray[np.float64]
+_NAMES = ("piston", "slope_x", "slope_y")
+# Two directions are told apart when the places spread across them by more than this part of their largest spread.
+_LEAST_SPREAD = 1e-6
+
+
+class ObservabilityError(ValueError):
+    """The places measured cannot tell one of the rotations."""
+
+
+@dataclass(frozen=True, eq=False)
+class LineLevel:
+    """Level of the line CCD: its rotation about +Z' out of the Y' axis.
+
+    angle, sigma: radians. straightness: (N,) what is left across the line, metres. chi_square, degrees_of_freedom: of
+    the straight line.
+    """
+
+    angle: float
+    sigma: float
+    straightness: Array
+    chi_square: float
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True, eq=False)
+class FocalPlaneFit:
+    """A weighted plane through the defocus of N places.
+
+    piston: metres. slope_x, slope_y: rises of the best focus along +X' and +Y'. covariance: (3, 3) in this order;
+        zero in the rows of what was held.
+    held: names of slopes that were taken as zero and not estimated.
+    place: (N, 2) metres. residual: (N,) defocus - plane. sigma: (N,) as given, metres.
+    chi_square, degrees_of_freedom: with the sigmas as given. p_value: chance of such a chi-square or a larger one, if
+        the best foci lie on a plane and the sigmas are right; 1 without redundancy.
+    extra_sigma: scatter of the places about the plane beyond their sigmas (chips that are not coplanar, curvature of
+        field), metres, for which the weighted chi-square equals the degrees of freedom; 0 when it was not asked for
+        or is not there. The weights and all covariances include it.
+    """
+
+    piston: float
+    slope_x: float
+    slope_y: float
+    covariance: Array
+    held: tuple[str, ...]
+    place: Array
+    residual: Array
+    sigma: Array
+    chi_square: float
+    degrees_of_freedom: int
+    p_value: float
+    extra_sigma: float
+
+    def plane(self, place: ArrayLike) -> tuple[Array, Array]:
+        """Height (...) of the fitted plane at places (..., 2), and its sigma (...); metres."""
+        design = _design(np.asarray(place, np.float64))
+        height = design @ np.array([self.piston, self.slope_x, self.slope_y])
+        return np.asarray(height), np.sqrt(np.einsum("...i,ij,...j->...", design, self.covariance, design))
+
+    def predicted_defocus(self) -> tuple[Array, Array]:
+        """What defocus the places will really have after an exact correction: (N,) metres, and (N, N) covariance.
+
+        True heights are the plane plus independent deviations of extra_sigma. The prediction is the best linear one:
+        each residual shrunk by extra_sigma^2 / (extra_sigma^2 + sigma^2), so zero for a true plane, and the covariance
+        has what the plane was misjudged by. A measurement afterwards adds its own sigma.
+        """
+        free = [k for k, name in enumerate(_NAMES) if name not in self.held]
+        design = _design(self.place)[:, free]
+        weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
+        hat = design @ self.covariance[np.ix_(free, free)] @ (design.T * weight)
+        own = np.eye(len(weight))
+        shrink = (self.extra_sigma**2 * weight)[:, None] * (own - hat)
+        # error = e - hat (e + n) - shrink (e + n) for deviations e and noise n
+        gain = -(hat + shrink)
+        spread = self.extra_sigma**2 * (own + gain) @ (own + gain).T + (gain * self.sigma**2) @ gain.T
+        return self.extra_sigma**2 * weight * self.residual, spread
+
+    def correction(self, level: LineLevel | None = None) -> RigidMotion:
+        """The motion of the assembly about O' that puts every place on the fitted plane and levels the line.
+
+        level: the measured level of the line; without it the line's projection on X'Y' keeps its direction to second
+            order of the tilt.
+        The finite rotation first turns the line by -level about Z' and then tilts the plane about the horizontal axis.
+        """
+        steepness = float(np.hypot(self.slope_x, self.slope_y))
+        ratio = np.arctan(steepness) / steepness if steepness > 0 else 1.0
+        tilt = Rotation.from_rotvec(ratio * np.array([self.slope_y, -self.slope_x, 0.0]))
+        angle, variance = (0.0, 0.0) if level is None else (level.angle, level.sigma**2)
+        turn = tilt * Rotation.from_rotvec([0.0, 0.0, -angle])
+        # (wx, wy, wz, x, y, z) from (piston, slope_x, slope_y, level), first order
+        map_ = np.zeros((6, 4))
+        map_[0, 2], map_[1, 1], map_[2, 3], map_[5, 0] = 1.0, -1.0, -1.0, 1.0
+        source = np.zeros((4, 4))
+        source[:3, :3], source[3, 3] = self.covariance, variance
+        return RigidMotion.of(turn.as_rotvec(), [0.0, 0.0, self.piston], map_ @ source @ map_.T)
+
+
+def fit_focal_plane(
+    place: ArrayLike,
+    defocus: ArrayLike,
+    sigma: ArrayLike,
+    *,
+    hold: tuple[str, ...] = (),
+    estimate_extra: bool = False,
+) -> FocalPlaneFit:
+    """Weighted least-squares plane through the defocus of N places.
+
+    place: (N, 2) X', Y', metres. defocus: (N,) metres, best focus minus CCD along +Z'. sigma: (N,) or a number, metres.
+    hold: slopes taken as zero, "slope_x" or "slope_y", where the places cannot tell them.
+    estimate_extra: when the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and
+        Mandel, J. Res. NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
+    Raises ObservabilityError when the places lie so that a slope cannot be told; ValueError for bad input.
+    """
+    spots, height = np.asarray(place, np.float64), np.asarray(defocus, np.float64)
+    if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:
+        raise ValueError(f"focal plane: place must be (N, 2) and defocus (N,), found {spots.shape} and {height.shape}")
+    spread = np.asarray(np.broadcast_to(np.asarray(sigma, np.float64), height.shape))
+    if not (np.all(np.isfinite(spots)) and np.all(np.isfinite(height)) and np.all(np.isfinite(spread))):
+        raise ValueError("focal plane: place, defocus and sigma must be finite; leave out places without a focus")
+    if not np.all(spread > 0):
+        raise ValueError("focal plane: every sigma must be positive")
+    if not set(hold) <= set(_NAMES[1:]):
+        raise ValueError(f"focal plane: only slope_x and slope_y can be held, found {', '.join(hold)}")
+    free = [k for k, name in enumerate(_NAMES) if name not in hold]
+    _check_places(spots, free)
+    design = _design(spots)[:, free]
+    freedom = len(height) - len(free)
+
+    def solve(extra: float) -> tuple[Array, Array, float]:
+        """Parameters, covariance and weighted chi-square with an extra scatter."""
+        root = 1.0 / np.sqrt(spread**2 + extra**2)
+        length = np.linalg.norm(design * root[:, None], axis=0)
+        inverse = np.linalg.pinv(design * root[:, None] / length) / length[:, None]
+        found = inverse @ (height * root)
+        return found, inverse @ inverse.T, float(np.sum(((height - design @ found) * root) ** 2))
+
+    found, covariance, chi_square = solve(0.0)
+    extra = 0.0
+    if estimate_extra and freedom > 0 and chi_square > freedom:
+        # chi-square falls with the extra scatter; with this much of it, it is below the degrees of freedom for sure
+        most = float(np.sqrt(np.sum((height - design @ found) ** 2) / freedom))
+        extra = float(brentq(lambda s: solve(s)[2] - freedom, 0.0, most, xtol=1e-6 * most))
+        found, covariance, _ = solve(extra)
+    values, full = np.zeros(3), np.zeros((3, 3))
+    values[free] = found
+    full[np.ix_(free, free)] = covariance
+    return FocalPlaneFit(
+        piston=float(values[0]),
+        slope_x=float(values[1]),
+        slope_y=float(values[2]),
+        covariance=full,
+        held=tuple(name for name in _NAMES if name in hold),
+        place=spots,
+        residual=height - design @ found,
+        sigma=spread,
+        chi_square=chi_square,
+        degrees_of_freedom=freedom,
+        p_value=float(chi2.sf(chi_square, freedom)) if freedom > 0 else 1.0,
+        extra_sigma=extra,
+    )
+
+
+def line_level(along: ArrayLike, across: ArrayLike, sigma: ArrayLike) -> LineLevel:
+    """Level of the line CCD from positions measured along it, for example pixels sighted with a theodolite.
+
+    along: (N,) Y', across: (N,) X' of N >= 2 points of the line, metres in the frame that the line has to be level in.
+    sigma: of `across`, (N,) or a number, metres; `along` is taken as exact.
+    A line turned by g about +Z' has X' = -tan(g) Y' + constant. Raises ValueError for bad input.
+    """
+    y, x = np.asarray(along, np.float64), np.asarray(across, np.float64)
+    if y.ndim != 1 or x.shape != y.shape or y.size < 2:
+        raise ValueError(f"line level: need two or more points along and across, found {y.shape} and {x.shape}")
+    spread = np.asarray(np.broadcast_to(np.asarray(sigma, np.float64), y.shape))
+    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and np.all(np.isfinite(spread)) and np.all(spread > 0)):
+        raise ValueError("line level: positions must be finite and sigmas finite and positive")
+    if np.ptp(y) <= 1e-12 * np.max(np.abs(y)):
+        raise ValueError("line level: all points are at one place along the line; measure near both of its ends")
+    weight = spread**-2
+    arm = y - np.sum(weight * y) / np.sum(weight)
+    moment = float(np.sum(weight * arm**2))
+    slope = float(np.sum(weight * arm * x)) / moment
+    rest = x - np.sum(weight * x) / np.sum(weight) - slope * arm
+    # d atan(slope) = d slope / (1 + slope^2)
+    sigma_angle = moment**-0.5 / (1.0 + slope**2)
+    return LineLevel(-float(np.arctan(slope)), sigma_angle, rest, float(np.sum(weight * rest**2)), y.size - 2)
+
+
+def _design(place: Array) -> Array:
+    """Columns 1, X', Y', (..., 3)."""
+    return np.stack([np.ones(place.shape[:-1]), place[..., 0], place[..., 1]], axis=-1)
+
+
+def _check_places(place: Array, free: list[int]) -> None:
+    """ObservabilityError when the places cannot tell the free slopes, with the reason in terms of where they lie."""
+    if len(place) < len(free):
+        raise ObservabilityError(
+            f"focal plane: {len(place)} places cannot tell {', '.join(_NAMES[k] for k in free)}; measure at least"
+            f" {len(free)}"
+        )
+    arm = (place - place.mean(axis=0))[:, [k - 1 for k in free if k > 0]]
+    if not arm.size:
+        return
+    _, values, axes = np.linalg.svd(arm, full_matrices=False)
+    scale = max(float(values[0]), 1e-6 * float(np.max(np.abs(place))))
+    if values[-1] > _LEAST_SPREAD * scale:
+        return
+    names = [_NAMES[k] for k in free if k > 0]
+    if len(names) == 1:
+        raise ObservabilityError(
+            f"focal plane: all places have the same {names[0][-1].upper()}', so {names[0]} cannot be told; measure at"
+            f" others or hold {names[0]} at zero"
+        )
+    if values[0] <= _LEAST_SPREAD * scale:
+        raise ObservabilityError("focal plane: all places are one; neither slope can be told")
+    direction = axes[0]
+    if abs(direction[0]) < 1e-3:
+        where, slope = "X' = constant (the line CCD alone)", "slope_x"
+    elif abs(direction[1]) < 1e-3:
+        where, slope = "Y' = constant", "slope_y"
+    else:
+        where, slope = f"one straight line along ({direction[0]:+.3g}, {direction[1]:+.3g})", "the slope across it"
+    remedy = f"hold {slope} at zero" if slope in _NAMES else "place some of them off that line"
+    raise ObservabilityError(
+        f"focal plane: all places lie on {where}, so {slope} cannot be told; measure another band as well or {remedy}"
+    )

@@ -1,0 +1,250 @@
+"""Interior orientation of a line camera from (angle, spot position) pairs, with all that is known of their noise.
+
+`fit_interior_orientation` fits the model of `analysis.distortion_model` (paper 004, eqs. 1-4, with a constant and
+radial terms). Errors of a turntable are common to many points (eccentricity, graduation, the zero), so the noise is a
+full covariance. The paper weights all points alike; its estimates stay unbiased under such noise, but sigmas from the
+scatter of the residuals are wrong, for a common error hides in the parameters. Here every sigma comes from the given
+covariance (sandwich). Generalised least squares is the alternative with the smallest sigmas.
+
+What counts as distortion depends on the f, p and c that it is counted from: `InteriorOrientation.printed` gives eq.
+(1), `residual` what is left after the whole model, `curve` the smooth distortion from a calibration of choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from analysis.distortion_algebra import condition_number, gain, noise_matrix, noise_root
+from analysis.distortion_model import OrientationError, design, readings, slope
+from analysis.principal_point import PointReport, point_report
+
+__all__ = ["InteriorOrientation", "PrintedDistortion", "fit_interior_orientation"]
+
+Array = NDArray[np.float64]
+_CALIBRATION = ("constant", "principal_distance", "principal_point")
+# A principal distance with a larger relative sigma is no result; the angles are then nearly constant.
+_WORST_DISTANCE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedDistortion:
+    """Distortion by eq. (1), with f and p of eq. (2), or f of eq. (3) and p = 0.
+
+    distortion: (N,) m; covariance: (N, N) m^2, of rank N - 2 or N - 1. principal_distance, principal_point: m.
+    parameter_covariance: (2, 2) m^2 of f and p, zero for a p that was not fitted.
+    """
+
+    distortion: Array
+    covariance: Array
+    principal_distance: float
+    principal_point: float
+    parameter_covariance: Array
+
+    @property
+    def rms(self) -> float:
+        """Rms over the points, m."""
+        return float(np.sqrt(np.mean(self.distortion**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class InteriorOrientation:
+    """Result of a fit over N points with P terms.
+
+    terms: names as in `analysis.distortion_model.TERMS`. values: (P,) m. covariance: (P, P) m^2.
+    weighted: generalised least squares; else all points alike, with the sandwich covariance.
+    angle, position: (N,) rad, m, as measured. noise: (N, N) m^2, of positions and angles together.
+    residual: (N,) m, position - model. residual_covariance: (N, N) m^2, of rank N - P.
+    chi_square: least sum of squares in the metric of the noise, whichever estimator was chosen; it has
+    degrees_of_freedom = N - P when model and noise are right. condition: of the columns scaled to length one.
+    point: about the principal point.
+    """
+
+    terms: tuple[str, ...]
+    values: Array
+    covariance: Array
+    weighted: bool
+    angle: Array
+    position: Array
+    noise: Array
+    residual: Array
+    residual_covariance: Array
+    chi_square: float
+    degrees_of_freedom: int
+    condition: float
+    point: PointReport
+
+    def value(self, term: str) -> float:
+        """Metres; zero for a term that was not fitted."""
+        return float(self.values[self.terms.index(term)]) if term in self.terms else 0.0
+
+    def sigma(self, term: str) -> float:
+        """Metres; zero for a term that was not fitted."""
+        k = self.terms.index(term) if term in self.terms else None
+        return 0.0 if k is None else float(np.sqrt(self.covariance[k, k]))
+
+    @property
+    def correlation(self) -> Array:
+        """(P, P), in the order of the terms."""
+        sigma = np.sqrt(np.diagonal(self.covariance))
+        return np.asarray(self.covariance / np.outer(sigma, sigma))
+
+    @property
+    def probability(self) -> float:
+        """Chance of a chi-square at least this large if model and noise are right; nan without degrees of freedom."""
+        return float(stats.chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom else np.nan
+
+    def printed(self, fit_principal_point: bool) -> PrintedDistortion:
+        """Eq. (1) with eq. (2), or with eq. (3) and p = 0, on the same readings and noise."""
+        terms = ("principal_distance", "principal_point")[: 2 if fit_principal_point else 1]
+        columns = design(self.angle, terms)
+        solve = gain(columns)
+        found = solve @ self.position
+        left = np.eye(len(self.position)) - columns @ solve
+        spread = np.zeros((2, 2))
+        spread[: len(terms), : len(terms)] = solve @ self.noise @ solve.T
+        return PrintedDistortion(
+            distortion=np.asarray(self.position - columns @ found),
+            covariance=np.asarray(left @ self.noise @ left.T),
+            principal_distance=float(found[0]),
+            principal_point=float(found[1]) if fit_principal_point else 0.0,
+            parameter_covariance=spread,
+        )
+
+    def curve(self, angle: ArrayLike, reference: Sequence[str] | None = None) -> tuple[Array, Array]:
+        """Smooth distortion and its sigma, each (...), m, at angles (...), rad: the model minus a calibration.
+
+        reference: None takes out the fitted constant, f and p and leaves radial terms and decentring. Names of these
+            three take out their best fit to the curve at the points of the test instead: ("principal_distance",) gives
+            distortion as by eq. (3), with ("principal_distance", "principal_point") as by eq. (2).
+        Errors are those of the fit; what the model does not hold shows in `residual`.
+        """
+        where = np.asarray(angle, dtype=np.float64)
+        rows = design(where, self.terms)
+        if reference is None:
+            rows = rows * np.array([term not in _CALIBRATION for term in self.terms])
+        else:
+            wrong = [term for term in reference if term not in _CALIBRATION]
+            if wrong or not reference:
+                raise OrientationError(f"distortion curve: reference must be names out of {_CALIBRATION}, or None")
+            taken = gain(design(self.angle, reference)) @ design(self.angle, self.terms)
+            rows = rows - design(where, reference) @ taken
+        variance = np.einsum("...i,ij,...j->...", rows, self.covariance, rows)
+        return np.asarray(rows @ self.values), np.sqrt(np.maximum(variance, 0.0))
+
+    def look_angle(self, position: ArrayLike) -> Array:
+        """Angle W (...), rad, that images to positions (...), m: the model inverted by Newton steps."""
+        target = np.asarray(position, dtype=np.float64)
+        angle = np.arctan((target - self.value("constant")) / self.value("principal_distance"))
+        for _ in range(20):
+            step = (target - design(angle, self.terms) @ self.values) / slope(angle, self.terms, self.values)
+            angle = angle + step
+            if np.all(np.abs(step) < 1e-15):
+                break
+        if not np.all(np.abs(angle) <= 2 * np.max(np.abs(self.angle))):
+            raise OrientationError(
+                "interior orientation: positions lie far beyond the field of the test, where the distortion is unknown"
+            )
+        return angle
+
+    def compensated(self, position: ArrayLike, reference: Sequence[str] | None = None) -> tuple[Array, Array]:
+        """Image coordinates (...), m, freed from the distortion `curve`, and the sigma of the correction, (...), m."""
+        removed, sigma = self.curve(self.look_angle(position), reference)
+        return np.asarray(np.asarray(position, dtype=np.float64) - removed), sigma
+
+    @property
+    def statements(self) -> tuple[str, ...]:
+        """Plain sentences for a report: fit, noise, principal point."""
+        n, dof = len(self.position), self.degrees_of_freedom
+        rms = 1e6 * float(np.sqrt(np.mean(self.residual**2)))
+        f, sigma = self.value("principal_distance"), self.sigma("principal_distance")
+        lines = [f"f = {1e3 * f:.4f} +- {1e3 * sigma:.2g} mm from {n} points; residual {rms:.3g} um rms."]
+        if dof:
+            text = f"Chi-square {self.chi_square:.4g} for {dof} degrees of freedom"
+            if self.probability < 1e-3:
+                text += ": the model lacks a term, or the noise is larger than stated"
+            elif self.probability > 1 - 1e-3:
+                text += ": the noise is smaller than stated"
+            lines.append(text + ".")
+        return (*lines, self.point.statement)
+
+
+def fit_interior_orientation(
+    position: ArrayLike,
+    angle: ArrayLike,
+    covariance: ArrayLike,
+    terms: Sequence[str] = ("constant", "principal_distance", "principal_point", "radial3"),
+    *,
+    angle_covariance: ArrayLike | None = None,
+    weighted: bool = False,
+    point_tolerance: float = 10e-6,
+) -> InteriorOrientation:
+    """Least squares for the terms of the model, linear in all of them.
+
+    position, angle: (N,) m, rad. terms: names out of `TERMS`, with principal_distance among them.
+    covariance: noise of the positions: (N, N) m^2, or sigmas (N,) or one sigma, m.
+    angle_covariance: the same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself
+        (attenuation) is of the order (sigma_W / W)^2, below 1e-8, and left out.
+    weighted: generalised least squares instead of equal weights.
+    point_tolerance: m, sigma up to which p counts as observable; about a pixel, the size that paper 004 expects of p.
+    Raises OrientationError for bad readings or noise, fewer angles than terms, nearly constant angles, angles that
+    count against the positions; InseparableTermsError for terms that these angles cannot tell apart.
+    """
+    where, turned = readings(position, angle)
+    names = tuple(terms)
+    if where.ndim != 1:
+        raise OrientationError(f"interior orientation: readings must be (N,), found {where.shape}; fit set by set")
+    if "principal_distance" not in names:
+        raise OrientationError("interior orientation: principal_distance must be among the terms")
+    columns = design(turned, names)
+    distinct = len(np.unique(turned))
+    if distinct == 1:
+        raise OrientationError("interior orientation: all angles are the same; turn the turntable between the readings")
+    if distinct < len(names):
+        raise OrientationError(
+            f"interior orientation: {distinct} different angles for {len(names)} unknowns ({', '.join(names)}); measure"
+            " at more angles or fit fewer terms"
+        )
+    condition = condition_number(columns, names, turned)
+    first = gain(columns) @ where
+    noise = noise_matrix(covariance, len(where), "covariance")
+    if angle_covariance is not None:
+        rate = slope(turned, names, first)
+        noise = noise + rate[:, None] * noise_matrix(angle_covariance, len(where), "angle_covariance") * rate
+    root = noise_root(noise)
+    best = gain(columns, root)
+    solve = best if weighted else gain(columns)
+    values = solve @ where
+    spread = solve @ noise @ solve.T
+    k = names.index("principal_distance")
+    f, sigma = float(values[k]), float(np.sqrt(spread[k, k]))
+    if sigma > _WORST_DISTANCE * abs(f):
+        raise OrientationError(
+            f"interior orientation: f = {f:.3g} +- {sigma:.2g} m; the angles span only {np.ptp(turned):.3g} rad, too"
+            " little for their noise; turn the turntable over the whole field"
+        )
+    if f < 0:
+        raise OrientationError(
+            f"interior orientation: the principal distance comes out as {f:.6g} m; angles and spot positions count in"
+            " opposite senses, change the sign of one of them"
+        )
+    left = np.eye(len(where)) - columns @ solve
+    return InteriorOrientation(
+        terms=names,
+        values=values,
+        covariance=spread,
+        weighted=weighted,
+        angle=turned,
+        position=where,
+        noise=noise,
+        residual=where - columns @ values,
+        residual_covariance=left @ noise @ left.T,
+        chi_square=float(np.sum(np.linalg.solve(root, where - columns @ (best @ where)) ** 2)),
+        degrees_of_freedom=len(where) - len(names),
+        condition=condition,
+        point=point_report(names, values, turned, noise, weighted, point_tolerance),
+    )

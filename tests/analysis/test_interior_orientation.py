@@ -1,0 +1,501 @@
+"""Interior orientation and distortion: the printed equations against plain least squares, the general fit against its
+own statistics under noise that is common to many points, and what a narrow field can say of the principal point.
+"""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.distortion_model import (
+    InseparableTermsError,
+    OrientationError,
+    distortion,
+    principal_distance,
+    principal_distance_and_point,
+    principal_point,
+)
+from analysis.distortion_sets import combine_sets
+from analysis.interior_orientation import fit_interior_orientation
+from analysis.model_fit import RankError
+
+FALSE_ALARM = 1e-6
+ARCSEC = np.pi / 180 / 3600
+EPS = np.finfo(float).eps
+F = 5.51
+EDGE = np.deg2rad(1.25)
+# 55 points of the test of paper 004, even in tan W as targets along a line CCD are
+GF7 = np.arctan(np.linspace(-1, 1, 55) * np.tan(EDGE))
+UM = 1e-6
+TERMS = ("constant", "principal_distance", "principal_point", "radial3")
+
+
+def line_image(angle, f=F, constant=0.0, point=0.0, radial3=0.0, radial5=0.0):
+    """Spot positions of the model, typed once more."""
+    t = np.tan(angle)
+    return constant + f * t - point * t**2 + radial3 * t**3 + radial5 * t**5
+
+
+def in_range(chi_square, freedom):
+    """Two-sided chi-square test with the false-alarm rate of this file."""
+    return FALSE_ALARM / 2 < stats.chi2.sf(chi_square, freedom) < 1 - FALSE_ALARM / 2
+
+
+# ---- the printed equations
+
+
+def test_printed_equations_are_least_squares():
+    """Eqs. (2), (3), (4) on 7 sets of uneven angles against numpy's solution of the same problem.
+
+    Rounding: p is L's rounding over tan^2 W, 2e-16 x 5.5 m / 0.044^2 = 6e-13 m, times some sums.
+    """
+    rng = np.random.default_rng(1)
+    angle = np.deg2rad(rng.uniform(-1.5, 2.5, (7, 55)))
+    position = line_image(angle, point=3e-3) + rng.standard_normal((7, 55)) * 5e-6
+    f, p = principal_distance_and_point(position, angle)
+    alone = principal_distance(position, angle)
+    known = principal_point(position, angle, np.full(7, 5.5))
+    assert f.shape == p.shape == alone.shape == known.shape == (7,)
+    for k in range(7):
+        t = np.tan(angle[k])
+        both = np.linalg.lstsq(np.column_stack([t, -(t**2)]), position[k], rcond=None)[0]
+        assert f[k] == pytest.approx(both[0], abs=1e-12)
+        assert p[k] == pytest.approx(both[1], abs=2e-11)
+        assert alone[k] == pytest.approx(np.linalg.lstsq(t[:, None], position[k], rcond=None)[0][0], abs=1e-13)
+        third = np.linalg.lstsq(-(t[:, None] ** 2), position[k] - 5.5 * t, rcond=None)[0][0]
+        assert known[k] == pytest.approx(third, abs=2e-11)
+        # (1): the residual of that fit
+        left = position[k] - np.column_stack([t, -(t**2)]) @ both
+        assert distortion(position, angle, f, p)[k] == pytest.approx(left, abs=1e-14)
+
+
+def test_printed_equations_agree_with_each_other():
+    exact = line_image(GF7)
+    assert principal_distance(exact, GF7) == pytest.approx(F, rel=20 * EPS)
+    f, p = principal_distance_and_point(exact, GF7)
+    assert f == pytest.approx(F, rel=100 * EPS)
+    assert p == pytest.approx(0, abs=1e-11)
+    noisy = line_image(GF7, point=2e-3) + np.random.default_rng(2).standard_normal(55) * 1e-5
+    f, p = principal_distance_and_point(noisy, GF7)
+    # (4) with f from (2) is the second normal equation of (2)
+    assert principal_point(noisy, GF7, f) == pytest.approx(float(p), abs=1e-11)
+    # over a field that is symmetric, tan and tan^2 are orthogonal and (3) finds the f of (2)
+    assert principal_distance(noisy, GF7) == pytest.approx(float(f), rel=1e-14)
+
+
+def test_principal_point_is_where_the_axis_meets_the_image():
+    """Exact perspective: the principal point lies p from O, W counts from the direction that images to O.
+
+    Rounding of the tan^2 series: f differs by p^2 / f = 0.18 um at p = 1 mm, p by p^3 / f^2 and p^2 / f tan W.
+    """
+    p = 1e-3
+    tilt = np.arctan(p / F)
+    position = F * np.tan(GF7 - tilt) + p
+    found_f, found_p = principal_distance_and_point(position, GF7)
+    assert found_f == pytest.approx(F, abs=1.1 * p**2 / F)
+    assert found_p == pytest.approx(p, abs=p**2 / F)
+
+
+# ---- the general fit
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("span", [(-1.25, 1.25), (-0.4, 2.5), (-20.0, 20.0)])
+def test_exact_data_come_back_to_rounding(weighted, span):
+    """Rounding of a linear fit: eps x condition x |L| / |column|, with a factor for sums and weights."""
+    angle = np.deg2rad(np.linspace(*span, 55))
+    truth = {"constant": 3e-6, "principal_distance": F, "principal_point": 2e-3, "radial3": -0.5, "radial5": 40.0}
+    position = line_image(angle, constant=3e-6, point=2e-3, radial3=-0.5, radial5=40.0)
+    sigma = np.linspace(1, 2, 55) * UM
+    found = fit_interior_orientation(position, angle, sigma, tuple(truth), weighted=weighted)
+    t = np.tan(angle)
+    for term, power in zip(truth, (0, 1, 2, 3, 5), strict=True):
+        rounding = 100 * EPS * found.condition * np.linalg.norm(position) / np.linalg.norm(t**power)
+        assert rounding < found.sigma(term) * 1e-3  # so that the tolerance means something
+        assert found.value(term) == pytest.approx(truth[term], abs=rounding)
+    assert np.abs(found.residual).max() < 100 * EPS * np.abs(position).max()
+    assert found.degrees_of_freedom == 50
+    assert found.chi_square < 1e-6
+
+
+def test_weighted_fit_is_the_textbook_one():
+    """Full covariance, generalised least squares typed from the normal equations; and never a larger sigma."""
+    _, noise = common_noise()
+    rng = np.random.default_rng(5)
+    position = line_image(GF7) + rng.multivariate_normal(np.zeros(55), noise)
+    found = fit_interior_orientation(position, GF7, noise, TERMS, weighted=True)
+    plain = fit_interior_orientation(position, GF7, noise, TERMS)
+    t = np.tan(GF7)
+    columns = np.column_stack([np.ones(55), t, -(t**2), t**3])
+    scale = np.diag(1 / np.linalg.norm(columns, axis=0))
+    normal = scale @ columns.T @ np.linalg.solve(noise, columns) @ scale
+    covariance = scale @ np.linalg.inv(normal) @ scale
+    values = covariance @ columns.T @ np.linalg.solve(noise, position)
+    # normal equations lose the digits of the noise's condition number, 1e5, and of the columns', 5 squared
+    assert found.values == pytest.approx(values, rel=1e-9, abs=1e-9 * np.sqrt(np.diagonal(covariance)).min())
+    sigma = np.sqrt(np.diagonal(covariance))
+    assert np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max() < 1e-9
+    assert np.all(np.diagonal(found.covariance) <= np.diagonal(plain.covariance) * (1 + 1e-9))
+    assert found.chi_square == pytest.approx(plain.chi_square, rel=1e-9)
+    assert np.diagonal(found.correlation) == pytest.approx(np.ones(4), rel=1e-12)
+    assert np.abs(found.correlation).max() <= 1 + 1e-12
+
+
+def common_noise():
+    """Covariance of the angles: zero, scale and a subdivision error of 0.2", and 0.04" from reading to reading.
+
+    Returns angle covariance (rad^2) and that of positions for an ideal camera with spots known to 0.3 um (m^2).
+    """
+    turn = GF7 / EDGE
+    shapes = np.stack([np.ones(55), turn, np.sin(2 * np.pi * 3.3 * turn), np.cos(2 * np.pi * 3.3 * turn)])
+    sizes = np.array([0.1, 0.15, 0.2, 0.2]) * ARCSEC
+    angles = (shapes.T * sizes**2) @ shapes + np.eye(55) * (0.04 * ARCSEC) ** 2
+    rate = F / np.cos(GF7) ** 2
+    return angles, rate[:, None] * angles * rate + np.eye(55) * (0.3 * UM) ** 2
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """400 tests: the *angles* err, by common errors; truth as used, and fits (equal weights, weighted)."""
+    angles, _ = common_noise()
+    rng = np.random.default_rng(20)
+    read = GF7 + rng.multivariate_normal(np.zeros(55), angles, 400)
+    position = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8) + rng.standard_normal((400, 55)) * 0.3 * UM
+    truth = np.array([1e-6, F, 1e-3, -0.8])
+    fits = {
+        weighted: [
+            fit_interior_orientation(position[k], read[k], 0.3 * UM, TERMS, angle_covariance=angles, weighted=weighted)
+            for k in range(400)
+        ]
+        for weighted in (False, True)
+    }
+    return truth, fits
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_scatter_agrees_with_sigmas(simulated, weighted):
+    """Each parameter's chi-square over 400 tests, all parameters together, and the chi-square that the fit states.
+
+    Two-sided false-alarm rate 1e-6 each. The error of tan W itself (attenuation) shifts f by
+    f (0.2" / 0.7 deg)^2 = 0.03 um, 2e-4 of its sigma.
+    """
+    truth, fits = simulated
+    errors = np.array([one.values - truth for one in fits[weighted]])
+    sigmas = np.array([[one.sigma(term) for term in TERMS] for one in fits[weighted]])
+    for k, term in enumerate(TERMS):
+        assert in_range(np.sum((errors[:, k] / sigmas[:, k]) ** 2), 400), term
+        assert abs(np.sum(errors[:, k] / sigmas[:, k])) < stats.norm.isf(FALSE_ALARM / 2) * np.sqrt(400), term
+    joint = sum(e @ np.linalg.solve(one.covariance, e) for e, one in zip(errors, fits[weighted], strict=True))
+    assert in_range(joint, 400 * 4)
+    assert in_range(sum(one.chi_square for one in fits[weighted]), 400 * 51)
+
+
+def test_sigmas_from_the_residuals_alone_are_wrong(simulated):
+    """s^2 (X'X)^-1, as unweighted least squares is usually reported, fails the test that the sandwich passes."""
+    truth, fits = simulated
+    t = np.tan(GF7)
+    columns = np.column_stack([np.ones(55), t, -(t**2), t**3])
+    inverse = np.linalg.inv(columns.T @ columns)
+    ratio = {}
+    for k, term in enumerate(TERMS):
+        naive = [np.sqrt(np.sum(one.residual**2) / 51 * inverse[k, k]) for one in fits[False]]
+        chi_square = np.sum([((one.values[k] - truth[k]) / s) ** 2 for one, s in zip(fits[False], naive, strict=True)])
+        ratio[term] = np.sqrt(chi_square / 400)
+    # zero and scale errors go into the constant and f, and no residual shows them: sigmas are several times too small
+    assert stats.chi2.sf(400 * ratio["constant"] ** 2, 400) < FALSE_ALARM
+    assert stats.chi2.sf(400 * ratio["principal_distance"] ** 2, 400) < FALSE_ALARM
+    assert ratio["constant"] > 1.5
+    assert ratio["principal_distance"] > 1.5
+
+
+def test_residuals_and_printed_distortion_have_the_stated_covariance(simulated):
+    """Quadratic forms with the pseudo-inverse; ranks N - P, and N - 2 or N - 1 for eqs. (2) and (3).
+
+    Printed distortion is about its own mean: the camera has a radial term and the angles a constant error.
+    """
+    _, fits = simulated
+    residual = sum(
+        one.residual @ np.linalg.pinv(one.residual_covariance, rcond=1e-9) @ one.residual for one in fits[False][:100]
+    )
+    assert in_range(residual, 100 * 51)
+    clean = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8)
+    for with_point, rank in ((True, 53), (False, 54)):
+        if with_point:
+            expected = distortion(clean, GF7, *principal_distance_and_point(clean, GF7))
+        else:
+            expected = distortion(clean, GF7, principal_distance(clean, GF7))
+        total = 0.0
+        for one in fits[False][:100]:
+            printed = one.printed(with_point)
+            error = printed.distortion - expected
+            total += error @ np.linalg.pinv(printed.covariance, rcond=1e-9) @ error
+        assert in_range(total, 100 * rank)
+    f, p = principal_distance_and_point(one.position, one.angle)
+    printed = one.printed(True)
+    assert printed.principal_distance == pytest.approx(float(f), rel=1e-13)
+    assert printed.principal_point == pytest.approx(float(p), abs=2e-11)
+    assert printed.distortion == pytest.approx(distortion(one.position, one.angle, f, p), abs=1e-14)
+    assert one.printed(False).rms == pytest.approx(
+        np.sqrt(np.mean(distortion(one.position, one.angle, principal_distance(one.position, one.angle)) ** 2)),
+        rel=1e-9,
+    )
+
+
+@pytest.mark.parametrize("reference", [None, ("principal_distance",), ("constant", "principal_distance")])
+def test_curve_and_its_sigma(simulated, reference):
+    """The curve at angles between the points: chi-square over 400 tests at each of four angles."""
+    _, fits = simulated
+    between = np.deg2rad([-1.11, -0.4, 0.73, 1.2])
+    clean = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8)
+    t, at = np.tan(GF7), np.tan(between)
+    if reference is None:
+        expected = -0.8 * at**3
+    else:
+        powers = [0, 1] if "constant" in reference else [1]
+        taken = np.linalg.lstsq(np.stack([t**k for k in powers], 1), clean, rcond=None)[0]
+        expected = line_image(between, constant=1e-6, point=1e-3, radial3=-0.8)
+        expected = expected - np.stack([at**k for k in powers], 1) @ taken
+    scores = []
+    for one in fits[False]:
+        value, sigma = one.curve(between, reference)
+        scores.append((value - expected) / sigma)
+    for column in np.array(scores).T:
+        assert in_range(np.sum(column**2), 400)
+
+
+def test_compensation_gives_the_ideal_image():
+    position = line_image(GF7, constant=2e-6, radial3=30.0, radial5=-5e3)
+    found = fit_interior_orientation(
+        position, GF7, 1e-7, ("constant", "principal_distance", "radial3", "radial5"), weighted=True
+    )
+    fresh = np.deg2rad([-1.2, -0.31, 0.0, 0.9, 1.25])
+    seen = line_image(fresh, constant=2e-6, radial3=30.0, radial5=-5e3)
+    # 30 m x tan^3 is 250 um at the edge: a plain division by f would be far off
+    assert np.abs(seen - 2e-6 - F * np.tan(fresh)).max() > 1e-4
+    assert found.look_angle(seen) == pytest.approx(fresh, abs=1e-14)
+    ideal, sigma = found.compensated(seen)
+    assert ideal == pytest.approx(2e-6 + F * np.tan(fresh), abs=1e-13)
+    assert np.all(sigma < 1e-6)
+    with pytest.raises(OrientationError, match="beyond the field"):
+        found.look_angle(1.0)
+
+
+# ---- the principal point
+
+
+def test_principal_point_over_a_narrow_field():
+    """gf7: sigma of p against its closed form, 1 um / sqrt(sum (tan^2 - mean)^2) = 0.9 mm."""
+    rng = np.random.default_rng(7)
+    position = line_image(GF7) + rng.standard_normal(55) * UM
+    found = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "principal_point"))
+    t2 = np.tan(GF7) ** 2
+    expected = UM / np.sqrt(np.sum((t2 - t2.mean()) ** 2))
+    assert 0.8e-3 < expected < 1e-3
+    assert found.sigma("principal_point") == pytest.approx(expected, rel=1e-9)
+    point = found.point
+    assert point.fitted
+    assert not point.observable
+    assert not point.significant
+    assert point.edge_effect == pytest.approx(expected * t2.max(), rel=1e-9)
+    for part in ("not observable over +-1.25 deg", "take p = 0", "eq. 3", "0.44 um against 1 um", "decentring"):
+        assert part in point.statement
+    assert point.statement in found.statements
+    # not fitted: the same, said of the p that could have been
+    without = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance")).point
+    assert not without.fitted
+    assert without.value == 0
+    assert without.sigma == pytest.approx(expected, rel=1e-9)
+    assert "not observable" in without.statement
+
+
+def test_principal_point_over_a_wide_field():
+    angle = np.deg2rad(np.linspace(-20, 20, 55))
+    rng = np.random.default_rng(8)
+    position = line_image(angle, f=0.2, point=50e-6) + rng.standard_normal(55) * UM
+    found = fit_interior_orientation(position, angle, UM, ("constant", "principal_distance", "principal_point"))
+    assert found.point.observable
+    assert found.point.significant
+    assert found.sigma("principal_point") < 4e-6
+    assert abs(found.value("principal_point") - 50e-6) < stats.norm.isf(FALSE_ALARM / 2) * found.sigma(
+        "principal_point"
+    )
+    assert ": observable over +-20 deg" in found.point.statement
+    assert "take p = 0" not in found.point.statement
+
+
+def test_a_large_tan_squared_term_over_a_narrow_field_is_not_called_zero():
+    position = line_image(GF7, point=20e-3)
+    point = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "principal_point")).point
+    assert point.significant
+    assert not point.observable
+    assert "take p = 0" not in point.statement
+    assert "decentring" in point.statement
+
+
+def test_decentring_is_the_principal_point_with_the_other_sign():
+    position = line_image(GF7, point=20e-3)
+    one = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "principal_point"))
+    two = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "decentring"))
+    assert two.value("decentring") == pytest.approx(-one.value("principal_point"), rel=1e-10)
+    assert two.sigma("decentring") == pytest.approx(one.sigma("principal_point"), rel=1e-10)
+    # but it is distortion, and p is not
+    assert np.abs(one.curve(GF7)[0]).max() == 0
+    assert np.abs(two.curve(GF7)[0]).max() == pytest.approx(20e-3 * np.tan(EDGE) ** 2, rel=1e-9)
+    with pytest.raises(OrientationError, match="same tan\\^2 term"):
+        fit_interior_orientation(position, GF7, UM, ("principal_distance", "principal_point", "decentring"))
+
+
+def test_error_of_the_zero_of_the_angles():
+    """A finding about paper 004: without a constant, 0.2" in the zero of W puts 18 mm into p by eq. (2).
+
+    With W read too large by d, L = f tan(W - d) = -f d + f tan W - f d tan^2 W + O(d^2). Projecting the constant on
+    tan^2 over 55 even points gives p = f d (1 + 1.608 / tan^2 of the edge), from the sums of k^2 and k^4 (5/3 for many
+    points). What is left is f d sqrt(1 - (sum t^2)^2 / (N sum t^4)) rms: 0.66 f d = 3.5 um, more than the 2.3 um that
+    the test is to reach; with p = 0 it is all of f d = 5.3 um.
+    """
+    d = 0.2 * ARCSEC
+    position, read = line_image(GF7), GF7 + d
+    f, p = principal_distance_and_point(position, read)
+    half = 27
+    ratio = 5 / (3 * half**2 + 3 * half - 1) * half**2
+    assert p == pytest.approx(F * d * (1 + ratio / np.tan(EDGE) ** 2), rel=1e-3)
+    assert 17e-3 < p < 19e-3
+    left = distortion(position, read, f, p)
+    t2 = np.tan(GF7) ** 2
+    expected = F * d * np.sqrt(1 - np.sum(t2) ** 2 / (55 * np.sum(t2**2)))
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(expected, rel=1e-3)
+    assert expected > 2.3e-6
+    third = distortion(position, read, principal_distance(position, read))
+    assert np.sqrt(np.mean(third**2)) == pytest.approx(F * d, rel=1e-3)
+
+    general = fit_interior_orientation(position, read, UM)
+    assert general.value("constant") == pytest.approx(-F * d, rel=1e-5)
+    # p is free of it but for the true f d tan^2 term, and the residual is gone
+    assert general.value("principal_point") == pytest.approx(F * d, abs=1e-9)
+    assert general.value("principal_distance") == pytest.approx(F, abs=1e-9)
+    assert np.abs(general.residual).max() < 1e-12
+    # the fit without a constant gives itself away
+    bare = fit_interior_orientation(
+        position + np.random.default_rng(3).standard_normal(55) * UM, read, UM, ("principal_distance",)
+    )
+    assert bare.probability < 1e-12
+    assert any("lacks a term" in line for line in bare.statements)
+
+
+# ---- several sets
+
+
+def test_sets():
+    """10 sets: each is solved by itself; rms, mean and scatter at each point, and scatter of f as its noise says."""
+    rng = np.random.default_rng(9)
+    fixed = rng.standard_normal(55) * 2e-6  # the same in all sets, as a dividing error is
+    position = line_image(GF7) + fixed + rng.standard_normal((10, 55)) * 0.5e-6
+    for with_point in (False, True):
+        sets = combine_sets(position, GF7, with_point)
+        for k in range(10):
+            if with_point:
+                f, p = principal_distance_and_point(position[k], GF7)
+            else:
+                f, p = principal_distance(position[k], GF7), 0.0
+            assert sets.principal_distance[k] == f
+            assert sets.principal_point[k] == p
+            assert np.array_equal(sets.distortion[k], distortion(position[k], GF7, f, p))
+        assert sets.rms_distortion**2 == pytest.approx(
+            sets.mean_distortion**2 + 0.9 * sets.scatter_distortion**2, rel=1e-9
+        )
+        assert sets.overall_rms == pytest.approx(np.sqrt(np.mean(sets.rms_distortion**2)), rel=1e-12)
+        freedom = 10 - 1
+        sigma = 0.5e-6 / np.sqrt(np.sum(np.tan(GF7) ** 2))
+        assert in_range(freedom * (sets.scatter[0] / sigma) ** 2, freedom)
+        # each set loses one or two of its 55 freedoms to f and p, alike in all sets
+        assert in_range(freedom * np.sum(sets.scatter_distortion**2) / 0.5e-6**2, freedom * (55 - 1 - with_point))
+    assert combine_sets(position, np.tile(GF7, (10, 1)), True).mean[1] == sets.mean[1]
+    with pytest.raises(OrientationError, match="at least 2 sets"):
+        combine_sets(position[:1], GF7)
+    with pytest.raises(OrientationError, match="all angles of set 0 are the same"):
+        combine_sets(position, np.full(55, 0.01))
+
+
+# ---- bad input
+
+
+def fit(position=None, angle=GF7, covariance=UM, terms=TERMS, **options):
+    position = line_image(angle) if position is None else position
+    return fit_interior_orientation(position, angle, covariance, terms, **options)
+
+
+WITH_NAN = np.where(np.arange(55) == 7, np.nan, GF7)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"angle": GF7[:3]}, "3 different angles for 4 unknowns .* measure at more angles or fit fewer"),
+        ({"angle": np.tile(GF7[:3], 9)}, "3 different angles for 4 unknowns"),
+        ({"angle": np.full(55, 0.01)}, "all angles are the same; turn the turntable"),
+        ({"position": np.zeros(54)}, "one angle per spot"),
+        ({"position": WITH_NAN}, r"spot position \[7\] is not finite"),
+        ({"angle": WITH_NAN, "position": GF7}, r"angle \[7\] is not finite"),
+        ({"angle": np.rad2deg(GF7), "position": GF7}, "give radians"),
+        ({"position": -line_image(GF7)}, "opposite senses, change the sign"),
+        ({"position": np.tile(GF7, (2, 1))}, "fit set by set"),
+        ({"terms": ("constant",)}, "principal_distance must be among"),
+        ({"terms": ("principal_distance", "radial7")}, "terms must be different ones of"),
+        ({"terms": ("principal_distance", "principal_distance")}, "terms must be different ones of"),
+        ({"covariance": np.zeros(55)}, "not positive definite.*add the sigmas"),
+        ({"covariance": np.ones((55, 55))}, "not positive definite"),
+        ({"covariance": np.ones(54)}, r"need \(55, 55\), or 55 sigmas"),
+        ({"covariance": np.tri(55)}, "not symmetric"),
+        ({"covariance": -UM}, "negative"),
+        ({"covariance": np.nan}, "covariance is not finite"),
+        ({"angle_covariance": np.ones((3, 3))}, "angle_covariance is"),
+        # nearly constant: a field of 0.02 arcsec in which no spot moves by more than its noise
+        ({"angle": GF7 * 1e-6, "terms": ("constant", "principal_distance")}, "span only .* over the whole field"),
+    ],
+)
+def test_errors_say_what_to_change(arguments, message):
+    with pytest.raises(OrientationError, match=message):
+        fit(**arguments)
+
+
+def test_terms_that_cannot_be_told_apart_are_named():
+    one_side = np.deg2rad(np.linspace(1.2, 1.25, 55))
+    with pytest.raises(InseparableTermsError, match=r"one side of zero, cannot separate .*both halves") as caught:
+        fit(angle=one_side)
+    assert set(caught.value.terms) == set(TERMS)
+    assert isinstance(caught.value, RankError)
+    # the vector is what it says: a combination of terms that hardly moves a spot
+    t = np.tan(one_side)
+    columns = np.column_stack([np.ones(55), t, -(t**2), t**3])
+    vector = caught.value.null_vectors[0]
+    assert np.linalg.norm(columns @ vector) < 1e-3 * np.linalg.norm(np.abs(columns) @ np.abs(vector))
+    # two angles on each side, the same size: tan and tan^3 are one function of the sign
+    pair = np.array([-0.02, -0.02, 0.02, 0.02, 0.0])
+    with pytest.raises(InseparableTermsError) as caught:
+        fit(angle=pair, terms=("principal_distance", "radial3"))
+    assert caught.value.terms == ("principal_distance", "radial3")
+    assert fit(angle=pair, terms=("constant", "principal_distance")).condition < 2
+    # half a field is poor but enough, and the correlation says so
+    half = fit(angle=np.deg2rad(np.linspace(0, 1.25, 55)), terms=("constant", "principal_distance"))
+    assert half.correlation[0, 1] < -0.8
+
+
+def test_errors_of_the_printed_equations():
+    position = line_image(GF7)
+    with pytest.raises(OrientationError, match="1 angle for the 2 unknowns"):
+        principal_distance_and_point(position[:1], GF7[:1])
+    with pytest.raises(OrientationError, match="cannot be separated"):
+        principal_distance_and_point(np.full(5, 0.1), np.full(5, 0.02))
+    with pytest.raises(OrientationError, match="all angles are zero"):
+        principal_distance(np.zeros(3), np.zeros(3))
+    with pytest.raises(OrientationError, match="all angles are zero"):
+        principal_point(np.zeros(3), np.zeros(3), F)
+    with pytest.raises(OrientationError, match="opposite senses"):
+        principal_distance(-position, GF7)
+    with pytest.raises(OrientationError, match="opposite senses"):
+        principal_distance_and_point(-position, GF7)
+    with pytest.raises(OrientationError, match="no points"):
+        principal_distance([], [])
+    with pytest.raises(OrientationError, match="do not match"):
+        principal_distance(np.zeros((2, 5)), np.zeros((3, 5)))
+    with pytest.raises(OrientationError, match="one angle per spot"):
+        distortion(position[:5], GF7, F)

@@ -1,0 +1,90 @@
+"""A TDI line CCD: what its pixels, its charge and its clocking do to the image, and the frames it records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.noise import NoiseModel
+from twin.detector import EmvaDetector, FixedPattern
+
+if TYPE_CHECKING:
+    from scenes.band import BandSpec
+    from scenes.detector import DetectorSpec
+
+
+@dataclass(frozen=True)
+class LineCcd:
+    """One band's line CCD. Images have columns along the line (+Y') and rows along the track (+X').
+
+    Every row of an image is collected over all stages of a column's pixels, so that pixel differences are those of
+    columns.
+
+    Attributes:
+        band: geometry and clocking.
+        detector: of the sum over all stages.
+    """
+
+    band: BandSpec
+    detector: EmvaDetector
+
+    @classmethod
+    def from_specs(cls, band: BandSpec, sheet: DetectorSpec) -> LineCcd:
+        """From what the files say."""
+        return cls(band, EmvaDetector(**{f.name: getattr(sheet, f.name) for f in fields(EmvaDetector)}))
+
+    def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
+        """Each effect's transfer at frequencies along the line (fx) and along the track (fy), cycles/m.
+
+        Returns:
+            ``pixel``: its square area; ``diffusion``: charge that spreads to neighbours; ``tdi_step``: the image moves
+            on while the charge waits for its next step; ``tdi_rate``: image and charge drift apart over the stages.
+        """
+        p, tdi = self.band.pitch, self.band.tdi
+        return {
+            "pixel": np.sinc(p * fx) * np.sinc(p * fy),
+            "diffusion": np.exp(-2.0 * np.pi**2 * self.band.diffusion**2 * (fx**2 + fy**2)),
+            "tdi_step": np.sinc(tdi.open_share * p / tdi.phases * fy),
+            "tdi_rate": np.sinc(tdi.stages * p * tdi.rate_error * fy),
+        }
+
+    def transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+        """Product of all factors."""
+        out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(fx), np.shape(fy)))
+        for factor in self.factors(fx, fy).values():
+            out = out * factor
+        return out
+
+    def white_photons(self, share: float) -> float:
+        """Photons per pixel over all stages that fill the well to that share."""
+        return share * self.detector.full_well_e / self.detector.quantum_efficiency
+
+    @property
+    def exposure(self) -> float:
+        """Time over which dark current is collected, seconds: the data sheet gives it for one second of all stages."""
+        return self.band.tdi.stages * self.band.tdi.line_time
+
+    @property
+    def noise(self) -> NoiseModel:
+        """What the analysis may know of the noise of one frame."""
+        return self.detector.noise_model(self.exposure)
+
+    def pattern(self, seed: np.random.SeedSequence) -> FixedPattern:
+        """Gain and offset of every column of the line, (1, pixels)."""
+        return self.detector.fixed_pattern((1, self.band.pixels), seed)
+
+    def expose(
+        self, photons: np.ndarray, column: int, pattern: FixedPattern, frames: int, seed: np.random.SeedSequence
+    ) -> np.ndarray:
+        """Frames of images (..., H, W) whose first column is the line's pixel ``column``, uint16 (..., frames, H, W).
+
+        Raises:
+            ValueError: the image reaches beyond the ends of the line.
+        """
+        last = column + photons.shape[-1]
+        if column < 0 or last > self.band.pixels:
+            raise ValueError(f"columns {column} to {last - 1} are not all on a line of {self.band.pixels} pixels")
+        own = FixedPattern(pattern.gain[:, column:last], pattern.offset_e[:, column:last])
+        return self.detector.expose(photons, own, frames, self.exposure, seed, threads=1)
