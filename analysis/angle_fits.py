@@ -1,32 +1,44 @@
-"""Five fits of a curve over a range of angles, under one interface, and their cross-validation (paper 004, section 3.3).
+"""Five fits of a curve over a range of angles under one interface, and their cross-validation (paper 004, section 3.3).
 
     piecewise_linear   straight lines through the points
     polynomial         weighted least squares in Chebyshev polynomials; the order by leave-one-out
-    cubic_spline       natural cubic smoothing spline; the smoothing by leave-one-out (none gives the interpolating spline)
-    fourier            weighted least squares in a Fourier series whose fundamental period is longer than the range, since
-                       an arc is no full circle and the curve's ends need not meet; period and order by leave-one-out
+    cubic_spline       natural cubic smoothing spline, the smoothing by leave-one-out; it interpolates if that is none
+    fourier            weighted least squares in a Fourier series whose fundamental period is longer than the range,
+                       since an arc is no full circle and the curve's ends need not meet; period and order by
+                       leave-one-out
     network            the paper's back-propagation network: one hidden layer of tanh, standardised, with weight decay;
                        mean of several trainings from random starts
 
-Every fit knows how it depends on its points: `AngleFit.weights` (M, N), the derivative of the M predictions with respect
-to the N values. For the first four the prediction is `weights @ value` (the order that was selected is taken as
-given). The network is linearised at the minimum that was found. So noise propagates to any combination of predictions.
+Every fit knows how it depends on its points: `AngleFit.weights` (M, N), the derivative of the M predictions with
+respect to the N values. For the first four the prediction is `weights @ value` (the order that was selected is taken
+as given). The network is linearised at the minimum that was found. So noise propagates to any combination of
+predictions.
 
 Angles in radians; values in any unit, their sigmas in the same one.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-__all__ = ["FITS", "GAP_ORDER", "AngleFit", "CrossValidation", "NotConvergedError", "cross_validate", "fewest", "fit"]
+from analysis.angle_network import NotConvergedError, network
+
+__all__ = [
+    "FITS",
+    "GAP_ORDER",
+    "AngleFit",
+    "CrossValidation",
+    "NotConvergedError",
+    "angles_left",
+    "cross_validate",
+    "fewest",
+    "fit",
+]
 
 Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
@@ -37,20 +49,10 @@ PERIODS = (1.05, 1.1, 1.25, 1.5, 2.0)
 """Fundamental periods of the Fourier series that are tried, in lengths of the range."""
 SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
 """Smoothing parameters that are tried, for angles in units of the mean step and weights of mean one."""
-HIDDEN, RESTARTS = 20, 4
-DECAY, GAIN = 1e-2, 5.0
-"""Weight decay, and the standard deviation to which angles are scaled: steep enough starts for a curve with many turns.
-Chosen on simulated turntables, seeds 0 to 3 of a model like that of scenes/lab/turntable.yaml.
-"""
-MOST_ITERATIONS, TOLERANCE = 8000, 1e-4
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}
 """With which power of the step the error between points falls for a smooth curve: h^2 and h^4 for the local fits. The
 others miss what they have no terms for, wherever the points are.
 """
-
-
-class NotConvergedError(RuntimeError):
-    """No training of the network came to a minimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +181,12 @@ def cross_validate(
     x, y, s = _points(name, angle, value, sigma)
     if not 2 <= folds:
         raise ValueError(f"cross-validation: {folds} folds; take 2 or more")
+    left = angles_left(len(x), folds)
+    if left < fewest(name) or len(x) < 3:
+        raise ValueError(
+            f"{name}: cross-validation leaves {left} of {len(x)} angles, but at least {fewest(name)} are needed "
+            "and one to leave out; calibrate more, take more folds, or another fit"
+        )
     inner = np.arange(1, len(x) - 1)
     residual, variance = np.empty(len(x)), np.empty(len(x))
     for k in range(min(folds, len(inner))):
@@ -189,6 +197,11 @@ def cross_validate(
         residual[out] = y[out] - part(x[out])
         variance[out] = s[out] ** 2 + (weights**2) @ s[rest] ** 2
     return CrossValidation(name, x[inner], residual[inner], variance[inner])
+
+
+def angles_left(count: int, folds: int) -> int:
+    """How many of so many angles the largest fold of `cross_validate` leaves to fit."""
+    return count - -(-max(count - 2, 0) // folds)
 
 
 def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array, Array]:
@@ -204,7 +217,9 @@ def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> 
         raise ValueError(f"{name}: angles must increase; sort them, and average the repeats of one angle")
     need = fewest(name) if name in FITS else 0
     if len(x) < need:
-        raise ValueError(f"{name}: {len(x)} angles, but at least {need} are needed; calibrate more, or take another fit")
+        raise ValueError(
+            f"{name}: {len(x)} angles, but at least {need} are needed; calibrate more, or take another fit"
+        )
     return x, y, np.array(s)
 
 
@@ -215,7 +230,7 @@ _Made = tuple[dict[str, float], Curve, Curve]
 def _linear(basis: Curve, solve: Array, value: Array) -> tuple[Curve, Curve]:
     """Curve and derivative of a linear fit: basis (M, K) at the angles, solve (K, N)."""
     coefficients = solve @ value
-    return lambda a: basis(a) @ coefficients, lambda a: basis(a) @ solve
+    return lambda a: np.asarray(basis(a) @ coefficients), lambda a: np.asarray(basis(a) @ solve)
 
 
 def _left_out(hat: Array, value: Array) -> float:
@@ -254,7 +269,7 @@ def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _Made:
 
 
 def _chebyshev(middle: float, half: float, order: int) -> Curve:
-    return lambda a: np.polynomial.chebyshev.chebvander((a - middle) / half, order)
+    return lambda a: np.asarray(np.polynomial.chebyshev.chebvander((a - middle) / half, order), np.float64)
 
 
 def _fourier(x: Array, y: Array, s: Array, seed: int) -> _Made:
@@ -303,96 +318,11 @@ def _cubic_spline(x: Array, y: Array, s: Array, seed: int) -> _Made:
     return {"smoothing": float(smoothing)}, *_linear(unit, hat, y)
 
 
-def _network(x: Array, y: Array, s: Array, seed: int) -> _Made:
-    # a second for the import, and only this fit needs it
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.neural_network import MLPRegressor
-
-    hidden = min(HIDDEN, (len(x) - 1) // 2)
-    middle, scale = float(np.mean(x)), GAIN / float(np.std(x))
-    mean, spread = float(np.mean(y)), float(np.std(y)) or 1.0
-    weight = s**-2 / np.mean(s**-2)
-    nets: list[Any] = []
-    for state in np.random.SeedSequence(seed).generate_state(RESTARTS):
-        net = MLPRegressor(
-            hidden_layer_sizes=(hidden,),
-            activation="tanh",
-            solver="lbfgs",
-            alpha=DECAY,
-            tol=TOLERANCE,
-            max_iter=MOST_ITERATIONS,
-            max_fun=2 * MOST_ITERATIONS,
-            random_state=int(state),
-        )
-        with warnings.catch_warnings():
-            # a training that stops early is left out, and counted in the settings
-            warnings.simplefilter("error", ConvergenceWarning)
-            try:
-                nets.append(net.fit(scale * (x[:, None] - middle), (y - mean) / spread, sample_weight=weight))
-            except ConvergenceWarning:
-                continue
-    if not nets:
-        raise NotConvergedError(
-            f"network: none of {RESTARTS} trainings came to a minimum in {MOST_ITERATIONS} iterations; check the values "
-            "for gross errors, or take another fit"
-        )
-
-    def curve(a: Array) -> Array:
-        return mean + spread * np.mean([net.predict(scale * (a[:, None] - middle)) for net in nets], axis=0)
-
-    solves = [_response(net, scale * (x - middle), (y - mean) / spread, weight) for net in nets]
-
-    def derivative(a: Array) -> Array:
-        at = scale * (a - middle)
-        return np.asarray(np.mean([_gradient(net, at) @ solve for net, solve in zip(nets, solves, strict=True)], axis=0))
-
-    return {"hidden": hidden, "trainings": RESTARTS, "converged": len(nets)}, curve, derivative
-
-
-def _gradient(net: Any, x: Array) -> Array:
-    """Derivative (M, 3 H + 1) of the output at standardised angles with respect to (w, b, v, c): c + v . tanh(w x + b)."""
-    w, b, v = net.coefs_[0][0], net.intercepts_[0], net.coefs_[1][:, 0]
-    t = np.tanh(np.outer(x, w) + b)
-    slope = v * (1.0 - t**2)
-    return np.concatenate([slope * x[:, None], slope, t, np.ones((len(x), 1))], axis=-1)
-
-
-def _response(net: Any, x: Array, y: Array, weight: Array) -> Array:
-    """Derivative (3 H + 1, N) of the trained weights with respect to the values, by the implicit function theorem at the
-    minimum of 1/2 sum weight (net - y)^2 + DECAY/2 (|w|^2 + |v|^2).
-    """
-    w, b, v, c = net.coefs_[0][0], net.intercepts_[0], net.coefs_[1][:, 0], net.intercepts_[1][0]
-    n = len(w)
-    t = np.tanh(np.outer(x, w) + b)
-    bend = 1.0 - t**2
-    jacobian = _gradient(net, x)
-    residual = weight * (c + t @ v - y)
-    hessian = jacobian.T @ (weight[:, None] * jacobian)
-    # what the residuals add: second derivatives of the output, within one hidden unit only
-    once, twice = residual @ (bend * x[:, None]), residual @ bend
-    curved = -2.0 * v * t * bend
-    i = np.arange(n)
-    for row, column, term in (
-        (0, 0, residual @ (curved * x[:, None] ** 2)),
-        (0, n, residual @ (curved * x[:, None])),
-        (n, n, residual @ curved),
-        (0, 2 * n, once),
-        (n, 2 * n, twice),
-    ):
-        hessian[row + i, column + i] += term
-        if row != column:
-            hessian[column + i, row + i] += term
-    hessian[i, i] += DECAY
-    hessian[2 * n + i, 2 * n + i] += DECAY
-    # directions that nothing determines (a unit that has switched off) do not change the output either
-    return np.linalg.pinv(hessian, rcond=1e-10, hermitian=True) @ (jacobian.T * weight)
-
-
 FITS: Mapping[str, Callable[[Array, Array, Array, int], _Made]] = {
     "piecewise_linear": _piecewise_linear,
     "polynomial": _polynomial,
     "cubic_spline": _cubic_spline,
     "fourier": _fourier,
-    "network": _network,
+    "network": network,
 }
 """Name -> fit."""

@@ -1,7 +1,7 @@
 """Where a straight edge runs through a region of an image: which way, at which sub-pixel place, at which angle.
 
-The first half of the slanted-edge method (ISO 12233): rows across the edge, the centroid of each row's derivative inside
-a window, a robust straight line through the centroids. Coordinates: (row, column), the centre of the region's first
+The first half of the slanted-edge method (ISO 12233): rows across the edge, the centroid of each row's derivative in a
+window, a robust straight line through the centroids. Coordinates: (row, column), the centre of the region's first
 pixel is (0, 0).
 """
 
@@ -14,13 +14,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["EdgeError", "EdgeLine", "checked_region", "locate_edge", "pixel_noise"]
+__all__ = ["EdgeError", "EdgeLine", "checked_region", "locate_edge", "pixel_noise", "saturation_fault"]
 
 Array = NDArray[np.float64]
 Axis = Literal["x", "y"]
 # Smallest region: along the edge, and across it.
 LEAST_ALONG, LEAST_ACROSS = 20, 32
-# Level that the line must keep from the region's sides, px: tails and plateaus must be seen.
+# Distance that the line must keep from the region's sides, px: tails and plateaus must be seen.
 LEAST_MARGIN = 10.0
 # Contrast over the noise of one pixel below which centroids of single rows mean nothing.
 LEAST_CONTRAST = 5.0
@@ -31,6 +31,10 @@ _CLIPPED_SHARE = 0.05
 # Above this the edge is as much of the one kind as of the other.
 _LARGEST_ANGLE = math.radians(40.0)
 _HALF_WINDOWS = (8.0, 6.0, 6.0)
+_NOT_FOLLOWED = (
+    "the edge cannot be followed through the region: in many lines there is no rise where the others have it (two edges, "
+    "a corner, or an edge that leaves the region); choose a region with one straight edge"
+)
 
 
 class EdgeError(ValueError):
@@ -41,8 +45,8 @@ class EdgeError(ValueError):
 class EdgeLine:
     """A straight edge, near-vertical (axis "x") or near-horizontal (axis "y").
 
-    axis: along which the MTF is measured: "x" is across a near-vertical edge, along a row; "y" is across a near-horizontal
-        edge, along a column.
+    axis: along which the MTF is measured: "x" is across a near-vertical edge, along a row; "y" is across a
+        near-horizontal edge, along a column.
     angle: of the edge against the pixel grid, rad: column = position + tan(angle) (row - middle row) for axis "x", and
         row = position + tan(angle) (column - middle column) for axis "y".
     position: column (row) of the edge in the middle of the region, px.
@@ -75,18 +79,19 @@ def checked_region(region: ArrayLike, saturation: float | None) -> Array:
     grey = np.ascontiguousarray(array, dtype=np.float64)
     if not math.isfinite(grey.sum()):
         bad = int(np.count_nonzero(~np.isfinite(grey)))
-        raise EdgeError(f"{bad} of the region's pixels are not finite (NaN or infinity): replace them or move the region")
-    _check_saturation(grey, saturation)
+        raise EdgeError(f"{bad} pixels of the region are not finite (NaN or infinity): repair them or move the region")
+    fault = saturation_fault(grey, saturation)
+    if fault:
+        raise EdgeError(fault)
     return grey
 
 
-def _check_saturation(grey: Array, saturation: float | None) -> None:
+def saturation_fault(grey: Array, saturation: float | None) -> str:
+    """What is wrong with grey values (H, W) that reach saturation or heap up at their extremes; "" if nothing."""
     advice = "lower the exposure or the light"
     if saturation is not None:
         count = int(np.count_nonzero(grey >= saturation))
-        if count:
-            raise EdgeError(f"{count} pixels reach the saturation level of {saturation:g}: {advice}")
-        return
+        return f"{count} pixels reach the saturation level of {saturation:g}: {advice}" if count else ""
     for side, values in (("highest", grey), ("lowest", -grey)):
         extreme = values.max()
         count = int(np.count_nonzero(values == extreme))
@@ -94,15 +99,16 @@ def _check_saturation(grey: Array, saturation: float | None) -> None:
             continue
         others = values[values < extreme]
         if others.size == 0:
-            raise EdgeError("no edge in the region: all pixels have the same value; move the region onto the edge")
+            return "no structure in the region: all pixels have the same value; move the region onto the target"
         # noise makes a maximum rarer than its neighbour; clipping heaps it up
         if count > 2 * np.count_nonzero(values == others.max()):
-            raise EdgeError(
+            return (
                 f"{count} pixels share the {side} value {abs(extreme):g}: the "
                 + ("bright side is saturated" if side == "highest" else "dark side is cut off at the black level")
                 + f"; {advice if side == 'highest' else 'raise the offset'}. If the image is computed without noise, "
                 "state a saturation level above it"
             )
+    return ""
 
 
 def pixel_noise(residual: Array) -> float:
@@ -141,8 +147,8 @@ def locate_edge(grey: Array) -> EdgeLine:
     if margin < LEAST_MARGIN:
         where = "leaves the region" if margin < 0 else f"comes within {margin:.1f} px of the region's side"
         raise EdgeError(
-            f"the edge {where}: at least {LEAST_MARGIN:g} px must be left on both sides of it in every line; centre the "
-            "region on the edge, or make it wider or shorter"
+            f"the edge {where}: at least {LEAST_MARGIN:g} px must be left on both sides of it in every line; centre "
+            "the region on the edge, or make it wider or shorter"
         )
     if sign < 0:
         offset, angle = columns - 1 - offset, -angle
@@ -154,8 +160,8 @@ def _check_shape(shape: tuple[int, ...], axis: Axis) -> None:
     if along < LEAST_ALONG or across < LEAST_ACROSS:
         kind = "near-vertical" if axis == "x" else "near-horizontal"
         raise EdgeError(
-            f"the region has {across} px across the {kind} edge and {along} px along it: take at least {LEAST_ACROSS} px "
-            f"across and {LEAST_ALONG} px along"
+            f"the region has {across} px across the {kind} edge and {along} px along it: take at least {LEAST_ACROSS} "
+            f"px across and {LEAST_ALONG} px along"
         )
 
 
@@ -174,8 +180,8 @@ def _direction(grey: Array) -> tuple[Axis, int]:
         blocks = _blocks(grey)
         if float(np.ptp(blocks)) > 10.0 * noise / 4.0 + 1e-9 * float(np.abs(grey).max()):
             raise EdgeError(
-                "no single edge in the region: there is structure, but one side is not brighter than the other (two edges "
-                "of a bar?); choose a region with one edge between two even areas"
+                "no single edge in the region: there is structure, but one side is not brighter than the other (two "
+                "edges of a bar?); choose a region with one edge between two even areas"
             )
         raise EdgeError("no edge in the region: it is even but for noise; move the region onto the edge")
     # the slopes, not their significance: the region need not be square
@@ -223,10 +229,7 @@ def _refined(rising: Array, offset: float, slope: float) -> tuple[float, float]:
         total = weight.sum(axis=1)
         strong = total > 0.2 * max(float(np.median(total)), 0.0)
         if np.count_nonzero(strong) < 0.7 * rows:
-            raise EdgeError(
-                "the edge cannot be followed through the region: in many lines there is no rise where the others have it "
-                "(two edges, a corner, or an edge that leaves the region); choose a region with one straight edge"
-            )
+            raise EdgeError(_NOT_FOLLOWED)
         centroid = np.where(strong, (weight * distance).sum(axis=1) / np.where(strong, total, 1.0), 0.0)
         step = _huber_line(row[strong], centroid[strong])
         offset, slope = offset + step[0], slope + step[1]
@@ -241,6 +244,8 @@ def _check_contrast(rising: Array, line: Array) -> None:
         raise EdgeError("the edge lies at the region's side or leaves it: centre the region on the edge")
     contrast, noise = float(np.median(right) - np.median(left)), pixel_noise(rising)
     if contrast < LEAST_CONTRAST * noise:
+        if float(np.ptp(_blocks(rising))) > LEAST_CONTRAST * noise:
+            raise EdgeError(_NOT_FOLLOWED)
         raise EdgeError(
             f"the contrast of {contrast:.3g} is only {max(contrast, 0.0) / noise:.1f} times the noise of a pixel of "
             f"{noise:.3g}; {LEAST_CONTRAST:g} times is needed: average more frames or give more light"

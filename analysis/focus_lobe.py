@@ -75,9 +75,7 @@ class Lobe:
         """Fit, choose the points within reach of the fitted vertex, and again, until the choice rests: (B, Z)."""
         for _ in range(_ROUNDS):
             self._newton(mask, _NEWTON_STEPS)
-            away = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
-            chosen = (away <= self.reach(fraction)[:, None]) & (self.weight > 0)
-            wider = (away <= self.reach(min(fraction, WIDEST_FRACTION))[:, None]) & (self.weight > 0)
+            chosen, wider = self.window(fraction), self.window(min(fraction, WIDEST_FRACTION))
             chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], wider, chosen)
             chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], mask, chosen)
             if np.array_equal(chosen, mask):
@@ -85,6 +83,11 @@ class Lobe:
             mask = chosen
         self._newton(mask, 2 * _NEWTON_STEPS)
         return mask
+
+    def window(self, fraction: float) -> NDArray[np.bool_]:
+        """Measured points where the fitted curve is above a fraction of its peak, (B, Z)."""
+        away = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
+        return (away <= self.reach(fraction)[:, None]) & (self.weight > 0)
 
     def reach(self, fraction: float) -> Array:
         """Distance from the vertex, (B,), at which the fitted curve has fallen to a fraction of its peak."""

@@ -134,7 +134,7 @@ class ShimPlan:
         return self.shims_only.line_turn - self.wanted.line_turn
 
     def focus_error(self, place: ArrayLike) -> Array:
-        """Defocus that rounding leaves at places (..., 2) of the focal plane, metres; + is focus beyond the CCD, along +Z'."""
+        """Defocus that rounding leaves at places (..., 2) of the focal plane, metres: focus minus CCD along +Z'."""
         spots = np.asarray(place, np.float64)
         point = np.concatenate([spots, np.zeros((*spots.shape[:-1], 1))], axis=-1)
         return np.asarray((self.wanted.moved(point) - self.achieved.moved(point))[..., 2])
@@ -237,10 +237,9 @@ def _check_thickness(thickness: Array, now: Array, least: float, step: float) ->
     if not thin.size:
         return
     text = ", ".join(f"hole {h} would get {1e3 * thickness[h]:.4g} mm" for h in thin)
-    short = float(np.max(least - thickness))
+    short = step * float(np.ceil(np.max(least - thickness) / step - 1e-9))
     raise ShimError(
-        f"shims: {text}, the least is {1e3 * least:.4g} mm; start from a nominal thickness that is"
-        f" {1e3 * short:.4g} mm larger at all holes (at least {1e3 * (float(now.max()) + short):.4g} mm) and move the"
-        " assembly's seat back by as much",
+        f"shims: {text}, the least is {1e3 * least:.4g} mm; move the seat back and start from shims that are"
+        f" {1e3 * short:.4g} mm thicker at all holes, {1e3 * (float(now.max()) + short):.4g} mm at the thickest",
         tuple(int(h) for h in thin),
     )

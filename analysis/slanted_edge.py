@@ -8,12 +8,12 @@ ISO 12233 projects along the rows, and its frequencies are counted along the row
 normal: the result is the cut through the two-dimensional MTF at f (cos angle, sin angle) for axis "x".
 `EdgeMtf.frequency_along_axis` gives the frequency along the row (axis "x") or column (axis "y"), lower by cos(angle).
 
-Noise passes through a chain that is linear but for the division by the contrast, so its covariance is exact to first order:
-pixel variances -> coefficients -> transfer function with its normalisation -> modulus. The modulus is too long on the
-average (Rice); `noise_bias` says by how much and `mtf` is not corrected for it.
+Noise passes through a chain that is linear but for the division by the contrast, so its covariance is exact to first
+order: pixel variances -> coefficients -> transfer function with its normalisation -> modulus. The modulus is too long
+on the average (Rice); `noise_bias` says by how much and `mtf` is not corrected for it.
 
-Without noise the error is below 0.0005 up to Nyquist for F/9.2 at 650 nm with pixels of 7 um and of 28 um, at 2 to 10 deg
-from 64 x 64 px on, and below 0.002 with strong coma (tests/analysis/test_slanted_edge.py). `sigma` does not contain it.
+Without noise the error is below 0.0005 up to Nyquist for F/9.2 at 650 nm with pixels of 7 um and of 28 um, at 2 to
+10 deg from 64 x 64 px on (tests/analysis/test_slanted_edge.py). `sigma` does not contain it.
 """
 
 from __future__ import annotations
@@ -23,98 +23,23 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
-from analysis.edge_location import Axis, EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
-from analysis.edge_spread import EdgeSpread, fit_edge_spread
+from analysis.edge_location import EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
+from analysis.edge_mtf import EdgeMtf
+from analysis.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.noise import NoiseModel
 from analysis.rice import rice_bias, rice_sigma, signal_modulus
 
 __all__ = ["EdgeError", "EdgeMtf", "measure_edge"]
 
 Array = NDArray[np.float64]
-# Half width of the spline: so many 10-90% widths of the edge, at least so many pixels, at most this part of the plateau.
+# Half width of the spline: so many 10-90% widths of the edge, at least so many px, at most this part of the plateau.
 _CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
 # Widest hole between neighbouring sampling phases, px.
 _LARGEST_GAP = 0.3
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
 _OTHER_STRUCTURE = 0.1
 _LINE_STEPS = 2
-
-
-@dataclass(frozen=True, eq=False)
-class EdgeMtf:
-    """MTF along the normal of one edge.
-
-    axis: "x" for a near-vertical edge (MTF along rows), "y" for a near-horizontal one (MTF along columns).
-    frequency: (F,) cycles/pixel along the normal.
-    mtf: (F,) modulus of the transfer function, 1 at frequency 0, not corrected for noise_bias.
-    transfer: (F,) complex transfer function, phase counted from the edge's position.
-    sigma: (F,) standard deviation of mtf from noise, with the share of the angle's uncertainty.
-    noise_bias: (F,) how much noise lengthens mtf on the average, >= 0.
-    angle, angle_sigma: rad, against the grid: column (row) = position + tan(angle) (row (column) - middle).
-    position, position_sigma: column (axis "x") or row (axis "y") of the edge's half height in the region's middle, px.
-    curvature, curvature_sigma: second derivative of the edge's column (row) by its row (column), 1/px; a straight edge
-        was used all the same.
-    place, esf, lsf: (S,) px along the normal from the dark side to the bright; grey values; line-spread function, 1/px,
-        integral 1.
-    pixel_place, pixel_grey: (N,) all pixels, projected, as used.
-    dark, bright: grey values far from the edge, tails accounted for.
-    noise_dark, noise_bright: rms noise of one pixel there.
-    core: half width of the spline, px; beyond it the edge-spread function is level + tail / x.
-    """
-
-    axis: Axis
-    frequency: Array
-    mtf: Array
-    transfer: NDArray[np.complex128]
-    sigma: Array
-    noise_bias: Array
-    angle: float
-    angle_sigma: float
-    position: float
-    position_sigma: float
-    curvature: float
-    curvature_sigma: float
-    place: Array
-    esf: Array
-    lsf: Array
-    pixel_place: Array
-    pixel_grey: Array
-    dark: float
-    bright: float
-    noise_dark: float
-    noise_bright: float
-    core: float
-
-    @property
-    def frequency_along_axis(self) -> Array:
-        """(F,) cycles/pixel along the row (axis "x") or column (axis "y"): what ISO 12233 plots."""
-        return self.frequency * math.cos(self.angle)
-
-    def at(self, frequency: float) -> tuple[float, float]:
-        """MTF and sigma at one frequency along the normal, cycles/pixel; cubic between the samples.
-
-        Raises:
-            ValueError: the frequency is outside of the measured ones.
-        """
-        if not self.frequency[0] <= frequency <= self.frequency[-1]:
-            raise ValueError(
-                f"frequency {frequency} lies outside of {self.frequency[0]:g} to {self.frequency[-1]:g} cycles/pixel"
-            )
-        value = CubicSpline(self.frequency, self.mtf)(frequency)
-        return float(value), float(np.interp(frequency, self.frequency, self.sigma))
-
-    def frequency_at(self, value: float) -> tuple[float, float]:
-        """Lowest frequency, cycles/pixel, where the MTF falls through the value, and its sigma; (nan, nan) if nowhere."""
-        below = np.flatnonzero((self.mtf[1:] < value) & (self.mtf[:-1] >= value))
-        if below.size == 0:
-            return math.nan, math.nan
-        curve = CubicSpline(self.frequency, self.mtf)
-        low, high = self.frequency[below[0]], self.frequency[below[0] + 1]
-        roots = curve.solve(value, extrapolate=False)
-        root = float(roots[(roots >= low) & (roots <= high)][0])
-        return root, float(np.interp(root, self.frequency, self.sigma) / abs(curve(root, 1)))
 
 
 def measure_edge(
@@ -128,11 +53,13 @@ def measure_edge(
 ) -> EdgeMtf:
     """MTF of the one edge in a region.
 
-    region: (H, W) grey values, linear in light. noise: the detector's model; its fixed pattern counts as independent from
-    pixel to pixel. frames: how many frames the region is the mean of, used with `noise` only. Without a model the
-    variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value. saturation:
-    grey value of saturation; default the model's, else plateaus of equal values are looked for. oversampling: knots of
-    the edge-spread function per pixel. frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
+    region: (H, W) grey values, linear in light.
+    noise: the detector's model; its fixed pattern counts as independent from pixel to pixel. Without a model the
+        variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
+    frames: how many frames the region is the mean of, used with `noise` only.
+    saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
+    oversampling: knots of the edge-spread function per pixel.
+    frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
 
     Raises:
         EdgeError: the region does not show one measurable edge.
@@ -158,63 +85,70 @@ def measure_edge(
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Line column = offset + slope * v with v from the middle row; normal distances of all pixels (H, W)."""
+    """Line column = offset + slope * v with v from the middle row (rows,); all pixels by their distance from it."""
 
     offset: float
     slope: float
     along: Array
-    distance: Array
+    design: EdgeDesign
     spread: EdgeSpread
 
 
 def _fit_line_and_spread(rising: Array, offset: float, slope: float, oversampling: int) -> _Fitted:
     rows, columns = rising.shape
-    along = np.arange(rows)[:, None] - (rows - 1) / 2.0
+    along = np.arange(rows) - (rows - 1) / 2.0
     column = np.arange(columns)
-    flat = rising.ravel()
+    grey = rising.ravel()
     core = 0.0
     for step in range(_LINE_STEPS + 1):
-        distance = (column - offset - slope * along) * math.cos(math.atan(slope))
+        distance = ((column - offset - slope * along[:, None]) * math.cos(math.atan(slope))).ravel()
         if step == 0:
-            _check_phases(distance, slope)
-            core = _core(distance, rising, min(offset, columns - 1 - offset) - abs(slope) * (rows - 1) / 2.0)
-        spread = fit_edge_spread(distance.ravel(), flat, core, oversampling)
-        if step < _LINE_STEPS:
-            parts, residual, _ = _line_residual(rising, distance, along, spread)
-            change, *_ = np.linalg.lstsq(parts.T, residual, rcond=None)
-            offset, slope = offset + change[0], slope + change[1]
-    return _Fitted(offset, slope, along, distance, spread)
+            _check_phases(distance, rows, slope)
+            core = _core(distance, grey, min(offset, columns - 1 - offset) - abs(slope) * (rows - 1) / 2.0)
+        last = step == _LINE_STEPS
+        # few knots for the line: its slope must not follow the noise
+        design = EdgeDesign.of(distance, core, oversampling if last else 2)
+        spread = fit_edge_spread(design, grey)
+        if not last:
+            parts, normal, near = _line_parts(design, spread, along, columns)
+            change = normal @ (parts @ (grey - spread.value(design))[near])
+            offset, slope = offset + float(change[0]), slope + float(change[1])
+    return _Fitted(offset, slope, along, design, spread)
 
 
-def _line_residual(
-    rising: Array, distance: Array, along: Array, spread: EdgeSpread
-) -> tuple[Array, Array, NDArray[np.bool]]:
-    """Derivatives (3, M) of the grey values in the core by offset, slope and curvature of the line; residuals (M,)."""
-    inside = np.abs(distance) < spread.core
-    x = distance[inside]
-    v = np.broadcast_to(along, distance.shape)[inside]
-    fall = -spread.slope(x)
-    return np.stack([fall, fall * v, fall * (0.5 * v * v)]), rising[inside] - spread.value(x), inside
+def _line_parts(
+    design: EdgeDesign, spread: EdgeSpread, along: Array, columns: int
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Derivatives (3, M) of grey values by the line's offset, slope and curvature; inverse normal matrix; pixels.
+
+    Only pixels in the inner quarter of the core: farther out the fitted slope is mostly noise and would pull the line.
+    """
+    close = np.abs(design.x[design.inside]) <= spread.core / _CORE_WIDTHS
+    near = design.inside[close]
+    v = along[near // columns]
+    fall = -spread.core_slope(design)[close]
+    parts = np.stack([fall, fall * v, fall * (0.5 * v * v)])
+    return parts, np.asarray(np.linalg.inv(parts @ parts.T)), near
 
 
-def _check_phases(distance: Array, slope: float) -> None:
+def _check_phases(distance: Array, rows: int, slope: float) -> None:
     near = np.sort(distance[np.abs(distance) <= 1.5])
     gap = float(np.diff(near).max()) if near.size > 1 else math.inf
     if gap > _LARGEST_GAP:
         degrees = math.degrees(abs(math.atan(slope)))
         raise EdgeError(
-            f"the edge at {degrees:.2f} deg to the pixel grid leaves gaps of {gap:.2f} px between its sampling phases in "
-            f"{distance.shape[0]} lines, at most {_LARGEST_GAP} px will do: tilt the target by 2 to 10 deg"
+            f"the edge at {degrees:.2f} deg to the pixel grid leaves gaps of {gap:.2f} px between its sampling phases "
+            f"in {rows} lines, at most {_LARGEST_GAP} px will do: tilt the target by 2 to 10 deg"
             + (" or take a region that is longer along the edge" if 0.2 < degrees < 5 else "")
         )
 
 
-def _core(distance: Array, rising: Array, plateau: float) -> float:
+def _core(distance: Array, grey: Array, plateau: float) -> float:
     """Half width of the spline, from the 10-90% width of the edge, px."""
-    cell = np.round(2.0 * distance).astype(np.intp).ravel()
+    cell = np.round(2.0 * distance).astype(np.intp)
     low = int(cell.min())
     count = np.bincount(cell - low)
-    profile = np.bincount(cell - low, rising.ravel()) / np.maximum(count, 1)
+    profile = np.bincount(cell - low, grey) / np.maximum(count, 1)
     middle = -low
     outer = round(2.0 * 0.7 * plateau)
     dark, bright = profile[: middle - outer].mean(), profile[middle + outer :].mean()
@@ -234,56 +168,60 @@ def _core(distance: Array, rising: Array, plateau: float) -> float:
 def _result(
     rising: Array, line: EdgeLine, fitted: _Fitted, noise: NoiseModel | None, frames: int, frequency: Array
 ) -> EdgeMtf:
-    spread, distance = fitted.spread, fitted.distance
-    model = spread.value(distance)
-    _check_one_edge(rising, model, spread.contrast, line)
-    variance, dark_variance, bright_variance = _variances(rising, model, distance, spread, noise, frames)
-    flat = distance.ravel()
-    covariance = spread.covariance(flat, variance.ravel())
+    spread, design = fitted.spread, fitted.design
+    grey, columns = rising.ravel(), rising.shape[1]
+    model = spread.value(design)
+    _check_one_edge(rising, model.reshape(rising.shape), spread.contrast, line)
+    variance, dark_variance, bright_variance = _variances(grey, model, design.x, spread, noise, frames)
+    covariance = spread.covariance(design, variance)
     transfer, gradient = spread.transform(frequency)
     modulus = np.abs(transfer)
     turned = gradient * np.exp(-1j * np.angle(transfer))
     along, across = (np.sqrt(np.sum(part * (covariance @ part), axis=0)) for part in (turned.real, turned.imag))
     signal = signal_modulus(modulus, along, across)
 
-    parts, residual, inside = _line_residual(rising, distance, fitted.along, spread)
-    normal = np.linalg.inv(parts @ parts.T)
-    bend = normal @ (parts @ residual)
-    line_sigma = np.sqrt(np.diag(normal @ ((parts * variance[inside]) @ parts.T) @ normal))
-    # Angle and offset alone, without the curvature, are what was fitted.
-    two = np.linalg.inv(parts[:2] @ parts[:2].T)
+    parts, normal, near = _line_parts(design, spread, fitted.along, columns)
+    scatter = (parts * variance[near]) @ parts.T
+    bend = normal @ (parts @ (grey - model)[near])
+    bend_sigma = math.sqrt(float((normal @ scatter @ normal)[2, 2]))
+    # offset and slope without the curvature are what was fitted
+    straight = np.linalg.inv((parts @ parts.T)[:2, :2])
+    slope_sigma = math.sqrt(float((straight @ scatter[:2, :2] @ straight)[1, 1]))
     cosine = math.cos(math.atan(fitted.slope))
-    slope_sigma = math.sqrt(float((two @ ((parts[:2] * variance[inside]) @ parts[:2].T) @ two)[1, 1]))
-    # A turned line blurs: 1 - mean cos(2 pi f v dslope cos) = k chi^2_1, of mean square 3 k^2.
+    # A turned line blurs: 1 - mean cos(2 pi f v dslope cosine) = k chi^2 of one degree of freedom, mean square 3 k^2.
     blur = 0.5 * (2.0 * np.pi * frequency * cosine * slope_sigma) ** 2 * float(np.mean(fitted.along**2))
-    half = 0.5 * (2.0 * spread.dark + spread.contrast)
-    height, steep = (float(f(np.zeros(1))[0]) for f in (spread.value, spread.slope))
-    shift = (half - height) / steep
-    up = spread.gradient(0.0)
-    up[-3:] -= (1.0, 0.5, 0.0)
+    centre = spread.design(np.zeros(1))
+    steep = float(spread.slope(centre)[0])
+    shift = (spread.dark + 0.5 * spread.contrast - float(spread.value(centre)[0])) / steep
+    # how each coefficient lifts the middle of the edge above half height
+    lift = centre.project(np.ones(1))
+    lift[-3:] -= (1.0, 0.5, 0.0)
     offset = fitted.offset + shift / cosine
     if line.sign < 0:
-        offset = rising.shape[1] - 1 - offset
-    reach = math.floor(min(-flat.min(), flat.max()) * spread.oversampling) / spread.oversampling
+        offset = columns - 1 - offset
+    reach = math.floor(min(-design.x.min(), design.x.max()) * spread.oversampling) / spread.oversampling
     place = np.linspace(-reach, reach, round(2 * reach * spread.oversampling) + 1)
+    shown = spread.design(place)
     return EdgeMtf(
         axis=line.axis,
         frequency=frequency,
         mtf=modulus,
         transfer=transfer * np.exp(2j * np.pi * frequency * shift),
+        sigma_along=along,
+        sigma_across=across,
         sigma=np.sqrt(rice_sigma(signal, along, across) ** 2 + 3.0 * (blur * modulus) ** 2),
         noise_bias=rice_bias(signal, across),
         angle=line.sign * math.atan(fitted.slope),
         angle_sigma=slope_sigma * cosine**2,
         position=offset,
-        position_sigma=math.sqrt(float(up @ covariance @ up)) / steep / cosine,
+        position_sigma=math.sqrt(float(lift @ covariance @ lift)) / steep / cosine,
         curvature=line.sign * float(bend[2]),
-        curvature_sigma=float(line_sigma[2]),
+        curvature_sigma=bend_sigma,
         place=place,
-        esf=spread.value(place),
-        lsf=spread.slope(place) / spread.contrast,
-        pixel_place=flat,
-        pixel_grey=rising.ravel(),
+        esf=spread.value(shown),
+        lsf=spread.slope(shown) / spread.contrast,
+        pixel_place=design.x,
+        pixel_grey=grey,
         dark=spread.dark,
         bright=spread.dark + spread.contrast,
         noise_dark=math.sqrt(dark_variance),
@@ -296,29 +234,31 @@ def _check_one_edge(rising: Array, model: Array, contrast: float, line: EdgeLine
     residual = rising - model
     rows, columns = residual.shape[0] // 4, residual.shape[1] // 4
     blocks = np.abs(residual[: 4 * rows, : 4 * columns].reshape(rows, 4, columns, 4).mean(axis=(1, 3)))
-    limit = max(_OTHER_STRUCTURE * contrast, 6.0 * pixel_noise(residual) / 4.0)
+    # six sigma: by chance once in 1e6 regions of 64 x 64 px
+    noise = max(pixel_noise(part) for part in (residual, residual[:, :8], residual[:, -8:]))
+    limit = max(_OTHER_STRUCTURE * contrast, 6.0 * noise / 4.0)
     if blocks.max() > limit:
         along, across = (4 * int(k) + 2 for k in np.unravel_index(int(blocks.argmax()), blocks.shape))
         across = across if line.sign > 0 else residual.shape[1] - 1 - across
         row, column = (along, across) if line.axis == "x" else (across, along)
         raise EdgeError(
-            f"the region holds more than one straight edge: near its row {row}, column {column} grey values differ from "
-            f"such an edge by {blocks.max() / contrast:.0%} of its contrast (second edge, corner, bend, speck, uneven "
-            "light); choose a region with one edge between two even areas"
+            f"the region holds more than one straight edge: near its row {row}, column {column} grey values differ "
+            f"from such an edge by {blocks.max() / contrast:.0%} of its contrast (second edge, corner, bend, speck, "
+            "uneven light); choose a region with one edge between two even areas"
         )
 
 
 def _variances(
-    rising: Array, model: Array, distance: Array, spread: EdgeSpread, noise: NoiseModel | None, frames: int
+    grey: Array, model: Array, distance: Array, spread: EdgeSpread, noise: NoiseModel | None, frames: int
 ) -> tuple[Array, float, float]:
-    """Variance of every pixel (H, W), and of a dark and a bright one."""
+    """Variance of every pixel (N,), and of a dark and a bright one."""
     levels = np.array([spread.dark, spread.dark + spread.contrast])
     if noise is not None:
         dark, bright = noise.temporal_variance_dn2(levels, frames) + noise.fixed_variance_dn2(levels)
         variance = noise.temporal_variance_dn2(model, frames) + noise.fixed_variance_dn2(model)
         return variance, float(dark), float(bright)
-    # two levels and a tail are fitted outside of the core, so each side gives some one degree of freedom and a half away
-    square = (rising - model) ** 2
+    # two levels and a tail are fitted outside of the core: each side gives one degree of freedom and a half away
+    square = (grey - model) ** 2
     sides = [square[distance < -spread.core], square[distance > spread.core]]
     dark, bright = (float(side.sum()) / max(side.size - 1.5, 1.0) for side in sides)
     share = np.clip((model - spread.dark) / spread.contrast, 0.0, 1.0)

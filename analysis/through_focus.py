@@ -6,11 +6,19 @@ out it is flatter. To fourth order every one of these curves has nearly the same
 
     v = p (1 - u + q u^2),    u = a (z - z0)^2,
 
-with q = 0.30 for a slit pupil (a sinc), 1/3 for a round pupil at low frequencies (2 J1(x)/x), and between 0.29 and 0.33
-for Hopkins' exact curves of an F/9.2 pupil at 71.4 and 17.9 cycles/mm. q is therefore a constant and not a fourth
-unknown: it costs no precision, and what a pure parabola (q = 0) gets wrong when its points lie lopsided about the peak
-goes down thirtyfold. Points count down to half of the peak: with fewer the noise is larger, with more the neglected
-sixth order shows.
+with q = 0.30 for a slit pupil (a sinc), 1/3 for a round pupil at low frequencies (2 J1(x)/x), and 0.29 to 0.33 for
+Hopkins' exact curves of an F/9.2 pupil at 650 nm, 71.4 and 17.9 cycles/mm (first zeros at 0.29 and 0.71 mm of defocus).
+So q is a constant and not a fourth unknown: a free one would cost precision, and none at all (q = 0, the parabola)
+leaves a bias where the points lie lopsided about the peak. Largest bias over the phases of the steps, in um, with
+points down to half of the peak, and sigma for values good to 2% of the peak:
+
+    scan                                              parabola    q = 0.3    sigma
+    71.4 cycles/mm, steps of 50 um (75 um)            0.9 (2.4)   0.04 (0.4)   2.3
+    17.9 cycles/mm, steps of 50 um (100 um)           1.3 (2.5)   0.04 (0.06)  3.7 (5.2)
+    17.9 cycles/mm, +-0.3 mm, focus at +0.2 mm        14          0.15         14
+
+With fewer points (0.7 of the peak) sigma is 1.3 to 1.5 times larger; with more (0.3) the neglected sixth order shows.
+Coma leaves the curve even; 0.4 waves of spherical aberration make its maximum and this vertex differ by 1.2 um.
 
 All positions in one unit of length (metres elsewhere in this program), values in any unit (MTF).
 """
@@ -30,11 +38,16 @@ __all__ = ["FocusError", "FocusVertex", "FocusVertices", "focus_vertex", "focus_
 Array = NDArray[np.float64]
 QUARTIC = 0.3
 FRACTION = 0.5
-# A curve is flat, and a flank has no slope, below this many sigma.
+# A curvature, a slope or a contrast is there above this many sigma. The highest of many places is looked at, so this
+# is more than for a single one.
 _SIGNIFICANT = 5.0
+# A curvature of this many sigma is enough where the peak stands out from the rest of the scan as well.
+_HINT = 3.0
+# Near an end of the scan a chi-square this many times the degrees of freedom means a flank and not a peak.
+_MISFIT = 10.0
 _REMEDY = {
-    "peak below": "the peak lies beyond the lower end of the scan, {low:.6g}; move the scan down",
-    "peak above": "the peak lies beyond the upper end of the scan, {high:.6g}; move the scan up",
+    "peak below": "the peak lies beyond the lower end of the scan, {low:.6g}, or too near to it; move the scan down",
+    "peak above": "the peak lies beyond the upper end of the scan, {high:.6g}, or too near to it; move the scan up",
     "few points": "fewer than {least} positions near the peak (about {place:.6g}); take steps of at most {step:.2g}",
     "flat": "no curvature above the noise; scan a wider range or lower the noise (more frames or edge rows)",
     "spurious": "the highest peak, {peak:.3g} at {place:.6g}, is below {lowest:.3g} and is taken for spurious"
@@ -201,22 +214,46 @@ def _faults(
 ) -> NDArray[np.str_]:
     """(B,) empty, or why a curve has no vertex."""
     fault = np.full(len(place), "", dtype="<U12")
+    scarce = model.positions(model.window(WIDEST_FRACTION)) < LEAST_POINTS
+    enough = model.positions(model.weight > 0) >= LEAST_POINTS
     fault[peak < lowest_peak] = "spurious"
-    fault[model.positions(mask) < LEAST_POINTS] = "few points"
-    curved = -bend > _SIGNIFICANT * np.sqrt(covariance[:, 2, 2])
-    fault[~curved & (fault == "")] = "flat"
-    # A flank: no curvature, or the vertex outside, and the values rise significantly toward an end.
-    measured = np.where(mask, model.weight, 0.0)
-    total = np.where(measured.sum(axis=1) > 0, measured.sum(axis=1), 1.0)
-    middle = (measured * model.x).sum(axis=1) / total
-    arm = model.x - middle[:, None]
-    spread = (measured * arm**2).sum(axis=1)
-    trend = (measured * arm * model.v).sum(axis=1) / np.sqrt(np.where(spread > 0, spread, 1.0))
-    sides = ((-1, "peak below", model.x0 < model.ends[0]), (1, "peak above", model.x0 > model.ends[1]))
-    for sign, name, beyond in sides:
-        fault[beyond & (curved | (sign * trend > _SIGNIFICANT))] = name
-        fault[~curved & (fault == "flat") & (sign * trend > _SIGNIFICANT)] = name
+    fault[scarce] = "few points"
+    bent = -bend / np.sqrt(np.maximum(covariance[:, 2, 2], 1e-300))
+    standing = _contrast(model, mask) > _SIGNIFICANT
+    curved = (bent > _SIGNIFICANT) | ((bent > _HINT) & standing)
+    fault[~curved & ~(scarce & standing)] = "flat"
+    # A flank: the vertex beyond an end, or so near to it that too few points are left or that the lobe does not fit
+    # them, or no curvature but values that rise toward the end.
+    misfit = model.chi_square(mask) > _MISFIT * np.maximum(mask.sum(axis=1) - 3, 1)
+    place_sigma = np.sqrt(covariance[:, 1, 1]) / model.scale
+    trend, half = _trend(model, mask), model.reach(WIDEST_FRACTION) / model.scale
+    for sign, name, room in (
+        (-1, "peak below", model.x0 - model.ends[0]),
+        (1, "peak above", model.ends[1] - model.x0),
+    ):
+        rising = sign * trend > _SIGNIFICANT
+        # Within two sigma of the end it is not seen to be inside.
+        fault[(room < 2 * place_sigma) & (curved | rising)] = name
+        fault[(room < half) & ((scarce & enough & (curved | standing)) | misfit)] = name
+        fault[~curved & rising] = name
     return fault
+
+
+def _contrast(model: Lobe, mask: NDArray[np.bool_]) -> Array:
+    """By how many sigma the mean of the chosen points is above the mean of all others, (B,)."""
+    inside, outside = np.where(mask, model.weight, 0.0), np.where(mask, 0.0, model.weight)
+    sums = [np.maximum(part.sum(axis=1), 1e-300) for part in (inside, outside)]
+    means = [(part * model.v).sum(axis=1) / total for part, total in zip((inside, outside), sums, strict=True)]
+    return np.asarray((means[0] - means[1]) / np.sqrt(1 / sums[0] + 1 / sums[1]))
+
+
+def _trend(model: Lobe, mask: NDArray[np.bool_]) -> Array:
+    """Slope of the straight line through the chosen points in units of its sigma, (B,)."""
+    weight = np.where(mask, model.weight, 0.0)
+    middle = (weight * model.x).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
+    arm = model.x - middle[:, None]
+    moment = np.maximum((weight * arm**2).sum(axis=1), 1e-300)
+    return np.asarray((weight * arm * model.v).sum(axis=1) / np.sqrt(moment))
 
 
 def _raise(
@@ -244,8 +281,8 @@ def _raise(
             "high": seen[-1] if seen.size else np.nan,
             "least": LEAST_POINTS,
             "place": place[b],
-            # LEAST_POINTS positions lie in the window wherever the steps fall.
-            "step": 2 * reach[b] / LEAST_POINTS,
+            # LEAST_POINTS in the window wherever the steps fall; less a quarter, for too few points look too wide.
+            "step": 0.75 * 2 * reach[b] / LEAST_POINTS,
             "peak": peak[b],
             "lowest": lowest_peak,
         }

@@ -1,7 +1,7 @@
 """Test targets of optical benches as vector shapes: knife edge, bar group, bars with level references, star, pinhole.
 
-A target lies in its own plane, metres, about the origin, x along the detector's columns and y along its rows as the axes
-are counted. ``Target.mapped`` takes it into an image plane. Levels are transmittances, 0 to 1.
+A target lies in its own plane, metres, about the origin. ``Target.mapped`` takes it into an image plane, where columns
+count along x and rows along y. Levels are transmittances, 0 to 1.
 """
 
 from __future__ import annotations
@@ -96,12 +96,17 @@ def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) ->
 
 
 def bar_target(
-    frequency: float, bars: int, region: Rectangle, clearance: float, direction: Literal["x", "y"] = "x", tilt: float = 0.0
+    frequency: float,
+    bars: int,
+    region: Rectangle,
+    clearance: float,
+    direction: Literal["x", "y"] = "x",
+    tilt: float = 0.0,
 ) -> tuple[Target, BarLayout]:
     """A bar group with a large bright square and a dark patch as level references, on dark.
 
     Half of the region, on the negative side of the axis along the bars, holds the group, whose bars are as long as they
-    can be. The other half holds the bright square at the negative end of the bars' normal, and is dark at the other end.
+    can be. The other half holds the bright square at the negative end of the bars' normal and is dark at the other.
 
     Args:
         frequency: along the bars' normal, cycles/m.
@@ -128,8 +133,8 @@ def bar_target(
     half_length = (0.5 * across - clearance - half_width * sine) / cosine
     if half_length <= 0.0 or half_width * cosine + half_length * sine > along - clearance:
         raise ValueError(
-            f"{bars} bars of {frequency:g} cycles/m are {2.0 * half_width:.3g} m wide; with a clearance of {clearance:g} m"
-            f" they do not fit a region of {2.0 * along:.3g} m by {2.0 * across:.3g} m"
+            f"{bars} bars of {frequency:g} cycles/m are {2.0 * half_width:.3g} m wide; with a clearance of"
+            f" {clearance:g} m they do not fit a region of {2.0 * along:.3g} m by {2.0 * across:.3g} m"
         )
     side = min(0.5 * along, 0.5 * across) - clearance
     # the largest upright rectangle between the bars' ends, drawn in by the clearance
@@ -138,8 +143,8 @@ def bar_target(
     inner_q = (short * cosine - half_width * sine) / np.cos(2.0 * tilt)
     if min(side - clearance, inner_p, inner_q) <= 0.0:
         raise ValueError(
-            f"a clearance of {clearance:g} m and a tilt of {np.degrees(tilt):g} degrees leave no room for the patches of"
-            f" bars and levels in a region of {2.0 * along:.3g} m by {2.0 * across:.3g} m"
+            f"a clearance of {clearance:g} m and a tilt of {np.degrees(tilt):g} degrees leave no room for the patches"
+            f" of bars and levels in a region of {2.0 * along:.3g} m by {2.0 * across:.3g} m"
         )
 
     def place(p: float, q: float) -> tuple[float, float]:
@@ -197,9 +202,7 @@ def _bars(frequency: float, bars: int, length: float, angle: float, centre: tupl
     quarter = 0.25 / frequency
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     upright = corners[:, :1] * quarter * normal + corners[:, 1:] * 0.5 * length * along
-    return [
-        Polygon(np.array(centre) + (i - 0.5 * (bars - 1)) / frequency * normal + upright) for i in range(int(bars))
-    ]
+    return [Polygon(np.array(centre) + (i - 0.5 * (bars - 1)) / frequency * normal + upright) for i in range(int(bars))]
 
 
 def _check_bars(frequency: float, bars: int) -> None:

@@ -25,11 +25,15 @@ from optics.pupil_function import PupilFunction
 from optics.threads import cores, one_blas_thread
 
 _AT_ONCE = 2**17
-"""Phases (shifts x defocus x nodes) worked on together: some arrays of 1 MB that stay in the cache."""
+"""Phases (shifts x defocus x nodes) or frequencies worked on together: some arrays of 1 MB that stay in the cache."""
+
+_NODES_AT_ONCE = 2**14
+"""Nodes (over several shifts) at which the polynomials are worked out together; for the same reason."""
 
 _PROBE_ANGLE = np.linspace(0.0, np.pi, 7)
 _PROBE = np.cos(_PROBE_ANGLE)
 """Where the overlap is probed for the phase in both parameters: Gauss' nodes lie evenly in this angle, too."""
+_PROBED = _NODES_AT_ONCE // len(_PROBE) ** 2
 
 
 def transfer(pupil: PupilFunction, frequency: np.ndarray, wavelength: float, defocus: np.ndarray) -> np.ndarray:
@@ -46,7 +50,7 @@ def transfer(pupil: PupilFunction, frequency: np.ndarray, wavelength: float, def
         image centred at x0 has the phase -2 pi f.x0.
 
     Raises:
-        ValueError: shapes other than these.
+        ValueError: shapes other than these, or numbers that are not finite.
     """
     return polychromatic_transfer(pupil, frequency, np.array([wavelength]), np.ones(1), defocus)
 
@@ -67,11 +71,14 @@ def polychromatic_transfer(
         Complex (Z, M).
 
     Raises:
-        ValueError: other shapes, weights that are negative or all zero, wavelengths that are not positive.
+        ValueError: other shapes, numbers that are not finite, weights that are negative or all zero, wavelengths that
+            are not positive.
     """
     frequency, defocus = np.asarray(frequency, float), np.asarray(defocus, float)
     if frequency.ndim != 2 or frequency.shape[1] != 2 or defocus.ndim != 1:
         raise ValueError(f"frequency (M, 2) and defocus (Z,) expected, got {frequency.shape} and {defocus.shape}")
+    if not np.all(np.isfinite(frequency)) or not np.all(np.isfinite(defocus)):
+        raise ValueError("frequency and defocus must be finite")
     wavelengths, share = _band(wavelengths, weights)
     shift = wavelengths[:, None] * pupil.normalised(frequency[:, 0], frequency[:, 1])
     every = np.repeat(wavelengths, len(frequency))
@@ -92,10 +99,12 @@ def _band(wavelengths: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.
 def nodes_for(span: float, least: int) -> int:
     """Gauss nodes for exp(i phase) with a phase that runs over +-``span`` radians, and with a smooth amplitude.
 
-    The rule for a linear phase is right to better than 1e-8 with span / 2 nodes and a few more, that grow like the
-    cube root of the span; ``least`` serves a constant phase.
+    Gauss' rule for a linear phase needs span / 2 nodes, and more that grow like the cube root of the span; with these
+    it is right to 1e-8 for spans up to 100. ``least`` serves a constant phase. At F/9 and 450 nm the transfer function
+    of a camera with 0.1 waves of aberration is then right to 3e-8 within 2 mm of its focus (7 waves at the edge), and
+    to 3e-7 at 5 mm.
     """
-    return least + int(np.ceil(0.5 * span + 1.5 * span ** (1 / 3)))
+    return least + int(np.ceil(0.5 * span + 2.0 * span ** (1 / 3)))
 
 
 LEAST_ALONG = 8
@@ -123,7 +132,7 @@ def _correlate(pupil: PupilFunction, shift: np.ndarray, wavelength: np.ndarray, 
 
     def piece(which: np.ndarray, across: int, along: int) -> None:
         s, k = shift[which], wave[which]
-        points, weight = pupil.overlap(s, right[:, which], left[:, which], _gauss(across), _gauss(along))
+        points, weight = pupil.edge.overlap(s, right[:, which], left[:, which], _gauss(across), _gauss(along))
         light, path, focus = _products(pupil, points, s)
         light *= weight
         phase = k[:, None, None] * (path[:, None] + defocus[:, None] * focus[:, None])
@@ -131,10 +140,12 @@ def _correlate(pupil: PupilFunction, shift: np.ndarray, wavelength: np.ndarray, 
         out[which] = scale * (real + 1j * imaginary)
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
-        right, left, inside = pupil.corners(shift)
+        right, left, inside = pupil.edge.corners(shift)
         used = np.flatnonzero(inside)
-        spans = _spans(pupil, shift[used], right[:, used], left[:, used], wave[used], defocus)
-        list(pool.map(lambda args: piece(*args), _pieces(used, *spans, len(defocus))))
+        few = [used[i : i + _PROBED] for i in range(0, len(used), _PROBED)]
+        parts = pool.map(lambda w: _spans(pupil, shift[w], right[:, w], left[:, w], wave[w], defocus), few)
+        spans = np.concatenate([np.zeros((2, 0)), *parts], axis=1)
+        list(pool.map(lambda args: piece(*args), _pieces(used, spans[0], spans[1], len(defocus))))
     return out
 
 
@@ -152,20 +163,20 @@ def _spans(
     left: np.ndarray,
     wave: np.ndarray,
     defocus: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """How fast the phase runs across and along the chords for the worst defocus, (S,) each, radians per radian of the
+) -> np.ndarray:
+    """How fast the phase runs across and along the chords for the worst defocus, (2, S), radians per radian of the
     angle in which Gauss' nodes lie evenly: half its range where it is linear.
     """
     probe = (_PROBE, np.ones_like(_PROBE))
-    points, _ = pupil.overlap(shift, right, left, probe, probe)
+    points, _ = pupil.edge.overlap(shift, right, left, probe, probe)
     _, path, focus = _products(pupil, points, shift)
-    across, along = np.zeros(len(shift)), np.zeros(len(shift))
+    out = np.zeros((2, len(shift)))
     for dz in (np.min(defocus), np.max(defocus)):
         phase = (wave[:, None] * (path + dz * focus)).reshape(-1, len(_PROBE), len(_PROBE))
-        for axis, span in ((1, across), (2, along)):
+        for axis, span in enumerate(out, 1):
             steps = np.max(np.abs(np.diff(phase, axis=axis)), axis=(1, 2))
             np.maximum(span, steps / _PROBE_ANGLE[1], out=span)
-    return across, along
+    return out
 
 
 def _pieces(
@@ -177,9 +188,10 @@ def _pieces(
     while start < len(order):
         # the first of a piece has the longest span along; across, the worst of what may be in it
         count = nodes_for(float(along[order[start]]), LEAST_ALONG)
-        most = order[start : start + max(1, _AT_ONCE // (layers * count * LEAST_ACROSS))]
+        room = min(_NODES_AT_ONCE, _AT_ONCE // layers) // count
+        most = order[start : start + max(1, room // LEAST_ACROSS)]
         rows = nodes_for(float(np.max(across[most])), LEAST_ACROSS)
-        some = most[: max(1, _AT_ONCE // (layers * count * rows))]
+        some = most[: max(1, room // rows)]
         yield used[some], rows, count
         start += len(some)
 
@@ -203,8 +215,8 @@ class TransferTable:
 
     The transfer function is worked out on a polar grid of shifts in the normalised pupil, for each wavelength: equal
     angles, and Chebyshev nodes in the arc cosine of shift / cut-off. In this angle it is smooth up to the cut-off,
-    where it ends like the power 3/2 of the distance. The phase of the image's centroid is kept apart. The band's mean is
-    then a cubic spline, fine enough for the cut-offs of the single wavelengths inside: right to 1e-5.
+    where it ends like the power 3/2 of the distance. The phase of the image's centroid is kept apart. The band's mean
+    is then a cubic spline, fine enough for the cut-offs of the single wavelengths inside: right to 1e-5.
 
     Attributes:
         centroid: (x, y) of the image from its origin, metres, (2,); its phase multiplies the spline.
@@ -232,16 +244,17 @@ class TransferTable:
         centroid = _centroid(pupil, float(np.mean(wavelengths)), defocus)
         rings, arms = 24, 16
         while True:
-            terms = _polar_terms(pupil, wavelengths, defocus, centroid, rings, arms)
-            size = np.max(np.abs(terms), axis=0)
-            radial = np.max(size[3 * rings // 4 :])
-            around = np.max(size[:, np.abs(np.fft.fftfreq(2 * arms)) > 3 / 8])
+            # the shortest wavelength has the largest phases
+            own = np.abs(_polar_terms(pupil, np.min(wavelengths, keepdims=True), defocus, centroid, rings, arms)[0])
+            radial = np.max(own[3 * rings // 4 :])
+            around = np.max(own[:, np.abs(np.fft.fftfreq(2 * arms)) > 3 / 8])
             if radial < TABLE_TAIL and around < TABLE_TAIL:
                 break
-            rings = rings if radial < TABLE_TAIL else 3 * rings // 2
-            arms = arms if around < TABLE_TAIL else 3 * arms // 2
+            rings = rings if radial < TABLE_TAIL else 4 * rings // 3
+            arms = arms if around < TABLE_TAIL else 4 * arms // 3
             if max(rings, arms) > _MOST_NODES:
                 raise ValueError("the wavefront has too many waves for a table of its transfer function")
+        terms = _polar_terms(pupil, wavelengths, defocus, centroid, rings, arms)
         cells, directions = _DENSE
         radius = np.arange(-_PAD, cells + _PAD) / cells
         around_dense = np.zeros((len(radius), directions), complex)
@@ -257,7 +270,7 @@ class TransferTable:
         padded = np.pad(dense, ((0, 0), (_PAD, _PAD)), mode="wrap")
         coefficients = spline_filter(padded.real) + 1j * spline_filter(padded.imag)
         direction = np.pi * np.arange(64) / 64
-        reach = np.fft.fft(pupil.reach(direction)[0])[:9] / 64
+        reach = np.fft.fft(pupil.edge.reach(direction)[0])[:9] / 64
         reach[1:] *= 2.0
         return cls(centroid, np.min(wavelengths) * np.linalg.inv(pupil.axes), reach, coefficients)
 
@@ -308,7 +321,7 @@ def _polar_terms(
     node = np.cos(np.pi * (np.arange(rings) + 0.5) / rings)
     direction = np.pi * np.arange(arms) / arms
     ratio = np.cos(0.25 * np.pi * (node + 1.0))
-    shift = ratio[:, None] * pupil.reach(direction)[0] * np.exp(1j * direction)
+    shift = ratio[:, None] * pupil.edge.reach(direction)[0] * np.exp(1j * direction)
     count = len(wavelengths)
     every = np.repeat(wavelengths, shift.size)
     values = _correlate(pupil, np.tile(shift.ravel(), count), every, np.array([defocus]))

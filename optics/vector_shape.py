@@ -1,8 +1,8 @@
 """Vector shapes in a plane, with the closed form of their Fourier transforms and their images under smooth maps.
 
-The spectrum of a shape S is S(fx, fy) = integral over S of exp(-2 pi i (fx x + fy y)) dx dy, frequencies in cycles/m. For
-a polygon, Gauss' theorem with k = 2 pi f, the edges' vectors d_j, middles m_j and outward normals n_j (of length |d_j|)
-gives (e.g. Lee and Mittra, IEEE Trans. Antennas Propag. 31, 99 (1983))
+The spectrum of a shape is S(fx, fy) = integral over it of exp(-2 pi i (fx x + fy y)) dx dy, frequencies in cycles/m.
+For a polygon, Gauss' theorem with k = 2 pi f, the edges' vectors d_j, middles m_j and outward normals n_j (of length
+|d_j|) gives (e.g. Lee and Mittra, IEEE Trans. Antennas Propag. 31, 99 (1983))
 
     S = i/|k|^2 sum_j (k . n_j) exp(-i k . m_j) sinc(k . d_j / 2),    sinc(s) = sin(s)/s.
 
@@ -68,13 +68,15 @@ class Polygon:
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Fourier transform of the polygon, m^2.
 
-        The sum over the edges loses eps * perimeter / (|k| area) of the area to rounding. Because the normals of a closed
-        outline sum to 0, 1 may be taken off every exp * sinc; where |k| times the polygon's radius is below 1 this is done
-        (with all differences in closed form), and the loss stays at eps * perimeter * radius / area down to f = 0.
+        The sum over the edges loses eps * perimeter / (|k| area) of the area to rounding. Because the normals of a
+        closed outline sum to 0, 1 may be taken off every exp * sinc; where |k| times the polygon's radius is below 1
+        this is done (with all differences in closed form), and the loss stays at eps * perimeter * radius / area down
+        to f = 0.
 
         Args:
-            fx, fy: frequencies, cycles/m, of at most two axes, that broadcast. A product grid, fx (C,) and fy (R, 1), is
-                fast: its complex exponentials are worked out per axis.
+            fx: frequencies along x, cycles/m, of at most two axes.
+            fy: the same along y; they broadcast. A product grid, fx (C,) and fy (R, 1), is fast: its complex
+                exponentials are worked out per axis.
 
         Returns:
             Complex, of the broadcast shape.
@@ -85,7 +87,7 @@ class Polygon:
         start = self.vertices - middle
         edges = _Edges.of(start, np.sign(self._signed_area))
         radius = float(np.max(np.hypot(start[:, 0], start[:, 1])))
-        out = np.empty(np.broadcast_shapes(kx.shape, ky.shape), complex)
+        out: np.ndarray = np.empty(np.broadcast_shapes(kx.shape, ky.shape), complex)
         rows = max(1, _BLOCK // out.shape[1])
         for begin in range(0, len(out), rows):
             here = slice(begin, begin + rows)

@@ -8,7 +8,7 @@ from scenes.collimator import CameraUnderTestSpec, CollimatorSpec
 from scenes.errors import Problem
 from scenes.instrument import Frames
 from scenes.quantity import PositiveLength, Quantity, Vector, Vector3
-from scenes.spec import Name, Number, Spec, Text, Whole
+from scenes.spec import Name, Number, Seed, Spec, Text, Whole
 from scenes.units import ANGLE, LENGTH, SCALE, format_quantity
 
 EdgeAngle = Annotated[float, Quantity(ANGLE, smallest="2 deg", largest="15 deg")]
@@ -98,6 +98,7 @@ class FocusTestSpec(CameraUnderTestSpec):
         mount: how it is mounted.
         level: standard deviation of the theodolite's reading of the line's level, radians.
         rounds: of shimming.
+        seed: of everything that is drawn.
     """
 
     name: Name
@@ -112,6 +113,7 @@ class FocusTestSpec(CameraUnderTestSpec):
     mount: MountSpec
     level: AngleSigma
     rounds: Annotated[Whole, Field(ge=1, le=10)] = 1
+    seed: Seed = 1
 
     @model_validator(mode="after")
     def _scan_has_steps(self) -> "FocusTestSpec":

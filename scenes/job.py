@@ -16,7 +16,7 @@ from scenes.course import CourseSpec, TemperatureChange, TemperatureGradient
 from scenes.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
 from scenes.instrument import Frames
 from scenes.quantity import Quantity, Vector
-from scenes.spec import Name, NothingIsEmpty, Paths, Reference, Spec, Whole
+from scenes.spec import Name, NothingIsEmpty, Paths, Reference, Seed, Spec, Whole
 from scenes.units import ANGLE, LENGTH, SCALE
 
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
@@ -137,7 +137,7 @@ class RenderSpec(Spec):
     images: Annotated[tuple[Literal["spots"], ...], AfterValidator(_some)] = ("spots",)
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     frames: Frames | None = None
-    seed: Annotated[Whole, Field(ge=0, le=2**63 - 1)] = 1
+    seed: Seed = 1
 
 
 class AnalysisSpec(Spec):

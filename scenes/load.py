@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from scenes.camera import CameraSpec
+from scenes.collimator import CameraUnderTestSpec
 from scenes.detector import DetectorSpec
+from scenes.distortion_test import DistortionTestSpec
+from scenes.dividing_error import TurntableTestSpec
 from scenes.error_budget import ErrorBudgetSpec
 from scenes.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.instrument import InstrumentSpec
@@ -104,6 +107,36 @@ def load_principle_experiment(
     reference = spec.autocollimator.area_ccd.detector
     detector = _find(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
     return PrincipleSetup(spec, load_detector(detector))
+
+
+def load_turntable_test(
+    name_or_path: str | Path = "turntable", relative_to: str | Path | None = None
+) -> TurntableTestSpec:
+    """Read a turntable test; arguments and errors as `load_instrument`."""
+    return _load(TurntableTestSpec, LAB, name_or_path, relative_to)
+
+
+def load_lab_test(model: type[SpecType], name_or_path: str | Path, relative_to: str | Path | None = None) -> SpecType:
+    """Read a laboratory test of that sort; arguments and errors as `load_instrument`."""
+    return _load(model, LAB, name_or_path, relative_to)
+
+
+def find_camera(test: CameraUnderTestSpec) -> Path:
+    """The file of the camera under test. Raises InputError if there is none."""
+    return _find(CAMERAS, test.camera, test, ("camera",))
+
+
+def find_turntable_test(test: DistortionTestSpec) -> Path:
+    """The file of the distortion test's turntable. Raises InputError if there is none."""
+    return _find(LAB, test.turntable, test, ("turntable",))
+
+
+def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
+    """Data sheets of a camera's line CCDs, by the name that the bands give. Raises InputError as `load_instrument`."""
+    return {
+        band.detector: load_detector(_find(DETECTORS, band.detector, camera, ("bands", name, "detector")))
+        for name, band in camera.bands.items()
+    }
 
 
 def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None) -> SpecType:

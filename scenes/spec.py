@@ -54,6 +54,8 @@ def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
     return FrozenMap(value)
 
 
+Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)]
+"""Of every random number."""
 Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
 """Name of a file in the library (`gf7`), or path of a file of one's own, relative to the file that names it."""
 

@@ -18,8 +18,11 @@ MAY_IMPORT = {
 NOT_IN_OPTICS = {"ruamel", "yaml", "pydantic", "pint", "typer", "rich", "mitsuba", "matplotlib"}
 # analysis must be usable on real images, without the twin's renderers.
 ONLY_IN_ANALYSIS = {"analysis", "numpy", "scipy", "cv2"} | sys.stdlib_module_names
-# Modules of analysis that are commands may use these as well; name each module here.
-ANALYSIS_COMMANDS: dict[str, set[str]] = {}
+# Modules of analysis that may use more: commands that draw, and fits that need a library. Name each module here.
+ANALYSIS_COMMANDS: dict[str, set[str]] = {
+    "angle_network": {"sklearn"},
+    "mtf": {"typer", "rich", "matplotlib", "tifffile"},
+}
 LONGEST_FILE = 500
 
 

@@ -23,7 +23,7 @@ def tiff(frames: np.ndarray) -> bytes:
 
 
 def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndarray:
-    """Eight-bit picture of the mean of frames (N, H, W), enlarged; ``stretch`` None leaves grey values in proportion."""
+    """Eight-bit picture of the mean of frames (N, H, W), enlarged; ``stretch`` None keeps grey values in proportion."""
     mean = frames.mean(axis=0)
     low, high = (np.percentile(mean, 5) if stretch else mean.min()), mean.max()
     level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)

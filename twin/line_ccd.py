@@ -15,6 +15,19 @@ if TYPE_CHECKING:
     from scenes.detector import DetectorSpec
 
 
+WIDEST_STEP = 100e-9
+"""Mean distance of the wavelengths of a band, metres: mean transfer functions are then right to 1e-4."""
+
+
+def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre wavelengths (K,), metres, and their weights, for light that is evenly spread over the band."""
+    first, last = band.spectrum
+    node, weight = np.polynomial.legendre.leggauss(
+        2 + int(np.ceil((last - first) / WIDEST_STEP)) if last > first else 1
+    )
+    return 0.5 * (first + last) + 0.5 * (last - first) * node, 0.5 * weight
+
+
 @dataclass(frozen=True)
 class LineCcd:
     """One band's line CCD. Images have columns along the line (+Y') and rows along the track (+X').

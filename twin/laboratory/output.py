@@ -42,6 +42,7 @@ def place(artefact: Artefact) -> str:
 
 def render_report(result: LabResult, facts: RunFacts) -> str:
     """``report.html`` as text."""
+    again = f"python -m twin.lab {result.kind} config.yaml --seed {facts.seed} --backend {facts.backend} --out again"
     return (
         environment(__package__)
         .get_template(TEMPLATE)
@@ -57,14 +58,14 @@ def render_report(result: LabResult, facts: RunFacts) -> str:
                 for section in result.sections
             ],
             facts=facts,
-            command=f"python -m twin.lab {result.kind} config.yaml --seed {facts.seed} --backend {facts.backend} --out again",
+            command=again,
             versions=versions(),
         )
     )
 
 
 def write_lab(result: LabResult, facts: RunFacts, folder: RunFolder) -> None:
-    """Write everything into an open run folder: config.yaml, KIND.json, report.html, artefacts, images, the manifest."""
+    """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest."""
     folder.write_text("config.yaml", facts.config)
     folder.write_json(f"{result.kind}.json", dict(result.data))
     for artefact in (result.summary, *(a for section in result.sections for a in section.artefacts)):

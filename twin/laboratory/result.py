@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,13 @@ import numpy as np
 from optics.frozen_map import FrozenMap
 from twin.artefact import Table
 from twin.laboratory.section import Section
+
+Advance = Callable[[str, int, int], None]
+"""Told what is being done, and how many of how many parts of it are."""
+
+
+def silent(part: str, done: int, total: int) -> None:
+    """An ``Advance`` that tells nobody."""
 
 
 @dataclass(frozen=True, eq=False)

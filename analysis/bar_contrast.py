@@ -1,0 +1,343 @@
+"""MTF at one frequency from a group of bars, from the amplitude of the fundamental.
+
+Bars of equal width and spacing between the levels `bright` and `dark` are a square wave, whose fundamental has the
+amplitude (2 / pi) (bright - dark). In the image it has that times the MTF:
+
+    MTF = pi A / (2 (bright - dark))
+
+A, the phase and the two-dimensional frequency are fitted to all pixels of the region by least squares, with the
+harmonics 3, 5 and 7 where their aliases can be told from the fundamental. Slightly tilted bars pass through all
+sampling phases, so that this holds at Nyquist as well, where the contrast of untilted bars depends on how they fall on
+the pixels.
+
+For comparison with practice: the contrast (max - min) / (max + min) and Coltman's correction pi / 4 (J. Opt. Soc. Am.
+44, 468 (1954), first term of his series), which is exact where the third harmonic is not passed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.edge_location import saturation_fault
+from analysis.noise import NoiseModel
+from analysis.rice import rice_bias, rice_sigma, signal_modulus
+
+__all__ = ["BarError", "BarMtf", "measure_bars"]
+
+Array = NDArray[np.float64]
+_HARMONICS = (3, 5, 7)
+_LEAST_SIDE = 12
+_LEAST_PATCH = 16
+# Two frequencies are apart if they differ by so many cycles over the region in some direction.
+_APART = 1.5
+# A fundamental this many sigmas long is there; by chance, over the 1e3 cells of a spectrum, once in some 300 regions.
+_LEAST_AMPLITUDE = 5.0
+# A quarter of the region may differ from the whole by so much of the amplitude.
+_UNEVEN = 0.15
+_STEPS = 8
+
+
+class BarError(ValueError):
+    """A region that does not show measurable bars; the message says what is wrong and what to change."""
+
+
+@dataclass(frozen=True, eq=False)
+class BarMtf:
+    """MTF of one group of bars.
+
+    frequency: (2,) cycles/pixel, (component down the column, component along the row); frequency_sigma: (2,). The
+        frequencies f and (0, 1) - f give the same pixels, so at Nyquist the direction of the tilt is not known.
+    mtf, sigma: at that frequency; noise_bias: how much noise lengthens mtf on the average, >= 0.
+    amplitude, phase: of the fundamental, grey values; rad at the region's middle, A cos(2 pi f . r + phase).
+    harmonics: number -> amplitude (grey values) of those that could be told apart.
+    dark, dark_sigma, bright, bright_sigma: grey values of the reference patches, offset included.
+    contrast: (max - min) / (max + min) of the region, offset taken off. Noise raises it.
+    contrast_transfer: contrast over that of the patches. coltman: pi / 4 of it.
+    """
+
+    frequency: Array
+    frequency_sigma: Array
+    mtf: float
+    sigma: float
+    noise_bias: float
+    amplitude: float
+    phase: float
+    harmonics: dict[int, float]
+    dark: float
+    dark_sigma: float
+    bright: float
+    bright_sigma: float
+    contrast: float
+    contrast_transfer: float
+    coltman: float
+
+    @property
+    def cycles_per_pixel(self) -> float:
+        """Length of the frequency vector."""
+        return float(np.hypot(*self.frequency))
+
+
+def measure_bars(
+    region: ArrayLike,
+    dark: ArrayLike,
+    bright: ArrayLike,
+    frequency: ArrayLike | None = None,
+    *,
+    noise: NoiseModel | None = None,
+    frames: int = 1,
+    saturation: float | None = None,
+    offset: float = 0.0,
+) -> BarMtf:
+    """MTF from the bars that fill a region.
+
+    region: (H, W) grey values, linear in light, inside the group. dark, bright: pixels, any shape, of even patches with
+        the levels of the bars and of the spaces, far from edges.
+    frequency: about what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row),
+        or one number, its length, or None for the strongest below Nyquist.
+    noise, frames: the detector's model and the number of averaged frames; without a model the variance is that of the
+        residuals and of the patches. saturation: as in `analysis.slanted_edge.measure_edge`. offset: grey value without
+        light, for the contrast only.
+
+    Raises:
+        BarError: no bars, saturated, too small, not filled, at Nyquist without tilt, or patches without contrast.
+    """
+    if saturation is None and noise is not None:
+        saturation = noise.saturation_dn
+    grey = _checked(region, saturation)
+    levels = [_level(name, patch, noise, frames, saturation) for name, patch in (("dark", dark), ("bright", bright))]
+    (low, low_sigma), (high, high_sigma) = levels
+    step, step_sigma = high - low, math.hypot(low_sigma, high_sigma)
+    if step <= 5.0 * step_sigma or step <= 0:
+        raise BarError(
+            f"the patches have no contrast: bright {high:g} +- {high_sigma:.2g}, dark {low:g} +- {low_sigma:.2g}; "
+            "choose even areas of the target's two levels, the brighter one as bright"
+        )
+    place = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in grey.shape), indexing="ij")).reshape(2, -1)
+    value = grey.ravel()
+    start = _start(grey, frequency)
+    _check_phases(start, grey.shape)
+    numbers = _separable(start, grey.shape)
+    fitted, parameters = _fit(place, value, start, numbers)
+    other = _other_alias(fitted, frequency)
+    if other is not None:
+        fitted, parameters = _fit(place, value, other, numbers)
+    design = _design(place, fitted, numbers, parameters)
+    model = design[:, :-2] @ parameters
+    inverse = np.linalg.inv(design.T @ design)
+    if noise is None:
+        variance = np.full(value.size, float(np.sum((value - model) ** 2)) / (value.size - design.shape[1]))
+    else:
+        variance = noise.temporal_variance_dn2(model, frames) + noise.fixed_variance_dn2(model)
+    covariance = inverse @ ((design.T * variance) @ design) @ inverse
+    c, s = parameters[1], parameters[2]
+    amplitude = math.hypot(c, s)
+    unit = np.array([c, s]) / max(amplitude, 1e-300)
+    square = covariance[1:3, 1:3]
+    across = np.array([-unit[1], unit[0]])
+    along_sigma, across_sigma = math.sqrt(unit @ square @ unit), math.sqrt(across @ square @ across)
+    if amplitude < _LEAST_AMPLITUDE * along_sigma:
+        raise BarError(
+            f"no bars in the region: the amplitude of {amplitude:.3g} at {np.hypot(*fitted):.3f} cycles/pixel is only "
+            f"{amplitude / along_sigma:.1f} times its sigma; move the region, state the frequency, or average frames"
+        )
+    _check_filled(place, grey.shape, value - model, fitted, amplitude, float(np.mean(variance)))
+    scale = math.pi / (2.0 * step)
+    signal = signal_modulus(amplitude, along_sigma, across_sigma)
+    mtf = scale * amplitude
+    sigma = math.hypot(scale * float(rice_sigma(signal, along_sigma, across_sigma)), mtf * step_sigma / step)
+    largest, least = float(grey.max()) - offset, float(grey.min()) - offset
+    contrast = (largest - least) / (largest + least) if largest + least > 0 else math.nan
+    transfer = contrast * (high + low - 2.0 * offset) / step
+    return BarMtf(
+        frequency=fitted,
+        frequency_sigma=np.sqrt(np.diag(covariance)[-2:]),
+        mtf=mtf,
+        sigma=sigma,
+        noise_bias=scale * float(rice_bias(signal, across_sigma)),
+        amplitude=amplitude,
+        phase=math.atan2(-s, c),
+        harmonics={h: math.hypot(*parameters[3 + 2 * k : 5 + 2 * k]) for k, h in enumerate(numbers)},
+        dark=low,
+        dark_sigma=low_sigma,
+        bright=high,
+        bright_sigma=high_sigma,
+        contrast=contrast,
+        contrast_transfer=transfer,
+        coltman=math.pi / 4.0 * transfer,
+    )
+
+
+def _checked(region: ArrayLike, saturation: float | None) -> Array:
+    array = np.asarray(region)
+    if array.ndim != 2 or array.dtype.kind not in "uif":
+        raise BarError(f"the region must be a plane of real grey values (H, W), found {array.dtype} {array.shape}")
+    if min(array.shape) < _LEAST_SIDE:
+        raise BarError(
+            f"the region of {array.shape[0]} x {array.shape[1]} px is too small: take at least {_LEAST_SIDE} x "
+            f"{_LEAST_SIDE} px inside the group"
+        )
+    grey = np.asarray(array, dtype=np.float64)
+    if not np.all(np.isfinite(grey)):
+        bad = int(np.count_nonzero(~np.isfinite(grey)))
+        raise BarError(f"{bad} pixels of the region are not finite (NaN or infinity): repair them or move the region")
+    fault = saturation_fault(grey, saturation)
+    if fault:
+        raise BarError(fault)
+    return grey
+
+
+def _level(
+    name: str, patch: ArrayLike, noise: NoiseModel | None, frames: int, saturation: float | None
+) -> tuple[float, float]:
+    """Mean of a patch and its sigma, grey values."""
+    pixels = np.asarray(patch, dtype=np.float64).ravel()
+    if pixels.size < _LEAST_PATCH or not np.all(np.isfinite(pixels)):
+        raise BarError(f"the {name} patch needs at least {_LEAST_PATCH} finite pixels, found {pixels.size}; enlarge it")
+    if saturation is not None and np.any(pixels >= saturation):
+        raise BarError(
+            f"the {name} patch reaches the saturation level of {saturation:g}: lower the exposure or the light"
+        )
+    mean = float(pixels.mean())
+    if noise is None:
+        variance = float(pixels.var(ddof=1))
+    else:
+        variance = float(noise.temporal_variance_dn2(mean, frames) + noise.fixed_variance_dn2(mean))
+    return mean, math.sqrt(variance / pixels.size)
+
+
+def _start(grey: Array, frequency: ArrayLike | None) -> Array:
+    """(2,) the strongest cell of the windowed spectrum near the wanted frequency, cycles/pixel, unwrapped to it."""
+    shape = np.array(grey.shape)
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in grey.shape))
+    flat = grey - np.average(grey, weights=window)
+    size = 4 * shape
+    power = np.abs(np.fft.fft2(flat * window, s=tuple(size)))
+    cells = np.stack(np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij"))
+    if frequency is None:
+        # not the window's main lobe about zero, half a plane
+        allowed = np.any(np.abs(cells) * shape[:, None, None] > 2.0, axis=0)
+        allowed &= (cells[1] > 0) | ((cells[1] == 0) & (cells[0] > 0)) | (cells[1] == -0.5) | (cells[0] == -0.5)
+        return _peak(power, cells, allowed)
+    wanted = np.asarray(frequency, dtype=np.float64)
+    if wanted.shape not in ((), (2,)) or not np.all(np.isfinite(wanted)) or not np.any(wanted):
+        raise BarError(
+            "the frequency must be one number or two (down the column, along the row), in cycles/pixel, not 0"
+        )
+    if wanted.shape == (2,):
+        near = cells + np.round(wanted[:, None, None] - cells)
+        allowed = np.all(np.abs(near - wanted[:, None, None]) * shape[:, None, None] <= 1.0, axis=0)
+        return _peak(power, near, allowed)
+    turns = np.arange(-math.ceil(abs(wanted)), math.ceil(abs(wanted)) + 1)
+    best, strongest = None, -1.0
+    for row_turn in turns:
+        for column_turn in turns:
+            shifted = cells + np.array([row_turn, column_turn])[:, None, None]
+            allowed = np.abs(np.hypot(*shifted) - abs(wanted)) * shape.min() <= 1.0
+            allowed &= (shifted[1] > 0) | ((shifted[1] == 0) & (shifted[0] > 0))
+            if allowed.any() and power[allowed].max() > strongest * (1.0 + 1e-9):
+                best, strongest = _peak(power, shifted, allowed), float(power[allowed].max())
+    if best is None:
+        raise BarError(f"no frequency of {float(wanted):g} cycles/pixel fits the region: state it in cycles/pixel")
+    return best
+
+
+def _other_alias(fitted: Array, frequency: ArrayLike | None) -> Array | None:
+    """The alias near Nyquist whose length is nearer the stated one, if there is one."""
+    if frequency is None or np.ndim(frequency) != 0:
+        return None
+    length = abs(float(np.asarray(frequency)))
+    turn = np.round(2.0 * fitted)
+    other = turn - fitted
+    return other if abs(np.hypot(*other) - length) < abs(np.hypot(*fitted) - length) - 1e-6 else None
+
+
+def _peak(power: Array, cells: Array, allowed: NDArray[np.bool]) -> Array:
+    if not allowed.any():
+        raise BarError("the region is too small for the stated frequency: take one of several periods of the bars")
+    index = int(np.argmax(np.where(allowed, power, -1.0)))
+    return cells.reshape(2, -1)[:, index].copy()
+
+
+def _apart(difference: Array, shape: tuple[int, ...]) -> bool:
+    wrapped = difference - np.round(difference)
+    return bool(np.any(np.abs(wrapped) * np.array(shape) >= _APART))
+
+
+def _check_phases(frequency: Array, shape: tuple[int, ...]) -> None:
+    if not _apart(frequency, shape):
+        raise BarError(
+            f"{np.hypot(*frequency):.3f} cycles/pixel is not a frequency of bars in {shape[0]} x {shape[1]} px: less "
+            "than two periods; take a larger region or state the frequency"
+        )
+    if not _apart(2.0 * frequency, shape):
+        raise BarError(
+            "the bars are at the Nyquist frequency and parallel to the pixels, so that their contrast depends on how "
+            "they fall on the pixels: tilt the target by 2 to 10 deg, or take a region that is longer along the bars"
+        )
+
+
+def _separable(frequency: Array, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Harmonics whose aliases lie apart from zero, from the fundamental and from each other."""
+    kept: list[int] = []
+    for h in _HARMONICS:
+        others = [1, *kept]
+        both = [(h - k) * frequency for k in others] + [(h + k) * frequency for k in others]
+        if all(_apart(each, shape) for each in (*both, h * frequency, 2 * h * frequency)):
+            kept.append(h)
+    return tuple(kept)
+
+
+def _waves(place: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
+    """Columns 1, then cosine and sine of the fundamental and of each harmonic, (N, 3 + 2 K)."""
+    phase = 2.0 * np.pi * (frequency @ place)
+    turned = np.outer((1, *numbers), phase)
+    return np.concatenate(
+        [np.ones((1, phase.size)), np.stack([np.cos(turned), np.sin(turned)], 1).reshape(-1, phase.size)]
+    ).T
+
+
+def _design(place: Array, frequency: Array, numbers: tuple[int, ...], parameters: Array) -> Array:
+    """The waves, then the derivatives by the two components of the frequency, (N, P)."""
+    waves = _waves(place, frequency, numbers)
+    slope: Array = np.zeros(waves.shape[0])
+    for k, h in enumerate((1, *numbers)):
+        cosine, sine = waves[:, 1 + 2 * k], waves[:, 2 + 2 * k]
+        slope = slope + 2.0 * np.pi * h * (parameters[2 + 2 * k] * cosine - parameters[1 + 2 * k] * sine)
+    return np.column_stack([waves, slope * place[0], slope * place[1]])
+
+
+def _fit(place: Array, value: Array, start: Array, numbers: tuple[int, ...]) -> tuple[Array, Array]:
+    """Least-squares frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps."""
+    frequency = start
+    parameters: Array = np.zeros(3 + 2 * len(numbers))
+    limit: Array = np.asarray(0.5 / np.ptp(place, axis=1))
+    for _ in range(_STEPS):
+        waves = _waves(place, frequency, numbers)
+        parameters = np.asarray(np.linalg.lstsq(waves, value, rcond=None)[0])
+        design = _design(place, frequency, numbers, parameters)
+        step = np.linalg.lstsq(design, value - waves @ parameters, rcond=None)[0][-2:]
+        frequency = np.asarray(frequency + np.clip(step, -limit, limit))
+        if np.all(np.abs(step) < 1e-7 * limit):
+            break
+    waves = _waves(place, frequency, numbers)
+    return frequency, np.asarray(np.linalg.lstsq(waves, value, rcond=None)[0])
+
+
+def _check_filled(
+    place: Array, shape: tuple[int, ...], residual: Array, frequency: Array, amplitude: float, variance: float
+) -> None:
+    wave = np.exp(-2j * np.pi * (frequency @ place))
+    quarter = (place[0] > 0) * 2 + (place[1] > 0)
+    for number in range(4):
+        part = quarter == number
+        rest = 2.0 * abs(np.mean(residual[part] * wave[part]))
+        if rest > max(_UNEVEN * amplitude, 6.0 * math.sqrt(2.0 * variance / np.count_nonzero(part))):
+            where = f"{('upper', 'lower')[number // 2]} {('left', 'right')[number % 2]}"
+            raise BarError(
+                f"the bars do not fill the region of {shape[0]} x {shape[1]} px evenly: their amplitude in its {where} "
+                f"quarter is off by {rest / amplitude:.0%}; choose a region inside one group"
+            )

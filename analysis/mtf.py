@@ -1,0 +1,393 @@
+"""``python -m analysis.mtf``: the modulation transfer function from a slanted edge or a group of bars in any image."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+import tifffile
+import typer
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from analysis.bar_contrast import BarError, BarMtf, measure_bars
+from analysis.edge_mtf import EdgeMtf
+from analysis.slanted_edge import EdgeError, measure_edge
+
+Array = NDArray[np.float64]
+BAD_INPUT = 2
+PLOT_KINDS = (".png", ".pdf", ".svg")
+_LENGTHS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "mm": 1.0}
+# Table rows, cycles/pixel.
+_ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+class _Wrong(Exception):
+    """What the user must change, in one sentence."""
+
+
+@app.command()
+def main(
+    image: Annotated[
+        Path, typer.Argument(help="TIFF or PNG, 8 or 16 bit (or floating-point TIFF).", show_default=False)
+    ],
+    roi: Annotated[
+        str, typer.Option(help="Region ROW,COLUMN,HEIGHT,WIDTH in pixels; the first pixel is 0,0.", show_default=False)
+    ],
+    pixel_size: Annotated[str, typer.Option(help='Pixel pitch with its unit: "7 um", "0.007 mm".', show_default=False)],
+    bars: Annotated[
+        str | None,
+        typer.Option(
+            help='Measure bars of this frequency: "71.4 cycles/mm" or "0.5 cycles/pixel". Needs --dark, --bright.'
+        ),
+    ] = None,
+    dark: Annotated[str | None, typer.Option(help="With --bars: an even patch of the dark level, as --roi.")] = None,
+    bright: Annotated[
+        str | None, typer.Option(help="With --bars: an even patch of the bright level, as --roi.")
+    ] = None,
+    saturation: Annotated[
+        float | None,
+        typer.Option(help="Grey value of saturation. Default: the file type's largest, and plateaus of equal values."),
+    ] = None,
+    offset: Annotated[float, typer.Option(help="Grey value without light; taken off levels and contrast.")] = 0.0,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Average this many pages of a multi-page TIFF. Default: all.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(readable=False, help="Write a plot: .png, .pdf or .svg.")] = None,
+    csv_file: Annotated[Path | None, typer.Option("--csv", readable=False, help="Write the curve as CSV.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else.")] = False,
+) -> None:
+    """Measure the MTF of a camera from an image of a slanted edge (ISO 12233) or of bars.
+
+    **Edge.** Choose a region with one straight edge between a dark and a bright even area, turned by 2 to 10 deg
+    against the rows or columns: 64 x 64 pixels or more, at least 32 across the edge, the edge in its middle. Whether it
+    is near-vertical or near-horizontal is found; frequencies are counted along the edge's normal. sigma comes from the
+    noise in the region, bias is how much noise lengthens the MTF (not taken off).
+
+    **Bars.** Choose a region inside a group of equal bars and spaces, slightly tilted, and two even patches with the
+    bars' dark and bright levels. The amplitude of the fundamental gives the MTF at that one frequency.
+
+    Grey values must be linear in light: raw frames, not pictures from a camera with a tone curve. Colour becomes the
+    luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B). Pages of a TIFF are averaged.
+
+    Example: python -m analysis.mtf edge.tiff --roi 100,200,64,64 --pixel-size "7 um" --plot mtf.png
+
+    Exit codes: 0 measured; 2 bad input, with a sentence that says what to change. After 2 no file is written.
+    """
+    errors = Console(stderr=True)
+    try:
+        pitch = _pixel_size(pixel_size)
+        frequency = _frequency(bars, pitch) if bars is not None else None
+        for path, kinds in ((plot, PLOT_KINDS), (csv_file, (".csv",))):
+            _check_target(path, kinds, image)
+        grey, full_scale = _read(image, frames, saturation)
+        region = _cut(grey, roi, "--roi")
+        if saturation is None and np.any(region >= full_scale):
+            saturation = full_scale
+        if frequency is not None:
+            if dark is None or bright is None:
+                raise _Wrong("--bars needs --dark and --bright: even patches with the levels of bars and spaces")
+            if plot is not None or csv_file is not None:
+                raise _Wrong("--plot and --csv are for an edge's curve; bars give one number (--json prints it)")
+            patches = _cut(grey, dark, "--dark"), _cut(grey, bright, "--bright")
+            _print_bars(
+                measure_bars(region, *patches, frequency, saturation=saturation, offset=offset), pitch, offset, as_json
+            )
+            return
+        if dark is not None or bright is not None:
+            raise _Wrong("--dark and --bright belong to --bars; an edge carries its own levels")
+        edge = measure_edge(region, saturation=saturation)
+        _write(plot, lambda path: _draw(edge, pitch, path))
+        _write(csv_file, lambda path: _write_csv(edge, pitch, path))
+    except (EdgeError, BarError, _Wrong) as error:
+        errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        raise typer.Exit(BAD_INPUT) from None
+    if as_json:
+        _print_json(_edge_json(edge, pitch, offset))
+    else:
+        _print_edge(edge, pitch, offset, [path for path in (plot, csv_file) if path is not None])
+
+
+def _pixel_size(text: str) -> float:
+    """Pixel pitch in millimetres."""
+    match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(\S*)\s*", text)
+    try:
+        value = float(match[1]) if match else math.nan
+    except ValueError:
+        value = math.nan
+    unit = match[2] if match else ""
+    if unit not in _LENGTHS or not math.isfinite(value):
+        raise _Wrong(f'--pixel-size {text!r} is not a length with its unit: write it as "7 um" or "0.007 mm"')
+    if not 0 < value * _LENGTHS[unit] < 10:
+        raise _Wrong(f"--pixel-size {text!r} must be above 0 and below 10 mm")
+    return value * _LENGTHS[unit]
+
+
+def _frequency(text: str, pitch: float) -> float:
+    """Cycles per pixel; pitch in millimetres."""
+    match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(cycles/mm|cycles/pixel|lp/mm)\s*", text)
+    try:
+        value = float(match[1]) if match else math.nan
+    except ValueError:
+        value = math.nan
+    if match is None or not 0 < value < math.inf:
+        raise _Wrong(f'--bars {text!r} is not a frequency with its unit: write "71.4 cycles/mm" or "0.5 cycles/pixel"')
+    return value if match[2] == "cycles/pixel" else value * pitch
+
+
+def _check_target(path: Path | None, kinds: tuple[str, ...], image: Path) -> None:
+    if path is None:
+        return
+    if path.suffix.lower() not in kinds:
+        raise _Wrong(f"{path} must end in {' or '.join(kinds)}")
+    if not path.absolute().parent.is_dir():
+        raise _Wrong(f"the folder of {path} does not exist: make it first")
+    if path.is_dir() or (path.exists() and image.exists() and path.samefile(image)):
+        raise _Wrong(f"{path} cannot be written: it is a folder or the image itself")
+
+
+def _read(path: Path, frames: int | None, saturation: float | None) -> tuple[Array, float]:
+    """Mean grey values (H, W), and the largest value that the file's integers can hold, else infinity.
+
+    A pixel that is saturated in one page counts as saturated: its mean is put at that level.
+    """
+    if not path.is_file():
+        raise _Wrong(f"there is no image {path}")
+    try:
+        pages = _tiff_pages(path) if path.suffix.lower() in (".tif", ".tiff") else _picture(path)
+    except _Wrong:
+        raise
+    except Exception as error:
+        raise _Wrong(f"{path} cannot be read as an image ({error})") from error
+    if pages.dtype.kind not in "uif":
+        raise _Wrong(f"{path} holds {pages.dtype} values; grey values must be integers or real numbers")
+    if frames is not None and frames > len(pages):
+        raise _Wrong(f"--frames {frames} is more than the {len(pages)} pages of {path}")
+    full_scale = float(np.iinfo(pages.dtype).max) if pages.dtype.kind == "u" else math.inf
+    limit = full_scale if saturation is None else saturation
+    used = pages[:frames]
+    mean = used.mean(axis=0, dtype=np.float64)
+    return np.where(used.max(axis=0) >= limit, np.maximum(mean, limit), mean), full_scale
+
+
+def _tiff_pages(path: Path) -> NDArray[Any]:
+    """(pages, H, W)."""
+    with tifffile.TiffFile(path) as file:
+        first = file.series[0]
+        data = np.asarray(first.asarray())
+        axes = first.axes
+    if "S" in axes:
+        data = _luminance(np.moveaxis(data, axes.index("S"), -1))
+        axes = axes.replace("S", "")
+    if not axes.endswith("YX"):
+        raise _Wrong(f"{path} has axes {axes}; pages of rows and columns are needed")
+    return data.reshape(-1, *data.shape[-2:])
+
+
+def _picture(path: Path) -> NDArray[Any]:
+    data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if data is None:
+        raise _Wrong(f"{path} cannot be read as an image: give a TIFF or PNG")
+    if data.ndim == 3:
+        data = _luminance(data[..., 2::-1])
+    return np.asarray(data)[None]
+
+
+def _luminance(colour: NDArray[Any]) -> NDArray[Any]:
+    """Grey from (..., RGB and perhaps alpha), in the same type so that full scale keeps its meaning."""
+    if colour.shape[-1] < 3:
+        return colour[..., 0]
+    grey = colour[..., :3] @ np.array([0.2126, 0.7152, 0.0722])
+    # one saturated channel spoils the sum
+    if colour.dtype.kind == "u":
+        full = np.iinfo(colour.dtype).max
+        return np.where((colour[..., :3] == full).any(axis=-1), full, np.round(grey)).astype(colour.dtype)
+    return np.asarray(grey)
+
+
+def _cut(grey: Array, text: str, option: str) -> Array:
+    match = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*", text)
+    if match is None:
+        raise _Wrong(f"{option} {text!r} must be four whole numbers ROW,COLUMN,HEIGHT,WIDTH")
+    row, column, height, width = (int(number) for number in match.groups())
+    if height == 0 or width == 0 or row + height > grey.shape[0] or column + width > grey.shape[1]:
+        raise _Wrong(f"{option} {text} does not lie in the image of {grey.shape[0]} rows and {grey.shape[1]} columns")
+    return grey[row : row + height, column : column + width]
+
+
+def _write(target: Path | None, make: Callable[[Path], None]) -> None:
+    """Make a file under a temporary name beside the target and rename it, so that no half-written one is left."""
+    if target is None:
+        return
+    try:
+        handle, name = tempfile.mkstemp(suffix=target.suffix, prefix=".", dir=target.absolute().parent)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            make(temporary)
+            # mkstemp makes files that only their owner can read
+            mask = os.umask(0)
+            os.umask(mask)
+            temporary.chmod(0o666 & ~mask)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise _Wrong(f"{target} cannot be written ({error.strerror})") from error
+
+
+def _write_csv(edge: EdgeMtf, pitch: float, path: Path) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frequency_cycles_per_mm", "frequency_cycles_per_pixel", "mtf", "sigma", "noise_bias"])
+        for f, m, s, b in zip(edge.frequency, edge.mtf, edge.sigma, edge.noise_bias, strict=True):
+            writer.writerow([f"{number:.9g}" for number in (f / pitch, f, m, s, b)])
+
+
+def _draw(edge: EdgeMtf, pitch: float, path: Path) -> None:
+    # a figure without pyplot has no window and no global state
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    spread, line, curve = figure.subplots(1, 3)
+    reach = min(edge.core * 1.5, float(edge.place[-1]))
+    near = np.abs(edge.pixel_place) <= reach
+    spread.plot(edge.pixel_place[near], edge.pixel_grey[near], ".", ms=2, color="0.6", label="pixels")
+    shown = np.abs(edge.place) <= reach
+    spread.plot(edge.place[shown], edge.esf[shown], color="C0", label="least-squares curve")
+    spread.set(title="edge-spread function", xlabel="along the normal / px", ylabel="grey value")
+    spread.legend()
+    line.plot(edge.place[shown], edge.lsf[shown], color="C0")
+    line.axhline(0.0, color="0.7", lw=0.8, zorder=0)
+    line.set(title="line-spread function", xlabel="along the normal / px", ylabel="1/px")
+    curve.fill_between(
+        edge.frequency / pitch,
+        edge.mtf - edge.sigma,
+        edge.mtf + edge.sigma,
+        color="C0",
+        alpha=0.3,
+        lw=0,
+        label="±1 sigma",
+    )
+    curve.plot(edge.frequency / pitch, edge.mtf, color="C0", label="MTF")
+    curve.plot(edge.frequency / pitch, edge.noise_bias, color="C3", lw=1, label="noise bias in it")
+    curve.axvline(0.5 / pitch, color="0.5", ls="--", lw=1)
+    curve.annotate("Nyquist", (0.5 / pitch, 1.0), xytext=(4, 0), textcoords="offset points", color="0.4")
+    curve.set(title="MTF along the normal", xlabel="cycles/mm", xlim=(0, edge.frequency[-1] / pitch), ylim=(0, 1.05))
+    curve.legend()
+    figure.savefig(path, format=path.suffix[1:].lower())
+
+
+def _edge_json(edge: EdgeMtf, pitch: float, offset: float) -> dict[str, Any]:
+    nyquist, nyquist_sigma = edge.at(0.5)
+    half, half_sigma = edge.frequency_at(0.5)
+    return {
+        "axis": edge.axis,
+        "angle_deg": math.degrees(edge.angle),
+        "angle_sigma_deg": math.degrees(edge.angle_sigma),
+        "position_px": edge.position,
+        "position_sigma_px": edge.position_sigma,
+        "curvature_per_px": edge.curvature,
+        "curvature_sigma_per_px": edge.curvature_sigma,
+        "dark_dn": edge.dark - offset,
+        "bright_dn": edge.bright - offset,
+        "noise_dark_dn": edge.noise_dark,
+        "noise_bright_dn": edge.noise_bright,
+        "mtf_nyquist": nyquist,
+        "mtf_nyquist_sigma": nyquist_sigma,
+        "mtf_nyquist_noise_bias": float(np.interp(0.5, edge.frequency, edge.noise_bias)),
+        "mtf50_cycles_per_mm": _or_none(half / pitch),
+        "mtf50_sigma_cycles_per_mm": _or_none(half_sigma / pitch),
+        "frequency_cycles_per_mm": (edge.frequency / pitch).tolist(),
+        "frequency_cycles_per_pixel": edge.frequency.tolist(),
+        "mtf": edge.mtf.tolist(),
+        "sigma": edge.sigma.tolist(),
+        "noise_bias": edge.noise_bias.tolist(),
+    }
+
+
+def _or_none(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _print_json(data: dict[str, Any]) -> None:
+    json.dump(data, sys.stdout, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def _print_edge(edge: EdgeMtf, pitch: float, offset: float, written: list[Path]) -> None:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("cycles/mm", "cycles/pixel", "MTF", "sigma", "noise bias"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for f in _ROWS:
+        value, sigma = edge.at(f)
+        bias = float(np.interp(f, edge.frequency, edge.noise_bias))
+        table.add_row(f"{f / pitch:.1f}", f"{f:.2f}", f"{value:.4f}", f"{sigma:.4f}", f"{bias:.4f}")
+    console = Console()
+    console.print(table)
+    value, sigma = edge.at(0.5)
+    half, half_sigma = edge.frequency_at(0.5)
+    kind = "near-vertical edge, MTF along rows" if edge.axis == "x" else "near-horizontal edge, MTF along columns"
+    lines = [
+        f"MTF at Nyquist ({0.5 / pitch:.1f} cycles/mm): {value:.4f} ± {sigma:.4f}",
+        "MTF50: not reached"
+        if math.isnan(half)
+        else f"MTF50: {half / pitch:.2f} ± {half_sigma / pitch:.2f} cycles/mm ({half:.4f} cycles/pixel)",
+        f"edge: {math.degrees(edge.angle):+.3f} ± {math.degrees(edge.angle_sigma):.3f} deg, {kind}",
+        f"levels: {edge.dark - offset:.1f} and {edge.bright - offset:.1f}, noise {edge.noise_dark:.2f} and "
+        f"{edge.noise_bright:.2f} per pixel",
+        *(f"written: {path}" for path in written),
+    ]
+    for text in lines:
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _print_bars(bars: BarMtf, pitch: float, offset: float, as_json: bool) -> None:
+    if as_json:
+        _print_json(
+            {
+                "frequency_cycles_per_mm": bars.cycles_per_pixel / pitch,
+                "frequency_cycles_per_pixel": bars.cycles_per_pixel,
+                "frequency_down_column_cycles_per_pixel": float(bars.frequency[0]),
+                "frequency_along_row_cycles_per_pixel": float(bars.frequency[1]),
+                "mtf": bars.mtf,
+                "sigma": bars.sigma,
+                "noise_bias": bars.noise_bias,
+                "dark_dn": bars.dark - offset,
+                "bright_dn": bars.bright - offset,
+                "contrast": _or_none(bars.contrast),
+                "contrast_transfer": _or_none(bars.contrast_transfer),
+                "coltman_mtf": _or_none(bars.coltman),
+            }
+        )
+        return
+    console = Console()
+    for text in (
+        f"bars: {bars.cycles_per_pixel / pitch:.2f} cycles/mm ({bars.cycles_per_pixel:.4f} cycles/pixel)",
+        f"MTF: {bars.mtf:.4f} ± {bars.sigma:.4f}, noise bias {bars.noise_bias:.4f}",
+        f"levels: {bars.dark - offset:.1f} ± {bars.dark_sigma:.1f} and "
+        f"{bars.bright - offset:.1f} ± {bars.bright_sigma:.1f}",
+        f"contrast (max - min) / (max + min): {bars.contrast:.4f}, over that of the levels "
+        f"{bars.contrast_transfer:.4f}, by Coltman's pi/4 {bars.coltman:.4f}",
+    ):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    app()

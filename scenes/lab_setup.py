@@ -1,0 +1,120 @@
+"""A laboratory test together with everything it refers to, so that one file says all that went into a run."""
+
+from pathlib import Path
+
+from optics.frozen_map import FrozenMap
+from scenes.camera import CameraSpec
+from scenes.detector import DetectorSpec
+from scenes.distortion_test import DistortionTestSpec
+from scenes.dividing_error import TurntableTestSpec
+from scenes.errors import names_text, nearest
+from scenes.focus_test import FocusTestSpec
+from scenes.load import (
+    find_camera,
+    find_turntable_test,
+    load_band_detectors,
+    load_camera,
+    load_lab_test,
+    load_turntable_test,
+)
+from scenes.spec import Paths, Source, Spec
+from scenes.translate import validate
+from scenes.yaml_file import dump_yaml, read_yaml
+
+
+class FocusSetup(Spec):
+    """A focal-plane alignment with its camera and detectors.
+
+    Attributes:
+        test: what the file says.
+        camera: prescription and bands.
+        detectors: as the bands name them -> data sheet.
+    """
+
+    test: FocusTestSpec
+    camera: CameraSpec
+    detectors: Paths[DetectorSpec]
+
+    def to_yaml(self) -> str:
+        """Text that ``resolve_focus`` reads back to the same values."""
+        return dump_yaml(self.plain())
+
+
+class DistortionSetup(Spec):
+    """A distortion test with its camera, detectors and turntable.
+
+    Attributes:
+        test: what the file says.
+        turntable: its dividing error and calibration.
+        camera: prescription and bands.
+        detectors: as the bands name them -> data sheet.
+    """
+
+    test: DistortionTestSpec
+    turntable: TurntableTestSpec
+    camera: CameraSpec
+    detectors: Paths[DetectorSpec]
+
+    def to_yaml(self) -> str:
+        """Text that ``resolve_distortion`` reads back to the same values."""
+        return dump_yaml(self.plain())
+
+
+def resolve_focus(path: str | Path) -> FocusSetup:
+    """Read a focal-plane alignment and all it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid.
+    """
+    if _is_resolved(path):
+        setup = validate(FocusSetup, read_yaml(path))
+        return setup.model_copy(update={"test": _told(setup, setup.test)})
+    test = load_lab_test(FocusTestSpec, path)
+    camera = load_camera(find_camera(test))
+    _require_bands(test, camera)
+    return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load_band_detectors(camera)))
+
+
+def resolve_distortion(path: str | Path) -> DistortionSetup:
+    """Read a distortion test and all it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid.
+    """
+    if _is_resolved(path):
+        setup = validate(DistortionSetup, read_yaml(path))
+        test = _told(setup, setup.test)
+        _require_bands(test, setup.camera, setup.test.band)
+        return setup.model_copy(update={"test": test})
+    test = load_lab_test(DistortionTestSpec, path)
+    camera = load_camera(find_camera(test))
+    _require_bands(test, camera, test.band)
+    turntable = load_turntable_test(find_turntable_test(test))
+    return DistortionSetup.model_construct(
+        test=test, turntable=turntable, camera=camera, detectors=FrozenMap(load_band_detectors(camera))
+    )
+
+
+def _is_resolved(path: str | Path) -> bool:
+    data = read_yaml(path).data if _is_file(path) else None
+    return isinstance(data, dict) and "test" in data
+
+
+def _is_file(path: str | Path) -> bool:
+    return isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))
+
+
+def _told(setup: Spec, test: Spec) -> Spec:
+    """The test, knowing where it was read."""
+    return test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
+
+
+def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> None:
+    if not camera.bands:
+        raise test.error(
+            f"the camera {camera.name} has no line CCDs", ("camera",), allowed="a camera with `bands:` in its file"
+        )
+    if band is not None and band not in camera.bands:
+        names = tuple(camera.bands)
+        meant = nearest(band, names)
+        raise test.error("no such band", ("band",), found=band, allowed=names_text(names), suggestion=meant)

@@ -1,0 +1,230 @@
+"""Fits of a curve over angles: what each must reproduce, SciPy's smoothing spline, that no fit sees what it is judged
+by, propagated noise, and errors.
+
+Chi-square tests have a false-alarm rate of 1e-4 each, two-sided; seeds are fixed, so that they pass or fail for good.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.interpolate import make_smoothing_spline
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from analysis import angle_network
+from analysis.angle_fits import FITS, GAP_ORDER, angles_left, cross_validate, fewest, fit
+from analysis.angle_network import NotConvergedError
+from analysis.dividing_error import CalibrationSeries, choose
+
+LINEAR = tuple(name for name in FITS if name != "network")
+FALSE_ALARM = 1e-4
+ANGLE = np.radians(np.linspace(92.0, 112.0, 41))
+BETWEEN = np.radians(np.random.default_rng(7).uniform(92.0, 112.0, 60))
+
+
+def wave(angle: np.ndarray, period_deg: float = 8.0) -> np.ndarray:
+    """A wave on a ramp: its ends do not meet."""
+    return np.asarray(np.sin(2.0 * np.pi * np.degrees(angle) / period_deg) + 0.1 * (np.degrees(angle) - 92.0))
+
+
+def noisy(sigma: float, seed: int, angle: np.ndarray = ANGLE) -> np.ndarray:
+    return wave(angle) + sigma * np.random.default_rng(seed).standard_normal(len(angle))
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_linear_fits_are_their_weights(name: str) -> None:
+    value = noisy(0.1, 1)
+    made = fit(name, ANGLE, value, 0.1)
+    np.testing.assert_allclose(made.weights(BETWEEN) @ value, made(BETWEEN), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_a_constant_is_kept(name: str) -> None:
+    """Weights add up to one: a shift of all values shifts the curve and changes nothing else."""
+    made = fit(name, ANGLE, noisy(0.1, 2), 0.1)
+    np.testing.assert_allclose(made.weights(BETWEEN).sum(axis=1), 1.0, rtol=0.0, atol=1e-8)
+
+
+def test_a_polynomial_is_found() -> None:
+    x = np.degrees(ANGLE) - 102.0
+    made = fit("polynomial", ANGLE, x**3 - 20.0 * x, 1.0)
+    at = np.degrees(BETWEEN) - 102.0
+    np.testing.assert_allclose(made(BETWEEN), at**3 - 20.0 * at, rtol=0.0, atol=1e-9 * 1000.0)
+    # with noise the order stays near the true one: leave-one-out does not run away to the highest
+    noise = 10.0 * np.random.default_rng(3).standard_normal(41)
+    assert 3 <= fit("polynomial", ANGLE, x**3 - 20.0 * x + noise, 10.0).settings["order"] <= 8
+
+
+def test_smoothing_spline_is_scipys() -> None:
+    """The same minimum with the smoothing that was selected, from SciPy's B-spline solver; unequal weights."""
+    sigma = np.where(np.arange(41) % 5 == 0, 0.6, 0.3)
+    value = wave(ANGLE) + sigma * np.random.default_rng(4).standard_normal(41)
+    made = fit("cubic_spline", ANGLE, value, sigma)
+    assert made.settings["smoothing"] > 0.0
+    step = ANGLE[1] - ANGLE[0]
+    weight = sigma**-2 / np.mean(sigma**-2)
+    peer = make_smoothing_spline(ANGLE / step, value, weight, lam=made.settings["smoothing"])
+    np.testing.assert_allclose(made(BETWEEN), peer(BETWEEN / step), rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["piecewise_linear", "cubic_spline"])
+def test_error_between_points_falls_with_the_step(name: str) -> None:
+    """h^2 and h^4, which the compensation relies on. In the middle of the range, away from the natural ends."""
+    inside = BETWEEN[(BETWEEN > np.radians(97.0)) & (BETWEEN < np.radians(107.0))]
+    rms = []
+    for count in (41, 81):
+        angle = np.linspace(ANGLE[0], ANGLE[-1], count)
+        left = fit(name, angle, wave(angle), 1e-9)(inside) - wave(inside)
+        rms.append(float(np.sqrt(np.mean(left**2))))
+    # next order of the step, and where the 60 angles fall in their steps: 20%
+    assert rms[0] / rms[1] == pytest.approx(2.0 ** GAP_ORDER[name], rel=0.2)
+
+
+def test_fourier_series_needs_no_closed_curve() -> None:
+    """The ends of the ramp differ by 2: a series of the range's own period would miss by about half of it there."""
+    made = fit("fourier", ANGLE, wave(ANGLE), 1e-3)
+    assert made.settings["period_deg"] > 20.0
+    assert np.max(np.abs(made(BETWEEN) - wave(BETWEEN))) < 0.02
+
+
+def test_network_follows_the_wave() -> None:
+    made = fit("network", ANGLE, noisy(0.02, 5), 0.02, seed=1)
+    assert made.settings["converged"] >= 1
+    # noise of 25 parameters on 41 points gives 0.016; the rest is left to the decay
+    assert np.sqrt(np.mean((made(BETWEEN) - wave(BETWEEN)) ** 2)) < 0.04
+    again = fit("network", ANGLE, noisy(0.02, 5), 0.02, seed=1)
+    assert np.array_equal(made(BETWEEN), again(BETWEEN))
+
+
+def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Central differences of weights found by BFGS from a loss that is written down here; more decay than in use, so
+    that the minimum is sharp enough for differences.
+    """
+    monkeypatch.setattr(angle_network, "DECAY", 0.1)
+    rng = np.random.default_rng(11)
+    n, h = 15, 4
+    x, y, weight = np.linspace(-5.0, 5.0, n), rng.standard_normal(n), rng.uniform(0.5, 2.0, n)
+
+    def output(theta: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return np.asarray(np.tanh(np.outer(at, theta[:h]) + theta[h : 2 * h]) @ theta[2 * h : 3 * h] + theta[-1])
+
+    def trained(value: np.ndarray, start: np.ndarray) -> np.ndarray:
+        def loss(theta: np.ndarray) -> float:
+            decay = np.sum(theta[:h] ** 2) + np.sum(theta[2 * h : 3 * h] ** 2)
+            return float(0.5 * np.sum(weight * (output(theta, x) - value) ** 2) + 0.5 * angle_network.DECAY * decay)
+
+        def slope(theta: np.ndarray) -> np.ndarray:
+            """By complex step, exact to rounding."""
+            steps = theta + 1e-30j * np.eye(len(theta))
+            out = []
+            for z in steps:
+                decay = np.sum(z[:h] ** 2) + np.sum(z[2 * h : 3 * h] ** 2)
+                total = 0.5 * np.sum(weight * (output_complex(z) - value) ** 2) + 0.5 * angle_network.DECAY * decay
+                out.append(total.imag / 1e-30)
+            return np.array(out)
+
+        return np.asarray(minimize(loss, start, jac=slope, method="BFGS", options={"gtol": 1e-10}).x)
+
+    def output_complex(z: np.ndarray) -> np.ndarray:
+        return np.asarray(np.tanh(np.outer(x, z[:h]) + z[h : 2 * h]) @ z[2 * h : 3 * h] + z[-1])
+
+    theta = trained(y, rng.standard_normal(3 * h + 1))
+    net = SimpleNamespace(
+        coefs_=[theta[None, :h], theta[2 * h : 3 * h, None]], intercepts_=[theta[h : 2 * h], theta[-1:]]
+    )
+    at = np.linspace(-5.0, 5.0, 23)
+    told = angle_network.gradient(net, at) @ angle_network.response(net, x, y, weight)
+    step = 1e-4
+    for i in (2, 7, 12):
+        change = np.where(np.arange(n) == i, step, 0.0)
+        found = output(trained(y + change, theta), at) - output(trained(y - change, theta), at)
+        # the minimiser stops some 1e-9 short, over the step and the least curvature
+        np.testing.assert_allclose(found / (2.0 * step), told[:, i], rtol=0.0, atol=1e-3)
+    assert np.max(np.abs(told)) > 0.5
+
+
+@pytest.mark.slow
+def test_network_noise_is_propagated() -> None:
+    """Scatter of networks trained on fresh noise and from fresh starts against the propagated sigma: within 15%.
+
+    24 trainings, some 25 effective parameters: the scatter itself is known to 1 / sqrt(2 * 24 * 25) = 3%.
+    """
+    sigma = 0.03
+    made = [fit("network", ANGLE, noisy(sigma, seed), sigma, seed) for seed in range(24)]
+    scatter = np.sqrt(np.mean(np.var([one(BETWEEN) for one in made], axis=0, ddof=1)))
+    told = np.sqrt(np.mean([np.diag(one.covariance(BETWEEN)) for one in made]))
+    assert told == pytest.approx(scatter, rel=0.15)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_cross_validation_does_not_see_what_it_predicts(name: str) -> None:
+    """A left-out value that changes by one changes its residual by exactly one, whatever a fit selects."""
+    value = noisy(0.1, 8)
+    plain = cross_validate(name, ANGLE, value, 0.1)
+    for i in (1, 17, 39):
+        changed = cross_validate(name, ANGLE, value + (np.arange(41) == i), 0.1)
+        assert changed.residual[i - 1] - plain.residual[i - 1] == pytest.approx(1.0, abs=1e-12)
+
+
+def test_cross_validation_states_its_noise() -> None:
+    """Residuals of straight lines through points of a straight line are noise alone; one residual of each of 300."""
+    squares = 0.0
+    sigma = np.where(np.arange(41) % 3 == 0, 0.2, 0.1)
+    for seed in range(300):
+        value = np.degrees(ANGLE) + sigma * np.random.default_rng(seed).standard_normal(41)
+        checked = cross_validate("piecewise_linear", ANGLE, value, sigma)
+        squares += checked.residual[20] ** 2 / checked.variance[20]
+    low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], 300)
+    assert low < squares < high
+
+
+def test_cross_validation_excess_is_the_misfit() -> None:
+    """A ripple that points a step apart cannot show: straight lines miss it by its RMS."""
+    ripple = 0.5 * np.where(np.arange(41) % 2 == 0, 1.0, -1.0)
+    checked = cross_validate("piecewise_linear", ANGLE, ripple, 1e-3)
+    # the neighbours lie on the other side: every residual is a full swing
+    assert np.sqrt(checked.excess) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_too_few_angles(name: str) -> None:
+    count = fewest(name)
+    with pytest.raises(ValueError, match=f"{name}: {count - 1} angles, but at least {count} are needed"):
+        fit(name, ANGLE[: count - 1], ANGLE[: count - 1], 1.0)
+    assert fit(name, ANGLE[:count], wave(ANGLE[:count]), 1.0).name == name
+    assert angles_left(41, 10) == 37
+    with pytest.raises(ValueError, match="cross-validation leaves"):
+        cross_validate(name, ANGLE[:count], wave(ANGLE[:count]), 1.0)
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_bad_angles(name: str) -> None:
+    with pytest.raises(ValueError, match="all 41 angles are the same; step the table"):
+        fit(name, np.full(41, 1.7), ANGLE, 1.0)
+    with pytest.raises(ValueError, match="average the repeats"):
+        fit(name, np.repeat(ANGLE[:20], 2), np.zeros(40), 1.0)
+    with pytest.raises(ValueError, match="finite"):
+        fit(name, ANGLE, np.where(np.arange(41) == 3, np.nan, 0.0), 1.0)
+    with pytest.raises(ValueError, match="greater than zero"):
+        fit(name, ANGLE, ANGLE, 0.0)
+
+
+def test_unknown_fit_and_outside_of_the_points() -> None:
+    with pytest.raises(ValueError, match=r"'bezier'.*piecewise_linear"):
+        fit("bezier", ANGLE, ANGLE, 1.0)
+    made = fit("cubic_spline", ANGLE, ANGLE, 1.0)
+    with pytest.raises(ValueError, match=r"calibrated from 92\.0000 to 112\.0000 deg; calibrate the whole range"):
+        made(np.radians(112.1))
+
+
+def test_network_that_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(angle_network, "MOST_ITERATIONS", 2)
+    with pytest.raises(NotConvergedError, match="none of 4 trainings"):
+        fit("network", ANGLE, wave(ANGLE), 0.1)
+    series = CalibrationSeries(ANGLE, wave(ANGLE)[:, None] + np.random.default_rng(1).normal(0.0, 0.1, (41, 5)))
+    choice = choose(series, names=("network", "cubic_spline"))
+    assert choice.chosen == "cubic_spline"
+    assert "none of 4" in choice["network"].failure
+    with pytest.raises(ValueError, match="no fit of the dividing error succeeded"):
+        choose(series, names=("network",))

@@ -1,0 +1,196 @@
+"""Bar-contrast MTF on bars whose image is known exactly: a square wave's Fourier series through the analytic MTF.
+
+Statistical limits are two-sided chi-square quantiles with a false-alarm rate of 1e-6 per comparison.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.bar_contrast import BarError, measure_bars
+from analysis.noise import NoiseModel
+from analysis.rice import rice_bias
+
+FALSE_ALARM = 1e-6
+PAN, MULTISPECTRAL = 7e-6, 28e-6
+DARK, BRIGHT = 150.0, 1150.0
+CALM = {
+    "dark": DARK + np.tile([-0.01, 0.01], 50),
+    "bright": BRIGHT + np.tile([-0.01, 0.01], 50),
+    "saturation": math.inf,
+}
+
+
+def transfer(f, angle, pitch=PAN):
+    """Circular pupil F/9.2 at 650 nm times the pixel, f cycles/pixel along the normal."""
+    s = min(f / pitch * 650e-9 * 9.2, 1.0)
+    pupil = 2 / math.pi * (math.acos(s) - s * math.sqrt(1 - s * s))
+    return pupil * np.sinc(f * math.cos(angle)) * np.sinc(f * math.sin(angle))
+
+
+def bar_image(f, degrees, size=64, pitch=PAN, phase=0.3):
+    """Near-vertical bars. 99 terms reach past every cut-off."""
+    angle = math.radians(degrees)
+    r = np.arange(size) - (size - 1) / 2
+    d = r * math.cos(angle) - r[:, None] * math.sin(angle)
+    wave = np.full(d.shape, 0.5)
+    for h in range(1, 100, 2):
+        sign = (-1) ** (h // 2)
+        wave += sign * 2 / math.pi / h * transfer(h * f, angle, pitch) * np.cos(h * (2 * math.pi * f * d + phase))
+    return DARK + (BRIGHT - DARK) * wave
+
+
+def vector(f, degrees):
+    return np.array([-f * math.sin(math.radians(degrees)), f * math.cos(math.radians(degrees))])
+
+
+def test_the_wave_is_a_square_wave():
+    """Without optics the series is the bars themselves: full levels in the middle of wide bars."""
+    image = bar_image(0.02, 0, 200, pitch=1e-3)
+    assert np.percentile(image, [25, 75]) == pytest.approx([DARK, BRIGHT], abs=15)
+
+
+@pytest.mark.parametrize("how", ["vector", "length", "found"])
+@pytest.mark.parametrize("degrees", [2, 3, 5, 10])
+@pytest.mark.parametrize("f", [0.1, 0.2, 0.25, 0.3, 0.45, 0.5])
+def test_mtf_is_exact(f, degrees, how):
+    stated = {"vector": vector(f, degrees) + [0.003, -0.004], "length": f, "found": None}[how]
+    bars = measure_bars(bar_image(f, degrees), frequency=stated, **CALM)
+    # what is left are the ninth and higher harmonics, which pass below 0.13 cycles/pixel only
+    assert bars.mtf == pytest.approx(transfer(f, math.radians(degrees)), abs=3e-4 if f == 0.1 else 1e-5)
+    if f < 0.5 or how != "found":
+        # at Nyquist the direction of the tilt cannot be seen: the other alias is longer
+        assert bars.cycles_per_pixel == pytest.approx(f, abs=1e-4)
+
+
+@pytest.mark.parametrize("f", [0.2, 0.3, 0.5])
+def test_aliased_images(f):
+    """28 um: the third to ninth harmonics of the bars pass and alias. The eleventh and more are left: 1e-3."""
+    for degrees in (3, 5, 10):
+        bars = measure_bars(bar_image(f, degrees, pitch=MULTISPECTRAL), frequency=f, **CALM)
+        assert bars.mtf == pytest.approx(transfer(f, math.radians(degrees), MULTISPECTRAL), abs=1e-3)
+        third = abs(transfer(3 * f, math.radians(degrees), MULTISPECTRAL)) * (BRIGHT - DARK) * 2 / math.pi / 3
+        assert bars.harmonics[3] == pytest.approx(third, abs=1.0)
+    # the first term of Coltman's series forgets the third harmonic
+    assert abs(bars.coltman - bars.mtf) > 0.02
+
+
+def test_near_horizontal_bars():
+    bars = measure_bars(bar_image(0.3, 4).T, **CALM)
+    assert bars.mtf == pytest.approx(transfer(0.3, math.radians(4)), abs=1e-5)
+    np.testing.assert_allclose(np.abs(bars.frequency), np.abs(vector(0.3, 4)[::-1]), atol=1e-5)
+
+
+def test_bars_above_nyquist_are_measured_when_the_frequency_is_stated():
+    """0.7 cycles/pixel looks like 0.3; what it is has to be said."""
+    bars = measure_bars(bar_image(0.7, 4), frequency=0.7, **CALM)
+    assert bars.cycles_per_pixel == pytest.approx(0.7, abs=1e-4)
+    assert bars.mtf == pytest.approx(transfer(0.7, math.radians(4)), abs=1e-5)
+
+
+def test_phase_and_amplitude():
+    bars = measure_bars(bar_image(0.3, 5, phase=1.1), frequency=vector(0.3, 5), **CALM)
+    assert bars.phase == pytest.approx(1.1, abs=1e-4)
+    assert bars.amplitude == pytest.approx(2 / math.pi * 1000 * transfer(0.3, math.radians(5)), rel=1e-4)
+
+
+def test_contrast_and_coltman():
+    """At Nyquist the third harmonic lies beyond the cut-off, so Coltman's first term is exact; all phases occur."""
+    image = bar_image(0.5, 5)
+    bars = measure_bars(image, frequency=0.5, **CALM)
+    assert bars.contrast == pytest.approx((image.max() - image.min()) / (image.max() + image.min()))
+    # of 4096 phases one lies within 1e-3 cycles of the crest
+    assert bars.coltman == pytest.approx(transfer(0.5, math.radians(5)), abs=2e-4)
+    with_offset = measure_bars(image + 200, 0.5 * 0 + CALM["dark"] + 200, CALM["bright"] + 200, 0.5, offset=200.0)
+    assert with_offset.contrast == pytest.approx(bars.contrast)
+    assert with_offset.coltman == pytest.approx(bars.coltman)
+
+
+MODEL = NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 60000.0)
+
+
+def repeats(contrast, use_model, count=200, f=0.5):
+    rng = np.random.default_rng([23, int(contrast)])
+    scale = contrast / (BRIGHT - DARK)
+    mean = 80 + scale * (bar_image(f, 4, 32) - DARK)
+
+    def draw(level):
+        return np.round(rng.normal(level, np.sqrt(MODEL.temporal_variance_dn2(level, 1) - 1 / 12)))
+
+    low, high = np.full((8, 8), 80.0), np.full((8, 8), 80.0 + contrast)
+    noise = MODEL if use_model else None
+    return [measure_bars(draw(mean), draw(low), draw(high), vector(f, 4), noise=noise) for _ in range(count)]
+
+
+@pytest.mark.parametrize("use_model", [True, False])
+@pytest.mark.parametrize("f", [0.2, 0.5])
+def test_sigma_agrees_with_the_scatter(f, use_model):
+    bars = repeats(400.0, use_model, f=f)
+    low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], len(bars) - 1)
+    mtf, sigma = (np.array([getattr(b, name) for b in bars]) for name in ("mtf", "sigma"))
+    assert low < np.sum((mtf - mtf.mean()) ** 2) / np.mean(sigma**2) < high
+    assert abs(mtf.mean() - transfer(f, math.radians(4))) < 5 * sigma.mean() / math.sqrt(len(bars)) + 1e-4
+    for k in range(2):
+        found = np.array([b.frequency[k] for b in bars])
+        assert low < np.sum((found - found.mean()) ** 2) / np.mean([b.frequency_sigma[k] ** 2 for b in bars]) < high
+
+
+def test_noise_bias_is_of_second_order():
+    """32 x 32 pixels hold the amplitude to a few percent, so the bias is below its square."""
+    bars = repeats(60.0, True)
+    truth = transfer(0.5, math.radians(4))
+    mean_bias = np.mean([b.noise_bias for b in bars])
+    sigma = np.mean([b.sigma for b in bars])
+    assert 0 < mean_bias < sigma**2 / truth
+    assert mean_bias == pytest.approx(float(rice_bias(truth, sigma)), rel=0.3)
+
+
+GOOD = bar_image(0.3, 4)
+
+
+def noisy(image, sigma=2.0):
+    return image + np.random.default_rng(5).normal(0, sigma, image.shape)
+
+
+def half_filled():
+    image = noisy(GOOD)
+    image[:, 32:] = noisy(np.full((64, 32), 650.0))
+    return image
+
+
+@pytest.mark.parametrize(
+    ("image", "frequency", "message"),
+    [
+        (noisy(np.full((64, 64), 500.0)), None, "no bars in the region.*average frames"),
+        (np.full((64, 64), 500), None, "all pixels have the same value"),
+        (GOOD[:8, :], None, "8 x 64 px is too small: take at least 12 x 12"),
+        (np.minimum(noisy(GOOD, 8), 850), None, "share the highest value 850.*lower the exposure"),
+        (np.where(np.eye(64) > 0, np.nan, GOOD), None, "64 pixels of the region are not finite"),
+        (np.zeros((3, 64, 64)), None, "must be a plane"),
+        (noisy(bar_image(0.5, 0)), 0.5, "Nyquist frequency and parallel to the pixels.*tilt"),
+        (noisy(bar_image(0.01, 4)), (0.0, 0.01), "less than two periods"),
+        (half_filled(), 0.3, "do not fill the region.*(left|right) quarter"),
+        (noisy(GOOD), 0.0, "one number or two"),
+        (noisy(GOOD), (0.1, 0.2, 0.3), "one number or two"),
+        (noisy(GOOD), (0.2, 0.0), "no bars in the region"),
+    ],
+)
+def test_bad_regions_are_explained(image, frequency, message):
+    with pytest.raises(BarError, match=message):
+        measure_bars(image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), frequency)
+
+
+@pytest.mark.parametrize(
+    ("dark", "bright", "message"),
+    [
+        (np.full(100, DARK), np.full(100, DARK), "no contrast"),
+        (np.full(100, BRIGHT), np.full(100, DARK), "the brighter one as bright"),
+        (np.full(9, DARK), np.full(100, BRIGHT), "dark patch needs at least 16"),
+        (np.full(100, DARK), np.full(100, 5000.0), "bright patch reaches the saturation level of 4095"),
+    ],
+)
+def test_bad_patches_are_explained(dark, bright, message):
+    with pytest.raises(BarError, match=message):
+        measure_bars(noisy(GOOD), dark, bright, 0.3, saturation=4095.0)

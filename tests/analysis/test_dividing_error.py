@@ -1,0 +1,193 @@
+"""Chauvenet's criterion on printed examples and on normal noise, series of comparisons, the compensation's sigmas.
+
+Chi-square tests have a false-alarm rate of 1e-4 each, two-sided; seeds are fixed, so that they pass or fail for good.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from analysis.chauvenet import chauvenet, normal_reduction, rejection_rate
+from analysis.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate, step_kernel
+
+ARCSEC = math.pi / 648000
+FALSE_ALARM = 1e-4
+ANGLE = np.radians(np.linspace(92.0, 112.0, 41))
+
+
+def curve(angle: np.ndarray) -> np.ndarray:
+    return np.asarray(0.4 * ARCSEC * np.sin(2.0 * np.pi * np.degrees(angle) / 9.0))
+
+
+def series(seed: int, sigma: float = 0.03 * ARCSEC, repeats: int = 10, angle: np.ndarray = ANGLE) -> CalibrationSeries:
+    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(angle), repeats))
+    return CalibrationSeries(angle, curve(angle)[:, None] + noise)
+
+
+@pytest.mark.parametrize(
+    ("readings", "rejected"),
+    [
+        # J. R. Taylor, An Introduction to Error Analysis, 2nd ed., section 6.2: 58 is expected 0.16 times, so it goes
+        ([46, 48, 44, 38, 45, 47, 58, 44, 45, 43], [58]),
+        # the same, section 6.1: six periods of a pendulum; 1.8 is expected 0.3 times
+        ([3.8, 3.5, 3.9, 3.9, 3.4, 1.8], [1.8]),
+    ],
+)
+def test_printed_examples(readings: list[float], rejected: list[float]) -> None:
+    values = np.array(readings, float)
+    assert values[~chauvenet(values)].tolist() == rejected
+
+
+def test_few_or_equal_readings_stay() -> None:
+    """Of up to four readings none can deviate by more than the limit: (n - 1)/sqrt(n) is less than it."""
+    for n in range(1, 5):
+        assert chauvenet([0.0] * (n - 1) + [1e6]).all()
+    assert not chauvenet([0.0, 0.1, -0.1, 0.05, 1e6]).all()
+    # equal but for the rounding of a sum
+    assert chauvenet([0.1 + 0.2] * 9 + [0.3]).all()
+    with pytest.raises(ValueError, match="finite"):
+        chauvenet([0.0, np.nan, 1.0])
+
+
+def test_repeating_finds_what_hid() -> None:
+    readings = np.array([-0.3, 0.1, 0.2, -0.1, 0.0, 0.3, -0.2, 0.1, 2.0, 50.0])
+    assert np.flatnonzero(~chauvenet(readings)).tolist() == [9]
+    assert np.flatnonzero(~chauvenet(readings, repeated=True)).tolist() == [8, 9]
+
+
+def test_many_series_at_once() -> None:
+    readings = np.random.default_rng(1).standard_t(2, (4, 6, 10))
+    for repeated in (False, True):
+        whole = chauvenet(readings, repeated)
+        assert not whole.all()
+        alone = [[chauvenet(row, repeated) for row in block] for block in readings]
+        assert np.array_equal(whole, np.array(alone))
+
+
+@pytest.mark.parametrize("n", [5, 10, 20])
+def test_what_normal_noise_loses(n: int) -> None:
+    """Formulas for the single pass against 20 000 series: 4 sigma of the counts; the variance within 1%."""
+    readings = np.random.default_rng(n).standard_normal((20_000, n))
+    keep = chauvenet(readings)
+    rate = rejection_rate(n)
+    assert np.mean(~keep) == pytest.approx(rate, abs=4.0 * math.sqrt(rate / keep.size))
+    left = readings - np.mean(readings, axis=1, keepdims=True, where=keep)
+    pooled = np.sum(left**2, where=keep) / np.sum(keep.sum(axis=1) - 1)
+    # sqrt(2 / (20 000 (n - 1))) is 0.5% at n = 5; that two go at once is not in the formula
+    assert pooled == pytest.approx(normal_reduction(n), rel=0.01)
+    assert normal_reduction(n) < 0.93
+
+
+def test_repeatability_is_unbiased() -> None:
+    """The trimming is undone: 200 series of 41 angles. Their 74 000 degrees of freedom give 0.3%."""
+    told = np.array([series(seed).repeatability for seed in range(200)])
+    assert np.sqrt(np.mean(told**2)) == pytest.approx(0.03 * ARCSEC, rel=0.01)
+
+
+def test_one_gross_error() -> None:
+    """Its angle has the largest RMS before, and averaging alone leaves a tenth of the error in the mean."""
+    clean = series(3)
+    comparisons = clean.comparisons.copy()
+    comparisons[7, 2] += 0.5 * ARCSEC
+    dirty = CalibrationSeries(ANGLE, comparisons)
+    assert np.argmax(dirty.rms_before) == 7
+    assert not dirty.keep[7, 2]
+    assert dirty.averaging_alone == pytest.approx(dirty.rms_before[7] / math.sqrt(10.0))
+    # mean of the nine others
+    assert dirty.mean[7] == pytest.approx(np.mean(np.delete(comparisons[7], 2)), rel=1e-12)
+    assert dirty.mean_rms < 0.6 * dirty.averaging_alone
+
+
+def test_two_gross_errors_that_hide_each_other_are_named() -> None:
+    comparisons = series(4).comparisons.copy()
+    comparisons[11, [0, 1]] += 0.3 * ARCSEC
+    dirty = CalibrationSeries(ANGLE, comparisons)
+    assert dirty.keep[11, [0, 1]].all()
+    assert np.flatnonzero(dirty.suspect).tolist() == [11]
+    # the bias, 0.06 arcsec, is within two of the sigmas that the angle is given, and far beyond that of the others
+    assert dirty.sigma[11] > 0.03 * ARCSEC > 2.0 * dirty.sigma[12]
+    # one series in a thousand is accused falsely; none of these 100 (probability of more than two: 2e-4)
+    assert sum(int(series(seed).suspect.any()) for seed in range(100)) <= 2
+
+
+def test_sign() -> None:
+    """Dividing error = reading - true angle, so that the corrected reading is the reading minus it."""
+    choice = choose(series(5), names=("cubic_spline",))
+    made = compensate(series(5), choice)
+    reading = np.radians([95.3, 101.7])
+    true = reading - curve(reading)
+    assert np.max(np.abs(made.correct(reading) - true)) < 0.05 * ARCSEC
+    assert np.max(np.abs(reading - true)) > 0.2 * ARCSEC
+
+
+def test_misfits_are_told_apart() -> None:
+    """A constant that the calibration does not share, and an error that is new at every reading."""
+    angle = 0.5 * (ANGLE[1:] + ANGLE[:-1])
+    white = []
+    common = []
+    for seed in range(20):
+        own = np.random.default_rng((seed, 1)).normal(0.0, 0.05 * ARCSEC, 40)
+        held = series(1000 + seed, angle=angle)
+        held = CalibrationSeries(angle, held.comparisons + own[:, None] + 0.1 * ARCSEC)
+        calibration = series(seed)
+        choice = choose(calibration, names=("cubic_spline",))
+        made = compensate(calibration, choice, held)
+        white.append(made.white / ARCSEC)
+        common.append(made.common / ARCSEC)
+        assert compensate(calibration, choice).white == 0.0
+    # each is estimated from 40 readings, to 1 / sqrt(80) = 11%, the mean of 20 estimates to 2.5%: 4 sigma
+    assert np.sqrt(np.mean(np.square(white))) == pytest.approx(0.05, rel=0.1)
+    assert np.mean(common) == pytest.approx(0.1, rel=0.1)
+
+
+def test_covariance_matches_the_scatter() -> None:
+    """Slope of the corrected error over the camera's field, 200 calibrations of a curve that the spline follows."""
+    reading = np.radians(np.linspace(100.75, 103.25, 55))
+    slope = (reading - reading.mean()) / np.sum((reading - reading.mean()) ** 2)
+    squares = 0.0
+    for seed in range(200):
+        calibration = series(seed)
+        made = compensate(calibration, choose(calibration, names=("piecewise_linear",)))
+        noise = made.fit.covariance(reading)
+        left = made.fit(reading) - np.interp(reading, ANGLE, curve(ANGLE))
+        squares += (slope @ left) ** 2 / (slope @ noise @ slope)
+        assert np.min(np.linalg.eigvalsh(made.covariance(reading))) > -1e-12 * np.max(noise)
+        assert np.all(np.diag(made.covariance(reading)) >= np.diag(noise))
+    low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], 200)
+    assert low < squares < high
+
+
+def test_covariance_of_two_sets_of_readings() -> None:
+    calibration = series(6)
+    choice = choose(calibration, names=("fourier",))
+    made = DividingCompensation(choice["fourier"].fit, calibration.step, 3e-8, 2e-8, 1e-8, 1e-7)  # type: ignore[arg-type]
+    both = np.radians([95.0, 95.1, 103.0])
+    whole = made.covariance(both)
+    np.testing.assert_allclose(made.covariance(both[:1], both[1:]), whole[:1, 1:], rtol=1e-12)
+    np.testing.assert_allclose(made.sigma(both) ** 2, np.diag(whole), rtol=1e-12)
+    assert step_kernel(both, both, calibration.step)[0].tolist() == pytest.approx([1.0, 0.8, 0.0])
+
+
+def test_a_series_without_noise() -> None:
+    exact = CalibrationSeries(ANGLE, np.repeat(curve(ANGLE)[:, None], 5, axis=1))
+    assert exact.rejected == 0
+    made = compensate(exact, choose(exact, names=("cubic_spline",)))
+    # natural ends: the curve is bent there and the spline is not, some 1e-3 of the amplitude
+    assert np.max(np.abs(made.error(ANGLE[3] + 0.004) - curve(ANGLE[3] + 0.004))) < 1e-3 * ARCSEC
+
+
+@pytest.mark.parametrize(
+    ("angle", "comparisons", "text"),
+    [
+        (np.full(5, 1.7), np.zeros((5, 3)), "all 5 angles are the same; step the table"),
+        ([1.0, 3.0, 2.0], np.zeros((3, 3)), "must increase"),
+        ([1.0, 2.0, 3.0], np.zeros((3, 1)), "one repeat only"),
+        ([1.0, 2.0, 3.0], np.zeros((2, 3)), "found"),
+        ([1.0, 2.0, 3.0], np.full((3, 3), np.inf), "finite"),
+    ],
+)
+def test_bad_series(angle: list[float], comparisons: np.ndarray, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        CalibrationSeries(np.array(angle), comparisons)

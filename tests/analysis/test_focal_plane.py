@@ -1,0 +1,220 @@
+"""The plane through measured defocus, its correction as a finite motion, and its statistics. The geometry of the tests
+is built from planes and rotation matrices of OpenCV, in the optics' frame, and never from the slopes that are fitted.
+"""
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.focal_plane import ObservabilityError, fit_focal_plane, line_level
+
+FALSE_ALARM = 1e-6
+ARCMIN = np.pi / 10800
+UM, MM = 1e-6, 1e-3
+# pan line and four bands at five fields, as in the paper
+FIELDS = np.linspace(-115 * MM, 115 * MM, 5)
+PLACE = np.array([(x, y) for x in (0.0, -10 * MM, -5 * MM, 5 * MM, 10 * MM) for y in FIELDS])
+SIGMA = np.where(PLACE[:, 0] == 0, 3 * UM, 8 * UM)
+
+
+def rotation(vector):
+    return cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
+
+
+def on_plane(place):
+    return np.column_stack([place, np.zeros(len(place))])
+
+
+def measured_defocus(place, turn, shift):
+    """Distance along Z' from places of an assembly at turn, shift to the optics' image plane Z = 0."""
+    matrix = rotation(turn)
+    point = on_plane(place) @ matrix.T + shift
+    return -point[:, 2] / matrix[2, 2]
+
+
+def bounds(statistic, freedom):
+    return FALSE_ALARM / 2 < stats.chi2.sf(statistic, freedom) < 1 - FALSE_ALARM / 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_correction_brings_a_misset_assembly_into_focus(seed):
+    """Arcminutes about all axes and 0.3 mm of piston, no noise: after the motion all places lie in the image plane."""
+    rng = np.random.default_rng(seed)
+    turn, shift = rng.uniform(-10, 10, 3) * ARCMIN, rng.uniform(-1, 1, 3) * [1 * MM, 1 * MM, 0.3 * MM]
+    fit = fit_focal_plane(PLACE, measured_defocus(PLACE, turn, shift), SIGMA)
+    matrix = rotation(turn)
+    # the theodolite: where the ends of the line stand in the optics' frame
+    ends = on_plane(np.array([[0, -115 * MM], [0, 115 * MM]])) @ matrix.T
+    level = line_level(ends[:, 1], ends[:, 0], 5 * UM)
+    motion = fit.correction(level)
+    moved = motion.moved(on_plane(PLACE)) @ matrix.T + shift
+    assert np.abs(moved[:, 2]).max() < 1e-14  # metres: float64 of 0.1 m with some ten operations
+    # level measured in the optics' frame and applied in the assembly's: they differ by tilt^2, (14')^2 = 0.06'
+    line = matrix @ rotation(motion.rotation) @ [0.0, 1.0, 0.0]
+    assert abs(np.arctan2(-line[0], line[1])) < 0.06 * ARCMIN
+    assert abs(level.angle - turn[2]) < 0.06 * ARCMIN
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift", "expected"),
+    [
+        # the CCD's +Y' end stands too high (+Z'): the focus there is below it; turn back about X'
+        ([5 * ARCMIN, 0, 0], [0, 0, 0], ([-5 * ARCMIN, 0, 0], [0, 0, 0])),
+        ([0, 5 * ARCMIN, 0], [0, 0, 0], ([0, -5 * ARCMIN, 0], [0, 0, 0])),
+        # the CCD stands 0.3 mm too high
+        ([0, 0, 0], [0, 0, 0.3 * MM], ([0, 0, 0], [0, 0, -0.3 * MM])),
+    ],
+)
+def test_signs(turn, shift, expected):
+    motion = fit_focal_plane(PLACE, measured_defocus(PLACE, turn, shift), SIGMA).correction()
+    assert motion.rotation == pytest.approx(expected[0], abs=1e-12)
+    assert motion.shift == pytest.approx(expected[1], abs=1e-15)
+
+
+def test_small_angles_are_the_slopes():
+    """omega = (slope_y, -slope_x, -level) and shift (0, 0, piston), to second order of 5'."""
+    defocus = 0.2 * MM + 1.2e-3 * PLACE[:, 0] - 0.9e-3 * PLACE[:, 1]
+    fit = fit_focal_plane(PLACE, defocus, SIGMA)
+    assert (fit.piston, fit.slope_x, fit.slope_y) == pytest.approx((0.2 * MM, 1.2e-3, -0.9e-3), rel=1e-9)
+    level = line_level([-0.1, 0.1], [1e-4, -1e-4], 5 * UM)
+    motion = fit.correction(level)
+    assert motion.rotation == pytest.approx([-0.9e-3, -1.2e-3, -1e-3], abs=1.5e-6)
+    assert motion.shift == pytest.approx([0, 0, 0.2 * MM], abs=1e-15)
+    assert motion.line_turn == pytest.approx(-1e-3, abs=1.5e-6)
+
+
+def test_scatter_agrees_with_covariance():
+    """500 noisy repeats: chi-square of the three parameters, of the residuals, and uniform p-values."""
+    rng = np.random.default_rng(4)
+    truth = np.array([0.3 * MM, 1e-3, -2e-3])
+    exact = truth[0] + PLACE @ truth[1:]
+    fits = [fit_focal_plane(PLACE, exact + SIGMA * rng.standard_normal(len(PLACE)), SIGMA) for _ in range(500)]
+    error = np.array([[f.piston, f.slope_x, f.slope_y] for f in fits]) - truth
+    weight = np.linalg.inv(fits[0].covariance)
+    assert bounds(np.einsum("ni,ij,nj->", error, weight, error), 1500)
+    assert bounds(sum(f.chi_square for f in fits), 500 * (len(PLACE) - 3))
+    assert stats.kstest([f.p_value for f in fits], "uniform").pvalue > FALSE_ALARM
+    # one parameter by hand: fields and bands are symmetric, so slope_y stands alone
+    assert fits[0].covariance[2, 2] == pytest.approx(1 / np.sum((PLACE[:, 1] / SIGMA) ** 2), rel=1e-12)
+    assert fits[0].correction().covariance[0, 0] == pytest.approx(fits[0].covariance[2, 2], rel=1e-12)
+    assert fits[0].correction().covariance[0, 1] == pytest.approx(-fits[0].covariance[2, 1], rel=1e-12, abs=1e-30)
+    height, sigma = fits[0].plane([[0.02, 0.1]])
+    design = np.array([1, 0.02, 0.1])
+    assert height[0] == pytest.approx(fits[0].piston + 0.02 * fits[0].slope_x + 0.1 * fits[0].slope_y, rel=1e-12)
+    assert sigma[0] == pytest.approx(np.sqrt(design @ fits[0].covariance @ design), rel=1e-12)
+
+
+@pytest.mark.parametrize("extra", [0.0, 12 * UM])
+def test_predicted_defocus_after_the_correction(extra):
+    """True defocus that remains when the fitted motion is made: 400 assemblies with chips that stand up or down by
+    `extra`, each measured with noise. The prediction's error has the covariance stated.
+    """
+    rng = np.random.default_rng(8)
+    total, rank, found = 0.0, 0, []
+    for _ in range(400):
+        turn, shift = rng.uniform(-5, 5, 3) * ARCMIN * [1, 1, 0], [0, 0, rng.uniform(-0.3, 0.3) * MM]
+        chip = extra * rng.standard_normal(len(PLACE))
+        true = measured_defocus(PLACE, turn, shift) + chip
+        fit = fit_focal_plane(
+            PLACE, true + SIGMA * rng.standard_normal(len(PLACE)), SIGMA, estimate_extra=extra > 0
+        )  # fmt: skip
+        found.append(fit.extra_sigma)
+        moved = fit.correction().moved(on_plane(PLACE))[:, 2]
+        predicted, covariance = fit.predicted_defocus()
+        error = true - moved - predicted
+        values, vectors = np.linalg.eigh(covariance)
+        good = values > 1e-9 * values[-1]
+        total += np.sum((vectors[:, good].T @ error) ** 2 / values[good])
+        rank += np.count_nonzero(good)
+    if extra == 0:
+        # three parameters that can be misjudged; moved is the finite motion: 5' squared of 0.1 m is 0.2 um of X'Y',
+        # a few 1e-10 m of height
+        assert rank == 3 * 400
+        assert bounds(total, rank)
+    else:
+        # extra_sigma is itself estimated, from 22 degrees of freedom (some 15%), so the sum of squares is not exactly
+        # a chi-square: its mean is right to a few per cent
+        assert total / rank == pytest.approx(1.0, abs=0.1)
+        assert np.sqrt(np.mean(np.square(found))) == pytest.approx(extra, rel=0.1)
+
+
+def test_extra_sigma_is_reported_and_only_on_request():
+    rng = np.random.default_rng(9)
+    bowl = 40 * UM * (PLACE[:, 1] / 0.115) ** 2  # curvature of field
+    defocus = 0.1 * MM + bowl + SIGMA * rng.standard_normal(len(PLACE))
+    plain = fit_focal_plane(PLACE, defocus, SIGMA)
+    assert plain.extra_sigma == 0
+    assert plain.p_value < 1e-6
+    wide = fit_focal_plane(PLACE, defocus, SIGMA, estimate_extra=True)
+    assert wide.chi_square == pytest.approx(plain.chi_square, rel=1e-12)  # still with the sigmas as given
+    weighted = wide.residual**2 / (SIGMA**2 + wide.extra_sigma**2)
+    assert weighted.sum() == pytest.approx(wide.degrees_of_freedom, rel=1e-4)
+    # rms of the bowl about its mean over five fields, 40 um x 0.374
+    assert wide.extra_sigma == pytest.approx(15 * UM, rel=0.35)
+    assert np.all(np.diag(wide.covariance) > np.diag(plain.covariance))
+    quiet = fit_focal_plane(PLACE, np.full(len(PLACE), 0.1 * MM), SIGMA, estimate_extra=True)
+    assert quiet.extra_sigma == 0
+
+
+def test_places_that_cannot_tell():
+    line = np.column_stack([np.full(5, 3 * MM), FIELDS])
+    with pytest.raises(ObservabilityError, match=r"X' = constant.*slope_x cannot be told.*hold slope_x"):
+        fit_focal_plane(line, np.zeros(5), UM)
+    held = fit_focal_plane(line, 0.1 * MM + 1e-3 * FIELDS, UM, hold=("slope_x",))
+    assert held.slope_x == 0
+    assert held.held == ("slope_x",)
+    assert not held.covariance[1].any()
+    assert held.slope_y == pytest.approx(1e-3, rel=1e-9)
+    assert held.degrees_of_freedom == 3
+    assert held.predicted_defocus()[0] == pytest.approx(np.zeros(5), abs=1e-15)
+    with pytest.raises(ObservabilityError, match=r"Y' = constant.*slope_y"):
+        fit_focal_plane(line[:, ::-1], np.zeros(5), UM)
+    with pytest.raises(ObservabilityError, match="one straight line along"):
+        fit_focal_plane(np.column_stack([FIELDS, FIELDS]), np.zeros(5), UM)
+    with pytest.raises(ObservabilityError, match="all places are one"):
+        fit_focal_plane(np.full((4, 2), 0.1), np.zeros(4), UM)
+    with pytest.raises(ObservabilityError, match="2 places cannot tell piston, slope_x, slope_y"):
+        fit_focal_plane(PLACE[:2], np.zeros(2), UM)
+    with pytest.raises(ObservabilityError, match="all places have the same Y'"):
+        fit_focal_plane(line[:, ::-1], np.zeros(5), UM, hold=("slope_x",))
+    single = fit_focal_plane([[0.0, 0.0]], [1e-4], UM, hold=("slope_x", "slope_y"))
+    assert single.piston == pytest.approx(1e-4)
+    assert single.p_value == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"defocus": np.zeros(3)}, r"\(N, 2\)"),
+        ({"sigma": 0.0}, "positive"),
+        ({"defocus": np.full(25, np.nan)}, "finite"),
+        ({"hold": ("piston",)}, "only slope_x and slope_y"),
+    ],
+)
+def test_bad_input(change, message):
+    given = {"place": PLACE, "defocus": np.zeros(25), "sigma": UM} | change
+    with pytest.raises(ValueError, match=message):
+        fit_focal_plane(**given)
+
+
+def test_line_level():
+    """Sign by a finite rotation about +Z', sigma against 2000 repeats, errors."""
+    ends = np.column_stack([np.zeros(6), np.linspace(-0.115, 0.115, 6), np.zeros(6)])
+    turned = ends @ rotation([0, 0, 8 * ARCMIN]).T
+    sigma = np.linspace(3, 9, 6) * UM
+    assert line_level(turned[:, 1], turned[:, 0], sigma).angle == pytest.approx(8 * ARCMIN, rel=1e-12)
+    noise = sigma * np.random.default_rng(12).standard_normal((2000, 6))
+    found = [line_level(turned[:, 1], turned[:, 0] + n, sigma) for n in noise]
+    assert bounds(sum(((f.angle - 8 * ARCMIN) / f.sigma) ** 2 for f in found), 2000)
+    assert bounds(sum(f.chi_square for f in found), 2000 * 4)
+    two = line_level([-0.1, 0.1], [0.0, 0.0], 10 * UM)
+    assert two.sigma == pytest.approx(np.sqrt(2) * 10 * UM / 0.2, rel=1e-12)
+    assert two.degrees_of_freedom == 0
+    for along, across, message in (
+        ([0.1], [0.0], "two or more"),
+        ([0.1, 0.1], [0.0, 1e-5], "one place along the line"),
+        ([0.1, np.nan], [0.0, 0.0], "finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            line_level(along, across, UM)

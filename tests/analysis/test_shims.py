@@ -1,0 +1,290 @@
+"""Shims as a rigid motion: pads moved by hand and a rigid body fitted to them (Kabsch), plane geometry of three pads,
+statistics of rounding, and the coupling of focus and line level through an inclined mounting surface.
+"""
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.focal_plane import fit_focal_plane, line_level
+from analysis.rigid_motion import RigidMotion
+from analysis.shims import Mount, ShimError, shim_plan
+
+FALSE_ALARM = 1e-6
+ARCMIN, DEG = np.pi / 10800, np.pi / 180
+UM, MM = 1e-6, 1e-3
+STEP = 10 * UM
+
+
+def rotation(vector):
+    return cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
+
+
+def inclined(angle, azimuth=0.0):
+    """Frame (3, 3) of a mounting surface as columns; its normal, the third, leans by angle from Z'.
+
+    azimuth 0 turns it about X', 90 deg about Y'.
+    """
+    return rotation([0, 0, azimuth]) @ rotation([-angle, 0, 0]) @ rotation([0, 0, -azimuth])
+
+
+def make_mount(angle=0.0, azimuth=0.0, count=4, step=STEP, clearance=2 * MM, behind=-30 * MM):
+    """Holes round the line CCD, 30 mm behind the focal plane at its middle."""
+    around = 2 * np.pi * (np.arange(count) + 0.5) / count
+    flat = np.column_stack([60 * MM * np.cos(around), 150 * MM * np.sin(around), np.zeros(count)])
+    frame = inclined(angle, azimuth)
+    return Mount.of(flat @ frame.T + [0, 0, behind], frame[:, 2], clearance, step)
+
+
+def kabsch(before, after):
+    """Rotation matrix and shift of the rigid body that best takes points (N, 3) to others."""
+    mean = before.mean(axis=0), after.mean(axis=0)
+    u, _, vt = np.linalg.svd((before - mean[0]).T @ (after - mean[1]))
+    turn = (vt.T * [1, 1, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    return turn, mean[1] - turn @ mean[0]
+
+
+def random_correction(rng, tilt=5 * ARCMIN, piston=0.3 * MM):
+    return RigidMotion.of(rng.uniform(-1, 1, 3) * tilt, [0, 0, rng.uniform(-1, 1) * piston])
+
+
+@pytest.mark.parametrize(("angle", "azimuth", "count"), [(0, 0, 3), (20 * DEG, 0, 4), (6 * DEG, 90 * DEG, 6)])
+def test_exact_shims_reproduce_the_wanted_motion(angle, azimuth, count):
+    """Unrounded: pads thickened along n and slid in the surface carry a rigid body by just the wanted motion."""
+    rng = np.random.default_rng(1)
+    mount = make_mount(angle, azimuth, count)
+    for _ in range(10):
+        wanted = random_correction(rng)
+        plan = shim_plan(wanted, mount)
+        assert np.abs(plan.slide @ mount.normal).max() < 1e-17  # the slide lies in the surface
+        turn, shift = kabsch(mount.holes, mount.holes + np.outer(plan.change, mount.normal) + plan.slide)
+        assert turn == pytest.approx(rotation(wanted.rotation), abs=1e-13)
+        assert shift == pytest.approx(wanted.shift, abs=1e-14)
+        # a workshop without a step: the achieved motion, found by settling on the pads, is the wanted one
+        fine = shim_plan(wanted, Mount(mount.holes, mount.normal, mount.clearance, 1e-15))
+        assert fine.achieved.rotation == pytest.approx(wanted.rotation, abs=1e-13)
+        assert fine.achieved.shift == pytest.approx(wanted.shift, abs=1e-14)
+
+
+def test_three_pads_carry_the_plane_that_is_wanted():
+    """From the thicknesses alone: the plane over three pads against the rotated mounting surface.
+
+    The pads stay where they are while the body slides over them by less than 1 mm, a few thousandths of the pads'
+    distance, so the tilt agrees to 1% of itself.
+    """
+    rng = np.random.default_rng(2)
+    mount = make_mount(20 * DEG, 0, 3)
+    for _ in range(20):
+        wanted = random_correction(rng)
+        plan = shim_plan(wanted, mount)
+        top = mount.holes + np.outer(plan.change, mount.normal)
+        normal = np.cross(top[1] - top[0], top[2] - top[0])
+        normal /= np.linalg.norm(normal) * np.sign(normal @ mount.normal)
+        expected = rotation(wanted.rotation) @ mount.normal
+        tilt = np.linalg.norm(expected - mount.normal)
+        assert np.linalg.norm(normal - expected) < 0.01 * max(tilt, 1 * ARCMIN)
+
+
+def test_thickness_signs():
+    """A thicker shim lifts along +n; a tilt about +X' lifts the +Y' side."""
+    mount = make_mount()
+    lift = shim_plan(RigidMotion.of([0, 0, 0], [0, 0, 0.1 * MM]), mount)
+    assert lift.change == pytest.approx(np.full(4, 0.1 * MM), abs=1e-17)
+    tilt = shim_plan(RigidMotion.of([2 * ARCMIN, 0, 0], [0, 0, 0]), mount)
+    assert np.array_equal(np.sign(tilt.change), np.sign(mount.holes[:, 1]))
+    assert tilt.change == pytest.approx(2 * ARCMIN * mount.holes[:, 1], rel=1e-3)
+
+
+@pytest.mark.parametrize("angle", [6 * DEG, 20 * DEG])
+def test_coupling_of_focus_and_line_level(angle):
+    """A tilt of 5' about Y' on a surface inclined about X': without the turn by hand the line is off by -5' sin cos.
+
+    Derived here in the mount's own axes: the shims make the two components of the rotation vector in the surface; the
+    third is dropped. Second order: 5'^2 = 0.007'.
+    """
+    tilt = 5 * ARCMIN
+    frame = inclined(angle)
+    plan = shim_plan(RigidMotion.of([0, tilt, 0], [0, 0, 0]), make_mount(angle))
+    in_mount = frame.T @ [0, tilt, 0]
+    kept = frame @ (in_mount * [1, 1, 0])
+    assert plan.turn == pytest.approx(in_mount[2], abs=1e-9)
+    assert abs(plan.turn) == pytest.approx(tilt * np.sin(angle), abs=1e-9)
+    assert plan.level_coupling == pytest.approx(kept[2], abs=0.01 * ARCMIN)
+    assert plan.level_coupling == pytest.approx(-tilt * np.sin(angle) * np.cos(angle), abs=0.01 * ARCMIN)
+    # and of the tilt itself only cos^2 comes about
+    assert plan.shims_only.rotation[1] == pytest.approx(tilt * np.cos(angle) ** 2, abs=0.01 * ARCMIN)
+    if angle == 20 * DEG:
+        assert plan.level_coupling / ARCMIN == pytest.approx(-1.607, abs=0.011)  # 5 x 0.34202 x 0.93969
+    # the holes' centre only moves along the normal
+    centre = plan.mount.holes.mean(axis=0)
+    drift = plan.shims_only.displacement(centre)
+    assert np.linalg.norm(drift - plan.mount.normal * (drift @ plan.mount.normal)) < 1e-9
+
+
+@pytest.mark.parametrize(("angle", "rotation_vector"), [(0, [0, 5, 0]), (0, [5, 0, 0]), (20 * DEG, [5, 0, 0])])
+def test_no_coupling(angle, rotation_vector):
+    """A surface that is not inclined, and a tilt about the axis of the inclination itself."""
+    plan = shim_plan(RigidMotion.of(np.array(rotation_vector) * ARCMIN, [0, 0, 0]), make_mount(angle))
+    assert abs(plan.level_coupling) < 1e-9
+    assert abs(plan.turn) < 1e-9
+
+
+def test_level_turn_is_made_by_hand():
+    """A pure turn about Z' on a flat mount needs no shim, only sliding: r times the angle at each hole."""
+    mount = make_mount()
+    plan = shim_plan(RigidMotion.of([0, 0, 4 * ARCMIN], [0, 0, 0]), mount)
+    assert np.abs(plan.change).max() < 1e-17
+    radius = np.linalg.norm(mount.holes[:, :2], axis=1)
+    assert np.linalg.norm(plan.slide, axis=1) == pytest.approx(2 * np.sin(2 * ARCMIN) * radius, rel=1e-12)
+    assert plan.turn == pytest.approx(4 * ARCMIN, rel=1e-12)
+    assert plan.level_coupling == pytest.approx(-4 * ARCMIN, rel=1e-9)
+    # on an inclined surface a piston along Z' slides: 0.3 mm sin 20 deg
+    piston = shim_plan(RigidMotion.of([0, 0, 0], [0, 0, 0.3 * MM]), make_mount(20 * DEG))
+    assert np.linalg.norm(piston.slide, axis=1) == pytest.approx(np.full(4, 0.3 * MM * np.sin(20 * DEG)), rel=1e-12)
+    assert piston.change == pytest.approx(np.full(4, 0.3 * MM * np.cos(20 * DEG)), rel=1e-12)
+
+
+def test_rounding_statistics():
+    """500 random motions: errors of the thickness uniform within half a step (variance step^2/12), and the motion that
+    rounding leaves as these errors propagate by hand to a body on four pads.
+    """
+    rng = np.random.default_rng(6)
+    mount = make_mount(count=4)
+    plans = [shim_plan(random_correction(rng), mount) for _ in range(500)]
+    error = np.array([p.rounded_change - p.change for p in plans])
+    assert np.abs(error).max() <= 0.5 * STEP * (1 + 1e-9)
+    assert stats.kstest((error / STEP + 0.5).ravel(), "uniform").pvalue > FALSE_ALARM
+    # variance of the square of a uniform error: step^4 (1/80 - 1/144) = step^4 / 180
+    z = (np.mean(error**2) - STEP**2 / 12) / (STEP**2 / np.sqrt(180 * error.size))
+    assert abs(z) < stats.norm.isf(FALSE_ALARM / 2)
+    # least squares by hand, flat mount, pads symmetric about O': three independent means over the pads; the wanted turn
+    # of up to 5' moves the pads by some 0.4% of the narrower half width, hence 1% of the largest
+    x, y = mount.holes[0, :2]
+    tilt = np.array([p.rounding_rotation for p in plans])
+    assert tilt[:, 0] == pytest.approx(error @ mount.holes[:, 1] / (4 * y**2), abs=0.01 * STEP / 2 / abs(y))
+    assert tilt[:, 1] == pytest.approx(-error @ mount.holes[:, 0] / (4 * x**2), abs=0.01 * STEP / 2 / abs(x))
+    piston = np.array([p.rounding_piston for p in plans])
+    assert piston == pytest.approx(error.mean(axis=1), abs=0.01 * STEP / 2)
+    predicted = np.array([STEP / np.sqrt(12 * 4) / abs(y), STEP / np.sqrt(12 * 4) / abs(x), STEP / np.sqrt(12 * 4)])
+    # means of four uniform errors are nearly normal (kurtosis -0.3): the variance of 500 has a sigma of 6%
+    ratio = np.array([tilt[:, 0].std(), tilt[:, 1].std(), piston.std()]) / predicted
+    assert ratio == pytest.approx(np.ones(3), abs=5 * 0.5 * 0.063)
+    # what does not fit a plane is the twist of the four pads
+    misfit = np.array([p.pad_misfit for p in plans])
+    twist = np.array([1, -1, 1, -1])
+    assert misfit == pytest.approx(np.outer(error @ twist / 4, twist), abs=0.01 * STEP / 2)
+    # the focal plane: z of the CCD where it was wanted minus where it is
+    place = np.array([[0.0, 0.0], [0.0, 0.115], [0.01, -0.115]])
+    left = np.array([p.focus_error(place) for p in plans])
+    by_hand = -(piston[:, None] + tilt[:, :1] * place[:, 1] - tilt[:, 1:2] * place[:, 0])
+    assert left == pytest.approx(by_hand, abs=0.01 * STEP / 2)
+
+
+def test_three_pads_are_met_exactly_after_rounding():
+    rng = np.random.default_rng(7)
+    mount = make_mount(20 * DEG, 30 * DEG, 3)
+    for _ in range(10):
+        plan = shim_plan(random_correction(rng), mount)
+        rise = plan.achieved.displacement(mount.holes) @ mount.normal
+        assert rise == pytest.approx(plan.rounded_change, abs=1e-15)
+        assert np.abs(plan.pad_misfit).max() < 1e-15
+        assert plan.rounded_change / STEP == pytest.approx(np.round(plan.rounded_change / STEP), abs=1e-9)
+        # rounding tilts, it does not turn: no rotation about the normal is added
+        assert abs(plan.rounding_rotation @ mount.normal) < 1e-6 * ARCMIN
+
+
+def test_covariance_of_the_thickness():
+    """Scatter of the changes over 500 noisy plane fits against the predicted covariance."""
+    rng = np.random.default_rng(9)
+    place = np.array([(x, y) for x in (-10 * MM, 0, 10 * MM) for y in np.linspace(-115, 115, 5) * MM])
+    sigma = np.linspace(3, 8, 15) * UM
+    mount = make_mount(20 * DEG, count=3)
+    exact = 0.1 * MM + place @ [1e-3, -5e-4]
+    ends = np.array([-0.115, 0.115])
+    changes, expected = [], None
+    for _ in range(500):
+        fit = fit_focal_plane(place, exact + sigma * rng.standard_normal(15), sigma)
+        level = line_level(ends, 5 * UM * rng.standard_normal(2), 5 * UM)
+        plan = shim_plan(fit.correction(level), mount)
+        changes.append(plan.change)
+        expected = plan.change_covariance
+    centre = shim_plan(fit_focal_plane(place, exact, sigma).correction(), mount).change
+    error = np.array(changes) - centre
+    statistic = np.einsum("ni,ij,nj->", error, np.linalg.inv(expected), error)
+    assert FALSE_ALARM / 2 < stats.chi2.sf(statistic, 1500) < 1 - FALSE_ALARM / 2
+    assert plan.change_sigma == pytest.approx(np.sqrt(np.diag(expected)))
+
+
+def test_present_shims():
+    """The new thickness is on the workshop's grid even where the present one is not."""
+    mount = make_mount(count=4)
+    now = np.array([2.003, 1.998, 2.011, 2.0]) * MM
+    plan = shim_plan(RigidMotion.of([1 * ARCMIN, 0, 0], [0, 0, -0.1 * MM]), mount, now)
+    assert plan.thickness / STEP == pytest.approx(np.round(plan.thickness / STEP), abs=1e-9)
+    assert plan.rounded_change == pytest.approx(plan.thickness - now, abs=1e-18)
+    assert np.abs(plan.thickness - now - plan.change).max() <= 0.5 * STEP * (1 + 1e-9)
+    assert shim_plan(plan.wanted, mount).thickness is None
+
+
+def test_errors_say_what_to_change():
+    mount = make_mount(count=4, clearance=0.05 * MM)
+    with pytest.raises(ShimError, match=r"hole 0 by 0\.\d+ mm.*allow 0\.05 mm.*mm too little") as caught:
+        shim_plan(RigidMotion.of([0, 0, 5 * ARCMIN], [0, 0, 0]), mount)
+    assert caught.value.holes == (0, 1, 2, 3)
+    with pytest.raises(ShimError, match=r"hole 2 would get -0\.1 mm, .* 0\.1 mm thicker.* 1\.1 mm at") as caught:
+        shim_plan(
+            RigidMotion.of([5 * ARCMIN, 0, 0], [0, 0, 0]), make_mount(count=4), [0.5 * MM, 0.5 * MM, 0.05 * MM, MM]
+        )
+    assert caught.value.holes == (2,)
+    # what it asks for does
+    now = np.array([0.6, 0.6, 0.15, 1.1]) * MM
+    plan = shim_plan(RigidMotion.of([5 * ARCMIN, 0, 0], [0, 0, 0]), make_mount(count=4), now)
+    assert plan.thickness.min() == pytest.approx(0, abs=1e-9)
+    with pytest.raises(ShimError, match=r"least is 0\.3 mm"):
+        shim_plan(RigidMotion.of([0, 0, 0], [0, 0, -0.3 * MM]), make_mount(), 0.5 * MM, least_thickness=0.3 * MM)
+    holes = make_mount().holes
+    with pytest.raises(ShimError, match="2 holes cannot hold a plane"):
+        Mount.of(holes[:2], [0, 0, 1], MM, STEP)
+    with pytest.raises(ShimError, match="on one line"):
+        Mount.of(np.outer(np.arange(4), [0.01, 0.1, 0]), [0, 0, 1], MM, STEP)
+    with pytest.raises(ShimError, match="seen along the normal"):
+        Mount.of([[0, 0, 0], [0, 0.1, 0], [0, 0.05, 0.05]], [0, 0, 1], MM, STEP)
+    for change, message in (
+        ({"normal": [0, 0, 0]}, "other than zero"),
+        ({"step": 0}, "step"),
+        ({"clearance": -1}, "clearance"),
+        ({"holes": np.zeros((4, 2))}, r"\(H, 3\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Mount.of(**({"holes": holes, "normal": [0, 0, 1], "clearance": MM, "step": STEP} | change))
+    with pytest.raises(ValueError, match="present thicknesses"):
+        shim_plan(RigidMotion.of([0, 0, 0], [0, 0, 0]), make_mount(), np.nan)
+    with pytest.raises(ValueError, match="finite"):
+        RigidMotion.of([0, 0, np.nan], [0, 0, 0])
+    with pytest.raises(ValueError, match=r"must be \(3,\)"):
+        RigidMotion.of([0, 0], [0, 0, 0])
+
+
+def test_one_round_of_shimming():
+    """Fit, shim with rounding, turn and slide by hand: 200 mis-set assemblies on a surface inclined by 20 deg.
+
+    The limits: measurement and rounding leave a few um, the line keeps its level within 1' (paper 004: +-40 um, +-1').
+    """
+    rng = np.random.default_rng(10)
+    place = np.array([(x, y) for x in (-10 * MM, -5 * MM, 0, 5 * MM, 10 * MM) for y in np.linspace(-115, 115, 5) * MM])
+    point = np.column_stack([place, np.zeros(25)])
+    mount = make_mount(20 * DEG)
+    ends = np.array([[0, -115 * MM, 0], [0, 115 * MM, 0]])
+    for _ in range(200):
+        matrix, shift = rotation(rng.uniform(-5, 5, 3) * ARCMIN), np.array([0, 0, rng.uniform(-0.3, 0.3) * MM])
+        defocus = -(point @ matrix.T + shift)[:, 2] / matrix[2, 2] + 5 * UM * rng.standard_normal(25)
+        line = ends @ matrix.T
+        level = line_level(line[:, 1], line[:, 0] + 5 * UM * rng.standard_normal(2), 5 * UM)
+        plan = shim_plan(fit_focal_plane(place, defocus, 5 * UM).correction(level), mount, 2 * MM)
+        after = plan.achieved.moved(point) @ matrix.T + shift
+        # rounding 5 um at most at the pads, levered by 115/106 along and nothing across; noise 6 sigma of 2.5 um
+        assert np.abs(after[:, 2]).max() < 25 * UM
+        along = matrix @ rotation(plan.achieved.rotation) @ [0, 1, 0]
+        # noise 0.1', rounding about the inclined normal, second order 0.02'
+        assert abs(np.arctan2(-along[0], along[1])) < 1 * ARCMIN

@@ -1,0 +1,400 @@
+"""Slanted-edge MTF against images whose MTF is known exactly.
+
+Truth is independent of the estimator: the optical transfer function of a circular pupil by formula, or by quadrature over
+the overlap of two pupils if it is aberrated, times the pixel's sincs; the edge-spread function by Gauss-Legendre
+quadrature over frequency, evaluated at each pixel's distance from the edge. Nothing is oversampled, binned or cut off.
+
+Statistical limits are two-sided chi-square quantiles with a false-alarm rate of 1e-6 per comparison.
+"""
+
+import math
+import time
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.interpolate import CubicSpline
+
+from analysis.noise import NoiseModel
+from analysis.rice import rice_bias
+from analysis.slanted_edge import EdgeError, measure_edge
+
+FALSE_ALARM = 1e-6
+WAVELENGTH, F_NUMBER = 650e-9, 9.2
+PAN, MULTISPECTRAL = 7e-6, 28e-6
+DARK, BRIGHT = 150.0, 1150.0
+MIDDLE = (0.13, 0.21)
+# Required of the laboratory: 0.005 (perfect pupil). The estimator keeps a tenth of it.
+ACCURACY = 5e-4
+
+
+def pupil_transfer(s, coma):
+    """OTF of a unit pupil at shear s, (F,) 0 to 1 of the cut-off, with coma of the wavefront, waves of Z7 rms, along it."""
+    if coma == 0.0:
+        return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+    x, w = np.polynomial.legendre.leggauss(48)
+    # overlap of two unit circles at +-s: |v| < sqrt(1 - s^2), |u| < sqrt(1 - v^2) - s
+    angle = x * np.arcsin(np.sqrt(1 - s * s))[:, None]
+    v = np.sin(angle)
+    half = np.sqrt(1 - v * v) - s[:, None]
+    u = half[..., None] * x
+
+    def wavefront(p, q):
+        return coma * np.sqrt(8) * (3 * (p * p + q * q) - 2) * p
+
+    q, shear = v[..., None], s[:, None, None]
+    phase = 2 * np.pi * (wavefront(u + shear, q) - wavefront(u - shear, q))
+    inner = np.exp(1j * phase) @ w * half
+    outer = np.cos(angle) * np.arcsin(np.sqrt(1 - s * s))[:, None]
+    return (inner * outer) @ w / np.pi
+
+
+def transfer(f, angle, pitch=PAN, coma=0.0, smear=0.0):
+    """OTF at f cycles/pixel along the normal of an edge tilted by angle; smear in pixels along the columns."""
+    s = np.minimum(f / pitch * WAVELENGTH * F_NUMBER, 1.0)
+    along, across = f * math.cos(angle), f * math.sin(angle)
+    return pupil_transfer(s, coma) * np.sinc(along) * np.sinc(across) * np.sinc(smear * across)
+
+
+@cache
+def edge_spread(angle, reach, pitch, coma, smear):
+    """E(d) = 1/2 + int_0^fc Im(H exp(2 pi i f d)) / (pi f) df on a grid of 0.01 px, as a spline (exact to 1e-9)."""
+    cutoff = pitch / (WAVELENGTH * F_NUMBER)
+    x, w = np.polynomial.legendre.leggauss(32)
+    # a panel covers at most four periods; sin places panels closely at the cut-off, where H ends as (1 - s)^1.5
+    panels = np.sin(np.linspace(0, np.pi / 2, math.ceil(cutoff * reach / 2.5) + 4)) * cutoff
+    half, mid = np.diff(panels)[:, None] / 2, (panels[1:] + panels[:-1])[:, None] / 2
+    f, weight = (mid + half * x).ravel(), (half * w).ravel()
+    if coma:
+        # the pupil integral is smooth in the frequency; a spline of it is good to 1e-7
+        nodes = np.sin(np.linspace(0, np.pi / 2, 301)) * cutoff
+        parts = pupil_transfer(nodes / cutoff, coma)
+        h = CubicSpline(nodes, parts)(f) * transfer(f, angle, pitch, 0.0, smear)
+        h /= pupil_transfer(np.minimum(f / cutoff, 1 - 1e-12), 0.0)
+    else:
+        h = transfer(f, angle, pitch, 0.0, smear)
+    step, fine = 0.01, 100
+    whole = np.arange(-reach - 1, reach + 2)
+    coarse = np.exp(2j * np.pi * np.outer(whole, f)) * (weight * h / (np.pi * f))
+    table = coarse @ np.exp(2j * np.pi * np.outer(f, np.arange(fine) * step))
+    return CubicSpline((whole[:, None] + np.arange(fine) * step).ravel(), 0.5 + table.imag.ravel())
+
+
+def edge_image(degrees, rows=64, columns=None, pitch=PAN, coma=0.0, smear=0.0, bend=0.0):
+    """Noise-free grey values of a near-vertical edge that passes (row, column) = middle + MIDDLE, bright on the right."""
+    angle, columns = math.radians(degrees), columns or rows
+    row = np.arange(rows)[:, None] - (rows - 1) / 2 - MIDDLE[0]
+    column = np.arange(columns) - (columns - 1) / 2 - MIDDLE[1] - bend * row**2 / 2
+    reach = 6 + math.ceil(math.hypot(rows, columns) / 2)
+    spread = edge_spread(angle, reach, pitch, coma, smear)
+    return DARK + (BRIGHT - DARK) * spread(column * math.cos(angle) - row * math.sin(angle))
+
+
+def error_of(edge, degrees, **optics):
+    """Largest error up to Nyquist, and up to 1 cycle/pixel."""
+    truth = np.abs(transfer(edge.frequency, math.radians(degrees), **optics))
+    error = np.abs(edge.mtf - truth)
+    return error[edge.frequency <= 0.5].max(), error.max()
+
+
+def detector(contrast_e):
+    """A detector of 0.5 DN per electron whose bright side is at contrast_e above the dark side."""
+    return NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 60000.0), 64 + 0.05 * contrast_e, 0.5 * contrast_e
+
+
+@cache
+def repeats(contrast_e, count=200, use_model=True, degrees=4):
+    """Measurements of `count` noisy frames of the same edge."""
+    model, dark, contrast = detector(contrast_e)
+    mean = dark + contrast * (edge_image(degrees) - DARK) / (BRIGHT - DARK)
+    rng = np.random.default_rng([17, contrast_e])
+    # shot and read noise as Gaussians, then rounding to whole grey values
+    sigma = np.sqrt(model.temporal_variance_dn2(mean, 1) - 1 / 12)
+    noise = model if use_model else None
+    return [measure_edge(np.round(rng.normal(mean, sigma)), noise=noise) for _ in range(count)]
+
+
+def chi_square_limits(count):
+    return stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count - 1)
+
+
+# --- accuracy -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pitch", [PAN, MULTISPECTRAL])
+@pytest.mark.parametrize("size", [64, 96, 128])
+@pytest.mark.parametrize("degrees", [2, 3, 5, 7, 10])
+def test_perfect_pupil(degrees, size, pitch):
+    image = edge_image(degrees, size, pitch=pitch)
+    # 28 um: the image is aliased, with 13% of contrast left at 1.5 cycles/pixel
+    across_columns = measure_edge(image)
+    across_rows = measure_edge(np.ascontiguousarray(image.T))
+    for edge, axis in ((across_columns, "x"), (across_rows, "y")):
+        assert edge.axis == axis
+        near, far = error_of(edge, degrees, pitch=pitch)
+        assert near < ACCURACY
+        assert far < 2 * ACCURACY
+        # 1e-4 rad over 64 rows blurs by 0.003 px
+        assert edge.angle == pytest.approx(math.radians(degrees), abs=1e-4)
+        column = (size - 1) / 2 + MIDDLE[1] - MIDDLE[0] * math.tan(math.radians(degrees))
+        assert edge.position == pytest.approx(column, abs=2e-3)
+        # the plateaus are extrapolated: at 32 px the diffraction tail still holds 1.7 DN of 1000
+        assert (edge.dark, edge.bright) == pytest.approx((DARK, BRIGHT), abs=0.1)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(64, 40), (24, 64), (160, 48), (100, 200)])
+def test_regions_that_are_not_square(rows, columns):
+    assert error_of(measure_edge(edge_image(4, rows, columns)), 4)[0] < 2 * ACCURACY
+
+
+def test_smear_along_the_columns():
+    """TDI smear of two pixels: at 10 deg it takes 1% of the MTF at Nyquist of a near-vertical edge."""
+    image = edge_image(10, smear=2.0)
+    with_smear, without = (
+        transfer(np.array([0.5]), math.radians(10), smear=2.0),
+        transfer(np.array([0.5]), math.radians(10)),
+    )
+    assert 1 - (with_smear / without)[0] > 0.01
+    assert error_of(measure_edge(image), 10, smear=2.0)[0] < ACCURACY
+
+
+@pytest.mark.parametrize("degrees", [2, 5, 10])
+def test_coma(degrees):
+    """0.12 waves rms: an asymmetric line-spread function, MTF down by a quarter, phase of the OTF kept."""
+    coma, angle = 0.12, math.radians(degrees)
+    edge = measure_edge(edge_image(degrees, coma=coma))
+    near, _ = error_of(edge, degrees, coma=coma)
+    # required of an aberrated field: 0.01
+    assert near < 0.002
+    truth = transfer(edge.frequency, angle, coma=coma)
+    assert np.abs(truth[32]) < 0.8 * transfer(np.array([0.5]), angle)[0]
+    # the phase, but for the shift to the half height, which is linear in the frequency
+    phase = np.unwrap(np.angle(edge.transfer[1:33] / truth[1:33]))
+    shift = phase @ edge.frequency[1:33] / (edge.frequency[1:33] @ edge.frequency[1:33])
+    assert np.abs(phase - shift * edge.frequency[1:33]).max() < 0.01
+    assert np.abs(np.angle(truth[32])) > 0.1
+
+
+def test_all_ways_round():
+    """Bright left, right, up, down, tilted either way: the same MTF; the angle's sign and the position follow."""
+    image = edge_image(5)
+    first = measure_edge(image)
+    for changed, angle, position in (
+        (image[:, ::-1], -first.angle, 63 - first.position),
+        (image[::-1], -first.angle, first.position),
+        (BRIGHT + DARK - image, first.angle, first.position),
+        (image.T, first.angle, first.position),
+        (image.T[::-1], -first.angle, 63 - first.position),
+    ):
+        edge = measure_edge(changed)
+        # mirrored pixels meet the knots at other places, so the spline differs by its own error
+        np.testing.assert_allclose(edge.mtf[:33], first.mtf[:33], atol=1e-4)
+        assert edge.angle == pytest.approx(angle, abs=1e-5)
+        assert edge.position == pytest.approx(position, abs=1e-3)
+
+
+def test_frequencies_along_the_axis_are_lower_by_the_cosine():
+    edge = measure_edge(edge_image(10))
+    np.testing.assert_allclose(edge.frequency_along_axis / edge.frequency.clip(1e-9), [0] + [math.cos(edge.angle)] * 64)
+
+
+def test_levels_and_scale_do_not_matter():
+    image = edge_image(6)
+    edge, other = measure_edge(image), measure_edge(1e-3 * image - 7.0)
+    np.testing.assert_allclose(other.mtf, edge.mtf, atol=1e-9)
+
+
+def test_spread_functions():
+    edge = measure_edge(edge_image(5))
+    truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN, 0.0, 0.0)
+    near = np.abs(edge.place) < 20
+    np.testing.assert_allclose(
+        edge.esf[near], DARK + (BRIGHT - DARK) * truth(edge.place[near]), atol=5e-4 * (BRIGHT - DARK)
+    )
+    np.testing.assert_allclose(edge.lsf[near], truth(edge.place[near], 1), atol=0.005)
+    assert edge.place[-1] > 25
+
+
+def test_interpolation_and_mtf50():
+    edge = measure_edge(edge_image(5))
+    f = 0.3337
+    assert edge.at(f)[0] == pytest.approx(transfer(np.array([f]), math.radians(5))[0], abs=ACCURACY)
+    half, sigma = edge.frequency_at(0.5)
+    assert transfer(np.array([half]), math.radians(5))[0] == pytest.approx(0.5, abs=ACCURACY)
+    assert sigma > 0
+    assert math.isnan(measure_edge(edge_image(5), frequency=[0.0, 0.1, 0.2]).frequency_at(0.5)[0])
+    with pytest.raises(ValueError, match="outside"):
+        edge.at(1.2)
+
+
+def test_speed():
+    image = edge_image(5)
+    times = []
+    for _ in range(30):
+        start = time.perf_counter()
+        measure_edge(image)
+        times.append(time.perf_counter() - start)
+    # 3 ms alone on a core; the limit leaves room for a busy machine
+    assert min(times) < 0.015
+
+
+# --- noise --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("contrast_e", "use_model"), [(4000, True), (4000, False), (600, True)])
+def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
+    edges = repeats(contrast_e, use_model=use_model)
+    low, high = chi_square_limits(len(edges))
+    checked = 0
+    for k in (4, 8, 16, 24, 32):
+        mtf, sigma = (np.array([getattr(edge, name)[k] for edge in edges]) for name in ("mtf", "sigma"))
+        if mtf.mean() > 5 * sigma.mean():
+            assert low < np.sum((mtf - mtf.mean()) ** 2) / np.mean(sigma**2) < high
+            checked += 1
+    assert checked >= 4
+    for name in ("angle", "position", "curvature"):
+        value = np.array([getattr(edge, name) for edge in edges])
+        sigma = np.array([getattr(edge, f"{name}_sigma") for edge in edges])
+        assert low < np.sum((value - value.mean()) ** 2) / np.mean(sigma**2) < high
+    # no sigma at zero frequency, where the normalisation makes 1
+    assert all(edge.sigma[0] < 1e-9 for edge in edges)
+
+
+def test_no_bias_where_the_signal_is_long():
+    edges = repeats(4000)
+    for k in (8, 16, 24):
+        mtf = np.array([edge.mtf[k] - edge.noise_bias[k] for edge in edges])
+        truth = transfer(edges[0].frequency[k : k + 1], math.radians(4))[0]
+        # 5 sigma of the mean: 6e-7
+        assert abs(mtf.mean() - truth) < 5 * edges[0].sigma[k] / math.sqrt(len(edges)) + ACCURACY
+
+
+@pytest.mark.parametrize("k", [32, 40, 64])
+def test_noise_bias_at_low_light(k):
+    """Some 12 grey values of noise on a contrast of 100: the MTF is too long, by what Rice's distribution says."""
+    edges = repeats(200)
+    mtf = np.array([edge.mtf[k] for edge in edges])
+    truth = transfer(edges[0].frequency[k : k + 1], math.radians(4))[0]
+    across = math.sqrt(np.mean([edge.sigma_across[k] ** 2 for edge in edges]))
+    error = mtf.std(ddof=1) / math.sqrt(len(edges))
+    assert mtf.mean() - truth == pytest.approx(float(rice_bias(truth, across)), abs=5 * error)
+    if k == 64:
+        assert truth < 1e-3
+        assert mtf.mean() > 10 * error
+        # what is left without a signal: mean of |noise|
+        assert mtf.mean() == pytest.approx(across * math.sqrt(math.pi / 2), abs=5 * error)
+    # what is reported knows no truth; where signal and noise are alike it is good to a factor of two
+    reported = np.mean([edge.noise_bias[k] for edge in edges])
+    assert 0.5 < reported / float(rice_bias(truth, across)) < 2.0
+
+
+def test_frames_and_fixed_pattern_enter_the_sigma():
+    image = np.round(edge_image(4) + np.random.default_rng(3).normal(0, 4, (64, 64)))
+    plain = NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 60000.0)
+    uneven = NoiseModel(0.5, 6.0, 0.0, 64.0, 0.02, 10.0, 60000.0)
+    one, many = (measure_edge(image, noise=plain, frames=n) for n in (1, 16))
+    # temporal noise alone: a quarter. The term of the angle is of second order.
+    assert many.sigma[16] == pytest.approx(one.sigma[16] / 4, rel=0.01)
+    assert measure_edge(image, noise=uneven, frames=16).sigma[16] > 2 * many.sigma[16]
+
+
+def test_noise_is_estimated_on_both_sides():
+    model, dark, contrast = detector(4000)
+    edges = repeats(4000, use_model=False)
+    for name, level in (("noise_dark", dark), ("noise_bright", dark + contrast)):
+        found = np.mean([getattr(edge, name) ** 2 for edge in edges])
+        # 200 x 1500 pixels: 0.26% of the variance per sigma
+        assert found == pytest.approx(float(model.temporal_variance_dn2(level, 1)), rel=0.015)
+
+
+def test_curvature_is_found():
+    bend = 4e-4
+    edge = measure_edge(edge_image(4, bend=bend))
+    # the shape is made along the row, and the fit of a straight line takes part of the blur: 10%
+    assert edge.curvature == pytest.approx(bend, rel=0.1)
+    assert edge.curvature > 5 * edge.curvature_sigma
+    assert abs(measure_edge(edge_image(4)).curvature) < 1e-6
+
+
+# --- bad input ----------------------------------------------------------------------------------------------------------
+
+
+def noisy(image, sigma=2.0):
+    return image + np.random.default_rng(5).normal(0, sigma, image.shape)
+
+
+def with_nan():
+    image = edge_image(5)
+    image[3, 4] = np.nan
+    return image
+
+
+def two_edges(centre):
+    row, column = np.indices((64, 64)) - 31.5
+    return noisy(DARK + 1000.0 * (np.abs(column - 0.1 * row - centre) < 12))
+
+
+def corner():
+    image = edge_image(5)
+    image[:32, :] = DARK
+    return noisy(image)
+
+
+def spot():
+    image = edge_image(5)
+    image[10:16, 50:56] += 400
+    return noisy(image)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (noisy(np.full((64, 64), 500.0)), "no edge in the region.*move"),
+        (np.full((64, 64), 500), "all pixels have the same value"),
+        (np.tile(np.linspace(0, 1000, 64), (64, 1)) + noisy(np.zeros((64, 64))), "no sharp edge|only"),
+        (np.minimum(noisy(edge_image(5), 8), 1150), "share the highest value 1150.*lower the exposure"),
+        (np.maximum(noisy(edge_image(5), 8), 150), "share the lowest value 150.*raise the offset"),
+        (edge_image(5)[:16, :], "too small: take at least 32"),
+        (edge_image(5, 64)[:, 18:46], "28 px across the near-vertical edge"),
+        (noisy(edge_image(0)), "0.00 deg.*2 to 10 deg"),
+        (noisy(edge_image(0.3)), "leaves gaps of .* longer along the edge"),
+        (noisy(edge_image(45)), "near 45 deg.*tilt the target by 2 to 10 deg|gaps"),
+        (noisy(edge_image(10, 200, 64)[:, 18:]), "the edge leaves the region.*wider or shorter"),
+        (noisy(edge_image(5)[:, 26:58]), "px of the region's side.*centre"),
+        (two_edges(0.0), "no single edge.*two edges"),
+        (two_edges(14.0), "two edges|second edge|more than one"),
+        (corner(), "cannot be followed|more than one"),
+        (spot(), "more than one straight edge: near its row 1[0-6], column 5[0-6].*speck"),
+        (noisy(edge_image(5), 300.0), "contrast of .* times the noise of a pixel.*average more frames"),
+        (with_nan(), "1 pixels of the region are not finite"),
+        (np.zeros((4, 64, 64)), r"must be a plane.*\(4, 64, 64\)"),
+        (edge_image(5).astype(complex), "real grey values"),
+    ],
+)
+def test_bad_regions_are_explained(image, message):
+    with pytest.raises(EdgeError, match=message):
+        measure_edge(image)
+
+
+def test_stated_saturation():
+    image = noisy(edge_image(5))
+    with pytest.raises(EdgeError, match="pixels reach the saturation level of 1100: lower"):
+        measure_edge(image, saturation=1100)
+    with pytest.raises(EdgeError, match="saturation level of 1000"):
+        measure_edge(image, noise=NoiseModel(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1000.0))
+    # a computed image in whole grey values has a true plateau
+    plateau = np.round(edge_image(5, pitch=MULTISPECTRAL) / 4)
+    with pytest.raises(EdgeError, match="computed without noise"):
+        measure_edge(plateau)
+    truth = transfer(np.array([0.5]), math.radians(5), MULTISPECTRAL)[0]
+    # steps of 1 in 250, pi cycles of slope: 0.004 rms if they were independent
+    assert measure_edge(plateau, saturation=math.inf).mtf[32] == pytest.approx(truth, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"oversampling": 1}, {"oversampling": 2.5}, {"frequency": [0.5]}, {"frequency": [0.0, 3.0]}]
+)
+def test_arguments_that_make_no_sense(wrong):
+    with pytest.raises(ValueError, match=r"oversampling|frequency"):
+        measure_edge(edge_image(5), **wrong)

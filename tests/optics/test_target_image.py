@@ -1,0 +1,342 @@
+"""Images of targets against closed forms, against brute force, and the makers of targets."""
+
+import numpy as np
+import pytest
+from scipy.special import erf, j0, j1, struve
+
+from optics import quadrature
+from optics.aperture import Rectangle
+from optics.diffraction import Grid, airy
+from optics.target_image import EdgeProfile, target_image
+from optics.test_target import Target, bar_group, bar_target, pinhole, siemens_star, slanted_edge
+from optics.vector_shape import HalfPlane, Polygon
+
+WAVELENGTH, F_NUMBER, PITCH = 650e-9, 9.2, 7e-6
+CUTOFF = 1.0 / (WAVELENGTH * F_NUMBER)
+COARSE, COARSE_CUTOFF = 28e-6, 241e3
+FAINT = 1e-6  # what the periods' copies may add, see target_image
+TILT = np.radians(5.0)
+
+
+def diffraction(cutoff: float = CUTOFF, pitch: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)):
+    """Clear circular pupil, square pixel, image shift."""
+
+    def transfer(fx, fy):
+        q = np.minimum(np.hypot(fx, fy) / cutoff, 1.0)
+        mtf = 2.0 / np.pi * (np.arccos(q) - q * np.sqrt(1.0 - q * q))
+        phase = np.exp(-2j * np.pi * (fx * shift[0] + fy * shift[1]))
+        return mtf * np.sinc(fx * pitch) * np.sinc(fy * pitch) * phase
+
+    return transfer
+
+
+def gaussian(sigma: float):
+    return lambda fx, fy: np.exp(-2.0 * (np.pi * sigma) ** 2 * (fx**2 + fy**2)) + 0j
+
+
+def centred(count: int, step: float) -> Grid:
+    return Grid(-0.5 * (count - 1) * step, step, count)
+
+
+def box(x0: float, x1: float, y0: float, y1: float) -> Polygon:
+    return Polygon(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
+
+
+# edge profiles
+
+
+def test_edge_of_a_gaussian_with_an_odd_part() -> None:
+    """H = exp(-(2 pi f s)^2/2 - 2 pi i f a) (1 + c (2 pi i f)^3): E is (1 + c d^3/dx^3) of a shifted error function."""
+    s, a, c = 4e-6, 3e-6, (2e-6) ** 3
+    normal = np.array([0.6, 0.8])
+
+    def transfer(fx, fy):
+        f = fx * normal[0] + fy * normal[1]
+        return np.exp(-2.0 * (np.pi * s * f) ** 2 - 2j * np.pi * f * a) * (1.0 + c * (2j * np.pi * f) ** 3)
+
+    profile = EdgeProfile.build(transfer, normal, 1.4 / s, 60e-6)
+    d = np.linspace(-60e-6, 60e-6, 997)
+    u = (d - a) / s
+    bell = np.exp(-0.5 * u * u) / np.sqrt(2.0 * np.pi)
+    want = 0.5 * (1.0 + erf(u / np.sqrt(2.0))) + c / s**3 * (u * u - 1.0) * bell
+    np.testing.assert_allclose(profile(d), want, rtol=0, atol=1e-8)  # the spline's share; H ends at 1e-17
+
+
+def test_edge_of_a_clear_circular_pupil() -> None:
+    """Its line spread is fc H1(2 pi fc d)/(pi fc d)^2 with Struve's H1; its tail falls as 2/(pi^3 fc d)."""
+    reach = 400e-6
+    profile = EdgeProfile.build(diffraction(), np.array([1.0, 0.0]), CUTOFF, reach)
+    node, weight = np.polynomial.legendre.leggauss(400)
+    for d in (1e-7, 3e-6, 17e-6, 120e-6, reach):
+        z = np.pi * CUTOFF * 0.5 * d * (node + 1.0)
+        half = 0.5 * d * np.sum(weight * CUTOFF * struve(1, 2.0 * z) / z**2)
+        np.testing.assert_allclose(profile(np.array([d, -d])), [0.5 + half, 0.5 - half], rtol=0, atol=1e-8)
+    assert 1.0 - profile(reach) == pytest.approx(2.0 / (np.pi**3 * CUTOFF * reach), rel=0.01)
+
+
+def deep_polygon(edge: HalfPlane, half_length: float, depth: float) -> Polygon:
+    """A rectangle on the bright side of an edge."""
+    along = np.array([-edge.normal[1], edge.normal[0]])
+    ends = np.array([half_length * along, -half_length * along])
+    return Polygon(np.concatenate([ends, ends[::-1] + depth * edge.normal]))
+
+
+@pytest.mark.parametrize("direction", ["x", "y"])
+def test_half_plane_is_a_huge_polygon(direction: str) -> None:
+    x, y = centred(24, PITCH), centred(20, PITCH)
+    target = slanted_edge(TILT, direction)
+    edge = target.parts[0][1]
+    # without far tails: to rounding and the spline
+    blur = gaussian(4e-6)
+    near = target_image(target, blur, 3.5e5, x, y)
+    far = target_image(Target(0.0, ((1.0, deep_polygon(edge, 2e-4, 2e-4)),)), blur, 3.5e5, x, y)
+    np.testing.assert_allclose(far, near, rtol=0, atol=1e-8)
+    assert near.min() < 1e-6 < 1.0 - 1e-6 < near.max()
+    # with a circular pupil's tails, 1/(pi^3 fc r^3): the polygon lacks their integral from its sides at the distance
+    # R(angle) on, as seen from the middle of its edge; pixels 1/18 of this distance away lack up to 1/8 more or less
+    half_length, depth = 1e-3, 2.5e-3
+    x, y = centred(16, PITCH), centred(12, PITCH)
+    transfer = diffraction(pitch=PITCH)
+    near = target_image(target, transfer, CUTOFF, x, y)
+    far = target_image(Target(0.0, ((1.0, deep_polygon(edge, half_length, depth)),)), transfer, CUTOFF, x, y)
+    angle = np.pi * (np.arange(2000) + 0.5) / 2000
+    lacking = np.mean(np.maximum(np.abs(np.cos(angle)) / half_length, np.sin(angle) / depth)) / (np.pi**2 * CUTOFF)
+    assert lacking < 5e-4
+    np.testing.assert_allclose(near - far, lacking, rtol=0.125, atol=0)
+
+
+def test_slanted_edge_runs_and_brightens_as_said() -> None:
+    x = centred(33, PITCH)
+    upright = target_image(slanted_edge(TILT, "y"), diffraction(), CUTOFF, x, x)
+    assert upright[16, 0] < 0.05 < 0.95 < upright[16, -1]
+    lying = target_image(slanted_edge(TILT, "x"), diffraction(), CUTOFF, x, x)
+    assert lying[0, 16] < 0.05 < 0.95 < lying[-1, 16]
+    # turned from +x toward +y: the upright edge leans toward -x at larger y
+    rows = np.arange(33) - 16.0
+    place = [np.interp(0.5, row, rows) for row in upright]
+    assert np.polyfit(rows, place, 1)[0] == pytest.approx(
+        -np.tan(TILT), rel=0.05
+    )  # crossings between pixels are taken on straight lines
+
+
+def test_profile_is_reused_for_other_offsets() -> None:
+    x = centred(16, PITCH)
+    normal = np.array([np.cos(TILT), np.sin(TILT)])
+    profile = EdgeProfile.build(diffraction(pitch=PITCH), normal, CUTOFF, 2e-4)
+    for offset in (0.0, 2.7e-6):
+        edge = HalfPlane((offset, 0.0), normal)
+        want = target_image(Target(0.0, ((1.0, edge),)), diffraction(pitch=PITCH), CUTOFF, x, x)
+        np.testing.assert_allclose(profile.image(edge, x, x), want, rtol=0, atol=1e-8)
+    with pytest.raises(ValueError, match="normal"):
+        profile.image(HalfPlane((0.0, 0.0), (1.0, 0.0)), x, x)
+    with pytest.raises(ValueError, match="the edge profile reaches"):
+        profile.image(HalfPlane((1e-3, 0.0), normal), x, x)
+
+
+# finite shapes
+
+
+def test_pinhole_is_the_airy_pattern_spread_over_a_disk() -> None:
+    diameter, place = 20e-6, np.array([1.3e-6, -2.1e-6])
+    x, y = centred(24, 3e-6), centred(20, 3e-6)
+    target = pinhole(diameter).mapped(lambda points: points + place)
+    got = target_image(target, diffraction(), CUTOFF, x, y)
+    nodes = quadrature.disk(24, 96)
+    u = x.points()[:, None] - place[0] - 0.5 * diameter * nodes.x
+    v = y.points()[:, None] - place[1] - 0.5 * diameter * nodes.y
+    peak = 0.25 * np.pi * CUTOFF**2
+    spot = airy(np.hypot(u[None, :], v[:, None]), WAVELENGTH, F_NUMBER)
+    want = spot @ (peak * 0.25 * diameter**2 * nodes.weight)
+    np.testing.assert_allclose(got, want, rtol=0, atol=FAINT)
+    assert want.max() > 0.8
+
+
+@pytest.mark.parametrize("radius", [1e-5, 1e-4, 4e-4])
+def test_middle_of_a_disk_is_the_encircled_energy(radius: float) -> None:
+    """1 - J0^2 - J1^2 (Rayleigh), also for a disk that reaches far beyond the window."""
+    x = centred(65, PITCH)
+    z = np.pi * radius * CUTOFF
+    middle = target_image(pinhole(2.0 * radius), diffraction(), CUTOFF, x, x)[32, 32]
+    assert middle == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=FAINT)
+
+
+def test_pinhole_integrates_to_its_area() -> None:
+    """With a Gaussian the whole image lies in the window: the sum over pixels is area * H(0) to rounding."""
+    x, y = centred(40, 4e-6), centred(44, 4e-6)
+    got = target_image(pinhole(25e-6), lambda fx, fy: 0.8 * gaussian(5e-6)(fx, fy), 2.5e5, x, y)
+    assert np.sum(got) * 16e-12 == pytest.approx(0.8 * np.pi * 12.5e-6**2, rel=1e-8)
+
+
+def test_coarse_pixels_against_a_fine_raster() -> None:
+    """Boxes on a raster of 2 um, its discrete Fourier transform times the cell's sinc, H, and every 14th sample.
+
+    The raster's transform is exact for the boxes repeated with its period of 4.1 mm. The copies add their tails,
+    area/(pi^3 fc P^3) times the lattice sum 9.03 of 1/n^3.
+    """
+    count, cell, ratio = 2048, 2e-6, 14
+    assert ratio * cell == COARSE
+    raster = np.zeros((count, count))
+    parts = []
+    for i0, i1, j0_, j1_, level in (
+        (1000, 1100, 990, 1003, 0.9),
+        (940, 997, 1010, 1085, 0.5),
+        (900, 903, 880, 1180, 1.0),
+    ):
+        raster[i0:i1, j0_:j1_] = level
+        parts.append((level, box(j0_ * cell, j1_ * cell, i0 * cell, i1 * cell)))
+    fx, fy = np.meshgrid(np.fft.rfftfreq(count, cell), np.fft.fftfreq(count, cell))
+    shift = (5e-6, -3e-6)
+    transfer = diffraction(COARSE_CUTOFF, COARSE, shift)
+    spectrum = np.fft.rfft2(raster) * np.sinc(fx * cell) * np.sinc(fy * cell) * transfer(fx, fy)
+    fine = np.fft.irfft2(spectrum, s=raster.shape)
+    first = 1024 - 10 * ratio
+    want = fine[first : first + 20 * ratio : ratio, first : first + 24 * ratio : ratio]
+    start = (first + 0.5) * cell
+    got = target_image(
+        Target(0.0, tuple(parts)), transfer, COARSE_CUTOFF, Grid(start, COARSE, 24), Grid(start, COARSE, 20)
+    )
+    tails = 9.03 * np.sum(raster) * cell**2 / (np.pi**3 * COARSE_CUTOFF * (count * cell) ** 3)
+    assert tails < 2e-6
+    np.testing.assert_allclose(got, want - tails, rtol=0, atol=0.1 * tails + FAINT)
+    assert got.max() > 0.5
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3])
+def test_bars_have_the_fundamental_of_the_transfer_function(angle: float) -> None:
+    """A square wave of unit height has the amplitude 2/pi; its harmonics from the third on lie beyond the cut-off."""
+    frequency = 65e3
+    x = centred(81, 1.9e-6)
+    target = bar_group(frequency, 61, 1.2e-3, angle)
+    transfer = diffraction(pitch=PITCH)
+    image = target_image(target, transfer, CUTOFF, x, x)
+    n = np.array([np.cos(angle), np.sin(angle)])
+    phase = 2.0 * np.pi * frequency * (n[0] * x.points() + n[1] * x.points()[:, None]).ravel()
+    columns = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)], axis=-1)
+    level, cosine, sine = np.linalg.lstsq(columns, image.ravel())[0]
+    assert 3.0 * frequency > CUTOFF
+    # the ends of the group, 0.46 mm away, take some 4/(pi^3 fc d) of the level and 1e-5 of the amplitude
+    assert cosine == pytest.approx(2.0 / np.pi * transfer(*(frequency * n)).real, abs=2e-5)
+    assert abs(sine) < 2e-5
+    assert level == pytest.approx(0.5, abs=2e-3)
+
+
+def test_star_and_bars_have_their_symmetries() -> None:
+    x = centred(40, PITCH)
+    transfer = diffraction(pitch=PITCH)
+    star = target_image(siemens_star(8, 1.1e-4, 1e-5), transfer, CUTOFF, x, x)
+    for other in (np.rot90(star), star[::-1], star.T):
+        np.testing.assert_allclose(other, star, rtol=0, atol=1e-12)
+    assert np.ptp(star) > 0.9
+    # an odd star turned by half a turn is its own complement within the rim
+    odd = target_image(siemens_star(9, 4e-4), transfer, CUTOFF, x, x)
+    np.testing.assert_allclose((odd + odd[::-1, ::-1])[10:30, 10:30], 1.0, rtol=0, atol=0.01)
+    bars = target_image(bar_group(30e3, 5, 1.5e-4), transfer, CUTOFF, x, x)
+    for other in (bars[::-1], bars[:, ::-1]):
+        np.testing.assert_allclose(other, bars, rtol=0, atol=1e-12)
+    turned = target_image(bar_group(30e3, 5, 1.5e-4, 0.5 * np.pi), transfer, CUTOFF, x, x)
+    np.testing.assert_allclose(turned, bars.T, rtol=0, atol=1e-12)
+
+
+def test_shift_of_the_target_is_a_phase_of_the_transfer_function() -> None:
+    shift = (2.3e-6, -1.7e-6)
+    x, y = centred(28, PITCH), centred(24, PITCH)
+    for target in (siemens_star(6, 7e-5), slanted_edge(TILT), pinhole(5e-5)):
+        moved = target.mapped(lambda points: points + shift)
+        plain = target_image(moved, diffraction(pitch=PITCH), CUTOFF, x, y)
+        phased = target_image(target, diffraction(pitch=PITCH, shift=shift), CUTOFF, x, y)
+        # rounding; an edge profile interpolates at other places
+        np.testing.assert_allclose(plain, phased, rtol=0, atol=1e-8)
+        assert np.max(np.abs(plain - target_image(target, diffraction(pitch=PITCH), CUTOFF, x, y))) > 0.01
+
+
+def test_levels_add() -> None:
+    """Babinet: a dark disk on bright is bright less a bright disk; an edge and a disk beside it sum."""
+    x = centred(24, PITCH)
+    transfer = diffraction(pitch=PITCH)
+    (_, disk), (_, edge) = pinhole(4e-5).parts[0], slanted_edge(TILT).parts[0]
+    alone = target_image(Target(0.0, ((1.0, disk),)), transfer, CUTOFF, x, x)
+    np.testing.assert_allclose(
+        target_image(Target(0.9, ((-0.7, disk),)), transfer, CUTOFF, x, x), 0.9 - 0.7 * alone, rtol=0, atol=1e-13
+    )
+    away = edge.mapped(lambda points: points + np.array([4e-5, 0.0]))
+    both = target_image(Target(0.1, ((0.5, away), (0.2, disk))), transfer, CUTOFF, x, x)
+    lone = target_image(Target(0.0, ((1.0, away),)), transfer, CUTOFF, x, x)
+    np.testing.assert_allclose(both, 0.1 + 0.5 * lone + 0.2 * alone, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "target", [siemens_star(12, 2e-4, 1e-5), pinhole(4.4e-4), pinhole(9e-4)], ids=["star", "disk", "huge"]
+)
+def test_default_guard(target: Target) -> None:
+    """It agrees with copies 3 mm away to the stated error."""
+    x = centred(64, PITCH)
+    got = target_image(target, diffraction(pitch=PITCH), CUTOFF, x, x)
+    want = target_image(target, diffraction(pitch=PITCH), CUTOFF, x, x, guard=3e-3)
+    np.testing.assert_allclose(got, want, rtol=0, atol=FAINT)
+
+
+# the makers
+
+
+def test_bar_target_keeps_to_its_layout() -> None:
+    """In the image the patches are even to the blur's tail at the clearance, and the group holds the bars."""
+    clearance, frequency = 8 * PITCH, 0.5 / PITCH
+    region = Rectangle(40 * PITCH, 40 * PITCH, (3e-6, -8e-6))
+    x = Grid(region.centre[0] - 39.5 * PITCH, PITCH, 80)
+    y = Grid(region.centre[1] - 39.5 * PITCH, PITCH, 80)
+    for direction, tilt in (("x", 0.0), ("y", 0.0), ("x", 0.05)):
+        target, layout = bar_target(frequency, 12, region, clearance, direction, tilt)
+        image = target_image(target, diffraction(pitch=PITCH), CUTOFF, x, y)
+        group, bright, dark = (
+            image[patch.contains(x.points(), y.points()[:, None])]
+            for patch in (layout.group, layout.bright, layout.dark)
+        )
+        assert min(len(group), len(bright), len(dark)) > 50
+        tail = 2.0 / (np.pi**3 * CUTOFF * clearance)  # of a long edge; a square has four
+        assert 1.0 - 4.0 * tail < bright.min() <= bright.max() < 1.0
+        assert 0.0 < dark.max() < tail
+        shapes = [shape for _, shape in target.parts]
+        assert len(shapes) == 13
+        x0, x1, y0, y1 = np.array([shape.bounds for shape in shapes]).T
+        left, right, low, high = region.bounds
+        room = min(x0.min() - left, right - x1.max(), y0.min() - low, high - y1.max())
+        assert room > clearance * (1.0 - 1e-9)
+        # bars at Nyquist: what is left of their contrast swings with the phase between bars and pixels
+        assert np.mean(group) == pytest.approx(0.5, abs=0.05)
+
+
+def test_bar_group_has_half_of_its_period_bright() -> None:
+    target = bar_group(50e3, 4, 1e-4)
+    edges = np.array([shape.bounds for _, shape in target.parts])
+    np.testing.assert_allclose(edges[:, 1] - edges[:, 0], 10e-6, rtol=1e-12)
+    np.testing.assert_allclose(np.diff(edges[:, 0]), 20e-6, rtol=1e-12)
+    np.testing.assert_allclose([np.mean(edges[:, :2]), *edges[0, 2:]], [0.0, -5e-5, 5e-5], atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: slanted_edge(np.radians(45.0)), "below 45 degrees"),
+        (lambda: slanted_edge(0.1, "column"), '"x" or "y"'),
+        (lambda: bar_group(0.0, 3, 1e-4), "positive frequency"),
+        (lambda: bar_group(1e4, 0, 1e-4), "whole number of bars"),
+        (lambda: bar_group(1e4, 3, 0.0), "positive length"),
+        (lambda: bar_target(1e4, 20, Rectangle(1e-4, 1e-4), 1e-5), "do not fit a region"),
+        (lambda: bar_target(7e4, 5, Rectangle(1e-4, 1e-4), 3e-5), "no room for the patches"),
+        (lambda: siemens_star(1, 1e-4), "two spokes"),
+        (lambda: siemens_star(8, 1e-4, 1e-4), "inner < radius"),
+        (lambda: pinhole(-1.0), "positive diameter"),
+        (lambda: Target(0.5, ((0.6, pinhole(1e-5).parts[0][1]),)), "between 0 and 1"),
+        (lambda: image_of(pinhole(1e-3), guard=1e-4), "enlarge the guard"),
+        (lambda: image_of(pinhole(1e-5), cutoff=0.0), "cutoff must be positive"),
+        (lambda: image_of(pinhole(1e-5), transfer=lambda fx, fy: np.nan * fx), "finite number"),
+    ],
+)
+def test_bad_input_is_refused(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def image_of(target: Target, cutoff: float = CUTOFF, guard: float | None = None, transfer=None) -> np.ndarray:
+    x = centred(8, PITCH)
+    return target_image(target, transfer or diffraction(), cutoff, x, x, guard)

@@ -1,0 +1,286 @@
+"""The optical transfer function: closed forms, the transform of the diffraction image, cut-offs, its table."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+from optics import quadrature, transfer, zernike
+from optics.diffraction import Grid, PupilField, image
+from optics.pupil_edge import PupilEdge
+from optics.pupil_function import PupilFunction, circular_pupil, fit_pupils
+from optics.quadrature import PupilNodes
+from optics.transfer import TransferTable, polychromatic_transfer
+from optics.tree import Motion
+from scenes.camera_model import IMAGE
+from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
+
+F_NUMBER = 9.2
+NODES = quadrature.disk(12, 48)
+FOCUS = np.zeros(1)
+BAND = np.linspace(450e-9, 900e-9, 7)
+DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.8, 0.6], [-0.6, 0.8]])
+
+
+def perfect(ratio: np.ndarray) -> np.ndarray:
+    """Diffraction transfer function of an evenly lit circle over frequency / cut-off."""
+    v = np.minimum(ratio, 1.0)
+    return 2.0 / np.pi * (np.arccos(v) - v * np.sqrt(1.0 - v * v))
+
+
+def circle(eikonal: np.ndarray | None = None, nodes: PupilNodes = NODES) -> PupilField:
+    """Evenly lit circular pupil of F/9.2 with an eikonal at the nodes, metres."""
+    aperture = 0.5 / F_NUMBER
+    amplitude = nodes.weight * aperture / np.sqrt(np.pi)
+    flat = np.zeros(nodes.count) if eikonal is None else eikonal
+    return PupilField(aperture * nodes.x[None], aperture * nodes.y[None], flat[None], amplitude[None], WAVELENGTH)
+
+
+def frequencies(pupil: PupilFunction, ratios: np.ndarray, wavelength: float = WAVELENGTH) -> np.ndarray:
+    """Frequencies at ratios of the cut-off along ``DIRECTIONS``, (directions * ratios, 2)."""
+    unit = DIRECTIONS * pupil.cutoff(DIRECTIONS, wavelength)[:, None]
+    return (ratios[:, None] * unit[:, None]).reshape(-1, 2)
+
+
+def random_frequencies(pupil: PupilFunction, count: int, wavelength: float, reach: float = 0.75) -> np.ndarray:
+    most = np.max(pupil.cutoff(DIRECTIONS, wavelength))
+    return np.random.default_rng(4).uniform(-reach, reach, (count, 2)) * most
+
+
+@pytest.fixture(scope="module")
+def traced(backend, gf7) -> PupilFunction:
+    (pupil,) = fit_pupils(Camera(backend, gf7, PERTURBED).field(NODES), NODES)
+    return pupil
+
+
+@pytest.mark.parametrize("pupil", [circular_pupil(F_NUMBER), *fit_pupils(circle(), NODES)], ids=["ideal", "fitted"])
+def test_perfect_circle(pupil: PupilFunction) -> None:
+    ratio = np.array([0.0, 1e-9, 1e-6, 1e-4, 0.01, 0.1, 0.3, 0.5, 0.8, 0.95, 0.999, 0.999999, 1.0 + 1e-9, 1.1, 3.0])
+    got = transfer.transfer(pupil, frequencies(pupil, ratio), WAVELENGTH, FOCUS)[0].reshape(4, -1)
+    np.testing.assert_allclose(pupil.cutoff(DIRECTIONS, WAVELENGTH), 1.0 / (WAVELENGTH * F_NUMBER), rtol=1e-12)
+    np.testing.assert_allclose(got, np.broadcast_to(perfect(ratio), got.shape), rtol=0, atol=1e-9)
+    assert np.all(got[:, ratio > 1.0] == 0.0)
+
+
+@pytest.mark.parametrize("waves", [0.25, 1.0, 3.0])
+def test_defocused_circle_against_hopkins(waves: float) -> None:
+    """Hopkins' single integral, by adaptive quadrature: W rho^2 over a circle, paper of 1955, before his eq. (20)."""
+    (pupil,) = fit_pupils(circle(waves * WAVELENGTH * (NODES.x**2 + NODES.y**2)), NODES)
+    ratio = np.array([0.02, 0.1, 0.25, 0.5, 0.75, 0.95])
+    want = []
+    for v in ratio:
+        a = 8.0 * np.pi * waves * v
+        edge = np.sqrt(1.0 - v * v)
+        area = quad(lambda t, a=a, v=v: np.sin(a * (np.cos(t) - v)) * np.cos(t), 0.0, np.arcsin(edge), epsabs=1e-13)[0]
+        want.append(4.0 / (np.pi * a) * area)
+    got = transfer.transfer(pupil, frequencies(pupil, ratio), WAVELENGTH, FOCUS)[0].reshape(4, -1)
+    np.testing.assert_allclose(got, np.broadcast_to(want, got.shape), rtol=0, atol=1e-8)
+    assert np.max(np.abs(perfect(ratio) - want)) > 0.1  # the defocus is seen
+
+
+@pytest.mark.parametrize("dz", [-1e-3, 1e-3])
+def test_a_perfect_point_beside_the_origin_and_out_of_focus(dz: float) -> None:
+    """Waves that are in phase at (x0, y0, dz) make a perfect image there: sign of defocus and of the image's place."""
+    x0, y0 = 40e-6, -25e-6
+    field = circle()
+    w = np.sqrt(1.0 - field.u**2 - field.v**2)
+    (pupil,) = fit_pupils(replace(field, eikonal=-(x0 * field.u + y0 * field.v + dz * w)), NODES)
+    ratio = np.linspace(0.05, 0.95, 10)
+    f = frequencies(pupil, ratio)
+    got = transfer.transfer(pupil, f, WAVELENGTH, np.array([-dz, 0.0, dz]))
+    want = np.tile(perfect(ratio), 4) * np.exp(-2j * np.pi * f @ [x0, y0])
+    np.testing.assert_allclose(got[2], want, rtol=0, atol=1e-8)
+    assert np.all(np.max(np.abs(np.abs(got[:2]) - np.abs(want)), axis=-1) > 0.3)
+
+
+@pytest.mark.parametrize("dz", [-300e-6, 0.0, 300e-6])
+def test_against_the_transform_of_the_image(backend, gf7, traced: PupilFunction, dz: float) -> None:
+    """The image on a moved detector, summed with the kernel, against the transfer function of the unmoved one.
+
+    The far wings of an image fall only like 1/r^3 and cannot be had. So the image is multiplied by a Gaussian window
+    that is 1e-9 at the grid's edge, and the transfer function convolved with the window's transform by Gauss-Hermite
+    quadrature, which is as exact. The sum over the samples has no error: image and window are band-limited.
+    """
+    # light reaches the image along -z of the prescription: downstream is -z
+    camera = Camera(backend, gf7, {**PERTURBED, IMAGE: Motion(shift=(0.0, 0.0, -dz))})
+    width, step, n = 30e-6, 2.5e-6, 157
+    axis = Grid(-0.5 * (n - 1) * step, step, n)
+    fine = quadrature.disk_for(2.0 * np.pi * 0.055 * np.hypot(*2 * [0.5 * n * step]) / WAVELENGTH)
+    origin = Camera(backend, gf7, PERTURBED).centre
+    window = np.exp(-0.5 * (axis.points() / width) ** 2)
+    light = image(camera.field(fine, origin), axis, axis)[0] * window[:, None] * window * step**2
+
+    # far enough from zero, where the transfer function has a cusp, and from the cut-off, for Gauss' rule
+    ratio = np.array([0.25, 0.4, 0.6, 0.8])
+    f = frequencies(traced, ratio)
+    x_wave, y_wave = (np.exp(-2j * np.pi * np.outer(f[:, i], axis.points())) for i in (0, 1))
+    got = np.einsum("mr,rc,mc->m", y_wave, light, x_wave)
+
+    node, weight = np.polynomial.hermite_e.hermegauss(10)
+    weight = weight / np.sum(weight)
+    near = np.stack(np.meshgrid(node, node, indexing="ij"), axis=-1).reshape(-1, 2) / (2.0 * np.pi * width)
+    around = transfer.transfer(traced, (f[:, None] + near).reshape(-1, 2), WAVELENGTH, np.array([dz]))[0]
+    want = around.reshape(len(f), -1) @ np.outer(weight, weight).ravel()
+    # the window ends at 1e-9, each quadrature's error is about as large
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-8)
+    assert np.max(np.abs(want)) > 0.15
+    assert np.max(np.abs(np.angle(want))) > 0.05  # coma of the moved mirrors: the phase is checked as well
+
+
+def test_symmetry_energy_and_shift(backend, gf7, traced: PupilFunction) -> None:
+    f = random_frequencies(traced, 50, WAVELENGTH, 0.6)
+    dz = np.array([-2e-4, 0.0, 5e-4])
+    got = transfer.transfer(traced, f, WAVELENGTH, dz)
+    np.testing.assert_allclose(transfer.transfer(traced, -f, WAVELENGTH, dz), np.conj(got), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(transfer.transfer(traced, np.zeros((1, 2)), WAVELENGTH, dz), 1.0, rtol=0, atol=1e-9)
+    # the stop takes all of the beam: unit power, through the fit of the amplitude and its Jacobian
+    assert traced.power == pytest.approx(1.0, abs=1e-9)
+
+    x0, y0 = 35e-6, -20e-6
+    field = Camera(backend, gf7, PERTURBED).field(NODES)
+    (moved,) = fit_pupils(replace(field, eikonal=field.eikonal - x0 * field.u - y0 * field.v), NODES)
+    want = got * np.exp(-2j * np.pi * f @ [x0, y0])
+    np.testing.assert_allclose(transfer.transfer(moved, f, WAVELENGTH, dz), want, rtol=0, atol=1e-9)
+
+
+def test_cutoffs_of_an_anamorphic_pupil(backend, gf7, traced: PupilFunction) -> None:
+    """Longest chords of the polygon of traced rim rays; its 2000 corners are 1e-6 of the radius inside the edge."""
+    angle = 2.0 * np.pi * np.arange(2000) / 2000
+    rim = PupilNodes(np.cos(angle), np.sin(angle), np.ones(2000))
+    field = Camera(backend, gf7, PERTURBED).field(rim)
+    edge = np.stack([field.u[0], field.v[0]], axis=-1)
+    checked = []
+    for along in (0, 1):
+        across = edge[:, 1 - along]
+        first, last = sorted((int(np.argmin(across)), int(np.argmax(across))))
+        sides = [np.arange(first, last + 1), np.r_[np.arange(last, 2000), np.arange(first + 1)]]
+        offsets = np.linspace(across.min(), across.max(), 4001)[1500:2500]
+        ends = []
+        for side in sides:
+            ordered = side[np.argsort(across[side])]
+            ends.append(np.interp(offsets, across[ordered], edge[ordered, along]))
+        longest = np.max(np.abs(ends[0] - ends[1]))
+        cutoff = float(traced.cutoff(np.eye(2)[along : along + 1], WAVELENGTH)[0])
+        assert cutoff == pytest.approx(longest / WAVELENGTH, rel=5e-6)
+        below, above = np.outer([0.999, 1.0 + 1e-9], np.eye(2)[along]) * cutoff
+        got = transfer.transfer(traced, np.stack([below, above]), WAVELENGTH, FOCUS)[0]
+        assert 1e-6 < np.abs(got[0]) < 1e-4
+        assert got[1] == 0.0
+        checked.append(1.0 / (WAVELENGTH * cutoff))
+    # paper design: F/9.2 along the line; the field bias lengthens the focal ratio across it
+    assert checked == pytest.approx([9.22, 9.45], abs=0.02)
+
+
+def test_overlap_of_a_distorted_edge() -> None:
+    """Area of the overlap against the intersection of polygons, for an edge as far from a circle as is allowed.
+
+    A polygon of N corners on a circle lacks (2 pi / N)^2 / 6 of its area.
+    """
+    harmonics = np.zeros(11, complex)
+    harmonics[5 + np.array([1, -2, 2, -3, 4])] = [1.0, 0.02 + 0.01j, -0.015j, 0.008, 0.002 - 0.003j]
+    edge = PupilEdge(harmonics)
+    angle = 2.0 * np.pi * np.arange(1200) / 1200
+    corners = edge.boundary(angle)[0]
+    planes = ConvexHull(np.stack([corners.real, corners.imag], axis=-1)).equations
+    rule = np.polynomial.legendre.leggauss(24)
+    sizes = np.array([0.01, 0.3, 1.0, 1.7, 1.9])
+    shift = (sizes[:, None] * np.exp(1j * np.array([0.1, 1.5, 2.9, -2.0]))).ravel()
+    right, left, inside = edge.corners(shift)
+    assert inside.all()
+    area = np.sum(edge.overlap(shift, right, left, rule, rule)[1], axis=-1)
+    for s, got in zip(shift, area, strict=True):
+        half = 0.5 * np.array([s.real, s.imag])
+        both = np.concatenate([planes - [[0, 0, 1]] * (planes[:, :2] @ way)[:, None] for way in (half, -half)])
+        want = ConvexHull(HalfspaceIntersection(both, np.zeros(2)).intersections).volume
+        assert got == pytest.approx(want, rel=1e-4 if abs(s) > 1.6 else 1e-5)
+
+
+@pytest.mark.parametrize("terms", [(7,), (8,), (5,), (6,), (7, 5, 11)])
+def test_aberrations_of_007_waves(terms: tuple[int, ...]) -> None:
+    """They lower the MTF and never raise it; the area under the transfer function is the Strehl ratio of the pupil."""
+    coefficients = np.zeros(11)
+    coefficients[np.array(terms) - 1] = 0.07 * WAVELENGTH / np.sqrt(len(terms))
+    wavefront = zernike.basis(11, NODES.x, NODES.y) @ coefficients
+    (pupil,) = fit_pupils(circle(wavefront), NODES)
+    node, weight = np.polynomial.legendre.leggauss(20)
+    t = 0.25 * np.pi * (node + 1.0)
+    ratio, angle = np.cos(t), 2.0 * np.pi * np.arange(24) / 24
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1) / (WAVELENGTH * F_NUMBER)
+    got = transfer.transfer(pupil, (ratio[:, None, None] * unit).reshape(-1, 2), WAVELENGTH, FOCUS).reshape(20, 24)
+    ideal = perfect(ratio)[:, None]
+    assert np.all(np.abs(got) <= ideal + 1e-9)
+    assert np.max(ideal - np.abs(got)) > 0.05
+    area = weight * np.sin(t) * np.cos(t)
+    strehl = np.abs(np.sum(NODES.share * np.exp(2j * np.pi * wavefront / WAVELENGTH))) ** 2
+    assert np.sum(area @ got) / (24 * area @ perfect(ratio)) == pytest.approx(strehl, abs=1e-8)
+
+
+@pytest.mark.parametrize("span", [0.1, 1.0, 3.0, 10.0, 30.0, 100.0])
+def test_rule_for_the_nodes(span: float) -> None:
+    node, weight = np.polynomial.legendre.leggauss(transfer.nodes_for(span, transfer.LEAST_ALONG))
+    assert np.sum(weight * np.cos(span * node)) == pytest.approx(2.0 * np.sin(span) / span, abs=1e-8)
+
+
+@pytest.mark.parametrize("reach", [0.0, 1e-3, 2e-3])
+def test_independent_of_the_number_of_nodes(traced: PupilFunction, monkeypatch, reach: float) -> None:
+    """+-1 mm at F/9.2 and 450 nm are 3.3 waves of defocus at the edge."""
+    f = random_frequencies(traced, 60, BAND[0])
+    dz = np.linspace(-reach, reach, 5)
+    got = transfer.transfer(traced, f, BAND[0], dz)
+    rule = transfer.nodes_for
+    monkeypatch.setattr(transfer, "nodes_for", lambda span, least: 2 * rule(span, least))
+    assert np.max(np.abs(transfer.transfer(traced, f, BAND[0], dz) - got)) < 1e-7
+
+
+def test_polychromatic_mean(traced: PupilFunction) -> None:
+    f = random_frequencies(traced, 30, 550e-9)
+    dz = np.array([-1e-4, 2e-4])
+    got = polychromatic_transfer(traced, f, np.array([500e-9, 600e-9]), np.array([1.0, 3.0]), dz)
+    want = sum(w * transfer.transfer(traced, f, at, dz) for w, at in ((0.25, 500e-9), (0.75, 600e-9)))
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-8)
+    assert got.shape == (2, 30)
+
+
+@pytest.mark.parametrize(("band", "dz"), [(BAND, 0.0), (BAND, -1e-3), (BAND[:1], 3e-4)])
+def test_table(traced: PupilFunction, band: np.ndarray, dz: float) -> None:
+    weights = np.linspace(1.0, 2.0, len(band))
+    table = TransferTable.build(traced, band, weights, dz)
+    f = random_frequencies(traced, 1800, band[0])
+    f[:200] *= 1e-3
+    f[0] = 0.0
+    f[-150:] *= 2.0
+    want = polychromatic_transfer(traced, f, band, weights, np.array([dz]))[0]
+    got = table(f[:, 0].reshape(60, 30), f[:, 1].reshape(60, 30)).ravel()
+    assert np.max(np.abs(got - want)) < 3e-6
+    beyond = want == 0.0
+    assert 100 < np.sum(beyond) < 600
+    assert np.all(got[beyond] == 0.0)
+    assert table(np.zeros(3), 1e4).shape == (3,)
+
+
+def test_errors_say_what_is_wrong(backend, gf7, traced: PupilFunction) -> None:
+    field = Camera(backend, gf7, {}).field(NODES)
+    dark = field.amplitude.copy()
+    dark[0, 5] = 0.0
+    with pytest.raises(ValueError, match=r"0.2% of the pupil of image 0 carries no light"):
+        fit_pupils(replace(field, amplitude=dark), NODES)
+    few = quadrature.disk(4, 12)
+    with pytest.raises(ValueError, match="48 nodes do not determine"):
+        fit_pupils(circle(nodes=few), few, degree=10)
+    ripple = 20e-9 * np.cos(12.0 * NODES.x)
+    with pytest.raises(ValueError, match="raise the degree"):
+        fit_pupils(circle(ripple), NODES, degree=4)
+    bent = circle()
+    with pytest.raises(ValueError, match="too far from an ellipse"):
+        fit_pupils(replace(bent, u=bent.u + 0.4 * bent.u * bent.v / np.max(bent.v)), NODES)
+    f = np.zeros((1, 2))
+    with pytest.raises(ValueError, match="frequency"):
+        transfer.transfer(traced, np.zeros(2), WAVELENGTH, FOCUS)
+    with pytest.raises(ValueError, match="finite"):
+        transfer.transfer(traced, f, WAVELENGTH, np.array([np.nan]))
+    with pytest.raises(ValueError, match="one weight"):
+        polychromatic_transfer(traced, f, BAND, np.ones(3), FOCUS)
+    with pytest.raises(ValueError, match="must be positive"):
+        polychromatic_transfer(traced, f, BAND, np.zeros(7), FOCUS)

@@ -1,0 +1,283 @@
+"""The bench of the distortion test (paper 004, section 3.1): the camera hangs on a turntable and looks at a pinhole in a
+collimator that stands still.
+
+World = camera frame. When the table turns by W the light's direction turns by +W about the table's axis, the camera's X
+but for a tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f tan W along the line. W counts from the
+true angle of the table at which the as-built camera images the pinhole to the middle of the line. The image is read out
+where the line's scan sees it: over the field its rows drift by the smile of the mapping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.noise import NoiseModel
+from optics.backend import Backend
+from optics.rotation import rotation_matrix
+from optics.test_target import pinhole
+from optics.tree import State
+from scenes.camera_under_test import ROOT, build_camera_under_test
+from scenes.lab_setup import DistortionSetup
+from twin.laboratory.bench_error import BenchError
+from twin.laboratory.dividing_error import TurntableModel
+from twin.laboratory.pinhole_images import PinholeImages, at_nodes, between, centroid_offset
+from twin.line_ccd import LineCcd
+from twin.target_path import TargetPath
+
+Advance = Callable[[str, int, int], None]
+
+LEAST_WIDTH = 2.0
+"""Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001 pixel."""
+
+MARGIN = 6
+"""Pixels between the centroid's window and the image's edge: four rows of background, and the spot's place between
+pixels."""
+
+BLUR = 3.0
+"""Pixels around the pinhole's geometric image that the centroid's window has to hold as well."""
+
+_BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
+"""Numbers of the seed's random streams; those below belong to the turntable."""
+
+
+def silent(part: str, done: int, total: int) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionTruth:
+    """What the analysis must not see, for N points and S sets.
+
+    Attributes:
+        zero: true angle of the table at which the line's middle is imaged, minus the one at which the table reads
+            ``camera_angle``, radians.
+        axis: of the table in the camera frame, unit, (3,).
+        turn: W of each exposure, (N, S), radians.
+        place: (along, across) of the chief ray, (N, S, 2), metres.
+        gross: exposures that a shock spoiled, (N, S).
+    """
+
+    zero: float
+    axis: np.ndarray
+    turn: np.ndarray
+    place: np.ndarray
+    gross: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionRecord:
+    """What a test leaves for the analysis: N points, S sets.
+
+    Attributes:
+        reading: of the table, (N, S), radians.
+        frames: uint16 (N, S, frames, rows, columns).
+        column: of the line, first of each region that was kept, (N, S).
+    """
+
+    reading: np.ndarray
+    frames: np.ndarray
+    column: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionBench:
+    """Everything that does not change from one test to the next.
+
+    Attributes:
+        setup: the test with all it refers to.
+        path: from the collimator to the image.
+        as_built: state of the camera.
+        ccd: of the band.
+        images: of the pinhole.
+        turn: nominal W of the points, (N,), radians, increasing.
+        middle: direction of the light that is imaged to the middle of the line, (3,).
+        design_offset: energy centroid minus chief ray along the line at the points, by the design, (N,), metres: known
+            to the analysis, as every laboratory has the prescription.
+        true_offset: the same of the as-built camera in this collimator; the analysis does not know it.
+    """
+
+    setup: DistortionSetup
+    path: TargetPath
+    as_built: State
+    ccd: LineCcd
+    images: PinholeImages
+    turn: np.ndarray
+    middle: np.ndarray
+    design_offset: np.ndarray
+    true_offset: np.ndarray
+
+    @classmethod
+    def build(cls, setup: DistortionSetup, backend: Backend, advance: Advance = silent) -> DistortionBench:
+        """Trace the camera and work out the spectra of its spots.
+
+        Raises:
+            InputError: ``as_built`` names what the camera does not have.
+            BenchError: the beam does not get through, the pinhole is too small or too large, or points lie beyond the
+                turntable's calibration.
+        """
+        test = setup.test
+        camera = build_camera_under_test(test, setup.camera, backend)
+        path = TargetPath(camera.assembly, ROOT, ROOT, camera.model, backend, test.collimator.model)
+        design = TargetPath(camera.assembly, ROOT, ROOT, camera.model, backend)
+        band = setup.camera.bands[test.band]
+        ccd = LineCcd.from_specs(band, setup.detectors[band.detector])
+        _check_pinhole(setup, camera.model.line_focal_length)
+        half = 0.5 * band.pixels * band.pitch
+        turn = np.arctan(test.reach * half / camera.model.line_focal_length) * np.linspace(-1.0, 1.0, test.points)
+        _check_table(setup, turn)
+        try:
+            middle = _aim(path, camera.as_built, band.offset)
+
+            def directions(angle: np.ndarray) -> np.ndarray:
+                return _turned(np.array([1.0, 0.0, 0.0]), angle, middle)
+
+            reach = float(turn[-1])
+            images = PinholeImages.build(
+                path,
+                camera.as_built,
+                directions,
+                reach,
+                pinhole(test.pinhole),
+                ccd,
+                test.window,
+                lambda done, total: advance("spectra of the spots", done, total),
+            )
+            nodes = directions(at_nodes(reach))
+            offsets = [centroid_offset(*way, nodes) for way in ((design, {}), (path, camera.as_built))]
+        except ValueError as error:
+            raise BenchError(
+                f"the camera's beam cannot be traced: {error}", ("collimator",), "a wider one, or smaller `as_built`"
+            ) from error
+        known, true = (between(offset, reach, turn) for offset in offsets)
+        return cls(setup, path, camera.as_built, ccd, images, turn, middle, known, true)
+
+    @property
+    def noise(self) -> NoiseModel:
+        """Of one frame."""
+        return self.ccd.noise
+
+    @property
+    def radius(self) -> float:
+        """Of the centroid's window, pixels."""
+        return 0.5 * self.setup.test.window - MARGIN
+
+    @property
+    def middle_column(self) -> float:
+        """Column of the line's middle, where L = 0."""
+        return 0.5 * (self.ccd.band.pixels - 1)
+
+    def places(self, axis: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """Where chief rays meet the focal plane, (..., 2) (along, across), metres, for turns (...) about an axis."""
+        light = _turned(axis, np.ravel(turn), self.middle)
+        return self.path.places(self.as_built, light).reshape(*np.shape(turn), 2)
+
+    def record(
+        self, table: TurntableModel, seed: int, advance: Advance = silent
+    ) -> tuple[DistortionRecord, DistortionTruth]:
+        """Carry out one test.
+
+        Args:
+            table: that turns the camera.
+            seed: of everything else that is drawn.
+            advance: told how many points are done.
+
+        Raises:
+            BenchError: a spot falls beside the line.
+        """
+        test, spec = self.setup.test, self.setup.turntable
+        rng = {key: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_BENCH, _READING)}
+        zero = float(rng[_BENCH].normal(0.0, test.zero))
+        tilt = rng[_BENCH].normal(0.0, test.axis_tilt, 2)
+        axis = np.array([1.0, *tilt]) / np.sqrt(1.0 + tilt @ tilt)
+        shape = len(self.turn), test.sets
+        setting = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SETTING,)))
+        reading = spec.camera_angle + self.turn[:, None] + setting.normal(0.0, test.setting, shape)
+        shock = rng[_READING].random(shape) < spec.reference.gross_probability
+        push = shock * rng[_READING].choice([-1.0, 1.0], shape) * spec.reference.gross_error
+        start = float(table.stand(np.array(spec.camera_angle))) + zero
+        turn = table.stand(reading, rng[_READING]) + push - start
+        place = self.places(axis, turn)
+        frames, column = self._expose(place, seed, advance)
+        return DistortionRecord(reading, frames, column), DistortionTruth(zero, axis, turn, place, shock)
+
+    def _expose(self, place: np.ndarray, seed: int, advance: Advance) -> tuple[np.ndarray, np.ndarray]:
+        test, pitch = self.setup.test, self.ccd.band.pitch
+        spot = place / pitch + np.array([self.middle_column, 0.0])
+        first = np.rint(spot).astype(int) - test.window // 2
+        column = first[..., 0]
+        if np.min(column) < 0 or np.max(column) + test.window > self.ccd.band.pixels:
+            most = 1.0 - 2.0 * (test.window + np.max(np.abs(place[..., 0])) / pitch - 0.5 * self.ccd.band.pixels) / (
+                self.ccd.band.pixels
+            )
+            raise BenchError(
+                "the first or last spot falls beside the line",
+                ("reach",),
+                f"at most about {min(most, 1.0) * test.reach:.4f} with this zero of the table",
+            )
+        inside = (spot - first) * pitch
+        light = np.stack([self.images(w, at) for w, at in zip(self.turn, inside, strict=True)])
+        # far tails of the Fourier sum may ring below zero by rounding
+        photons = np.maximum(light, 0.0) * (self.ccd.white_photons(test.light) / np.max(light))
+        pattern = self.ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN,)))
+        count, sets = column.shape
+        frames = np.empty((count, sets, test.frames, test.window, test.window), np.uint16)
+        for i in range(count):
+            for s in range(sets):
+                stream = np.random.SeedSequence(seed, spawn_key=(_NOISE, i, s))
+                frames[i, s] = self.ccd.expose(photons[i, s], int(column[i, s]), pattern, test.frames, stream)
+            advance("exposures", i + 1, count)
+        return frames, column
+
+
+def _turned(axis: np.ndarray, turn: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Directions of the light (M, 3) after turns (M,) about an axis (3,)."""
+    return np.asarray(rotation_matrix(turn[:, None] * axis) @ middle)
+
+
+def _aim(path: TargetPath, state: State, offset: float) -> np.ndarray:
+    """Direction of the light that is imaged to the middle of the line, by Newton's steps with finite differences."""
+    slope, step, wanted = np.zeros(2), 1e-6, np.array([0.0, offset])
+    for _ in range(6):
+        around = slope + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        # light that travels along -Z + t has its image at +f t; slopes are (along, across)
+        light = np.stack([around[:, 1], around[:, 0], -np.ones(3)], axis=-1)
+        light /= np.linalg.norm(light, axis=1)[:, None]
+        seen = path.places(state, light)
+        slope = slope + np.linalg.solve((seen[1:] - seen[0]).T / step, wanted - seen[0])
+    out = np.array([slope[1], slope[0], -1.0])
+    return np.asarray(out / np.linalg.norm(out))
+
+
+def _check_pinhole(setup: DistortionSetup, focal_length: float) -> None:
+    test, pitch = setup.test, setup.camera.bands[setup.test.band].pitch
+    per_pixel = pitch * test.collimator.focal_length / focal_length
+    width = test.pinhole / per_pixel
+    most = 2.0 * (0.5 * test.window - MARGIN - BLUR)
+    allowed = f"{1e6 * LEAST_WIDTH * per_pixel:.0f} um to {1e6 * most * per_pixel:.0f} um"
+    if width < LEAST_WIDTH:
+        raise BenchError(
+            f"the pinhole's image is {width:.2g} pixels wide: too small for these pixels, which would bias its centroid",
+            ("pinhole",),
+            allowed,
+        )
+    if width > most:
+        raise BenchError(
+            f"the pinhole's image is {width:.3g} pixels wide and does not fit into a window of {test.window} pixels",
+            ("pinhole",),
+            f"{allowed}, or a larger window",
+        )
+
+
+def _check_table(setup: DistortionSetup, turn: np.ndarray) -> None:
+    plan, angle = setup.turntable.calibration, setup.turntable.camera_angle
+    room = min(angle - plan.first, plan.last - angle) - 6.0 * setup.test.setting
+    if turn[-1] > room:
+        raise BenchError(
+            f"the camera's field needs +-{np.rad2deg(turn[-1]):.3f} deg of the turntable, but about its camera_angle "
+            f"only +-{np.rad2deg(max(room, 0.0)):.3f} deg are calibrated",
+            ("reach",),
+            "a smaller share, or a turntable file that is calibrated over the field",
+        )

@@ -1,0 +1,208 @@
+"""The bench of the focal-plane alignment: a collimator with a slanted edge, the camera, its line CCDs.
+
+Frame of all numbers: the focal-plane frame of the camera as its prescription has it (X' flight direction, Y' along the
+line, Z' along the light). The focal-plane assembly stands in it at a ``Pose``, and each band's chip at a height above
+the assembly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from optics.backend import Backend
+from optics.pose import Pose
+from optics.pupil_function import PupilFunction
+from optics.test_target import slanted_edge
+from optics.vector_shape import HalfPlane
+from scenes.camera_under_test import ROOT, CameraUnderTest, build_camera_under_test
+from twin.edge_images import EdgeImager, EdgeOptics
+from twin.laboratory.result import Advance, silent
+from twin.line_ccd import LineCcd
+from twin.target_path import TargetPath
+
+if TYPE_CHECKING:
+    from scenes.lab_setup import FocusSetup
+
+ALONG, TRACK = "along", "track"
+EDGES = (ALONG, TRACK)
+"""Edges by the direction in which they measure: along the line and along the track."""
+
+_AXES: dict[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
+_SEARCH = 0.3e-3
+"""Defocus up to which best focus is looked for, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """One place of the focal plane where the edge is imaged.
+
+    Attributes:
+        band: whose line CCD.
+        field: share of half the line.
+        place: (X', Y') on the nominal focal plane, metres.
+        point, direction: of the chief ray in the focal-plane frame, (3,), metres and unit.
+        imagers: edge -> its images.
+        defocus_per_shift: edge -> defocus of the image per metre of the target's move, as the edge's direction sees it.
+        best: Z' of best focus: where the mean of both edges' MTF at the Nyquist frequency is largest, metres.
+    """
+
+    band: str
+    field: float
+    place: np.ndarray
+    point: np.ndarray
+    direction: np.ndarray
+    imagers: Mapping[str, EdgeImager]
+    defocus_per_shift: Mapping[str, float]
+    best: float
+
+    @property
+    def nyquist(self) -> float:
+        """Nyquist frequency of the band, cycles/m."""
+        return self.imagers[ALONG].ccd.band.nyquist
+
+    def crossing(self, standing: Pose, height: float) -> np.ndarray:
+        """Where the chief ray meets the chip, in the focal-plane frame, (3,), metres."""
+        normal = standing.rotation[:, 2]
+        chip = standing.translation + height * normal
+        return np.asarray(self.point + self.direction * ((chip - self.point) @ normal) / (self.direction @ normal))
+
+    def defocus(self, standing: Pose, height: float) -> float:
+        """How far the chip stands downstream of best focus, metres."""
+        return float(self.crossing(standing, height)[2] - self.best)
+
+    def column(self, standing: Pose, height: float) -> int:
+        """First column of the line on which the image of the edge lies in the middle."""
+        imager = self.imagers[ALONG]
+        along = standing.inverse().apply(self.crossing(standing, height))[1]
+        middle = along / imager.ccd.band.pitch + 0.5 * (imager.ccd.band.pixels - 1)
+        return int(np.clip(round(middle - 0.5 * imager.region), 0, imager.ccd.band.pixels - imager.region))
+
+    def image(self, edge: str, standing: Pose, height: float, target_shift: float, offset: float) -> np.ndarray:
+        """Share of the white signal in every pixel, for a target moved by ``target_shift`` and an edge ``offset``."""
+        moved = self.crossing(standing, height)[2] - self.defocus_per_shift[edge] * target_shift
+        return self.imagers[edge].image(float(moved), offset)
+
+
+@dataclass(frozen=True, eq=False)
+class BudgetLine:
+    """What makes a band's MTF at its Nyquist frequency, in the middle of the field and at best focus.
+
+    Attributes:
+        band: name.
+        edge: direction in which it is measured.
+        factors: effect -> its transfer there.
+        total: their product.
+    """
+
+    band: str
+    edge: str
+    factors: Mapping[str, float]
+    total: float
+
+
+class FocusBench:
+    """Everything of the bench that does not change from one alignment to the next.
+
+    Args:
+        setup: the test with all it refers to.
+        backend: where to trace.
+        advance: told how many of how many tables are done.
+
+    Raises:
+        InputError: the camera cannot be built as the file says.
+        AimError, BeamMissedError, ValueError: its beam is lost or vignetted.
+    """
+
+    def __init__(self, setup: FocusSetup, backend: Backend, advance: Advance = silent) -> None:
+        test = setup.test
+        self.setup = setup
+        self.camera: CameraUnderTest = build_camera_under_test(test, setup.camera, backend)
+        self.collimator = test.collimator.model
+        self.path = TargetPath(self.camera.assembly, ROOT, ROOT, self.camera.model, backend, self.collimator)
+        self.ccds = {
+            name: LineCcd.from_specs(band, setup.detectors[band.detector]) for name, band in setup.camera.bands.items()
+        }
+        self.focal_length = float(self.camera.model.first_order.focal_length[0])
+        self.sites = self._build_sites(advance)
+
+    @property
+    def image_per_target_shift(self) -> float:
+        """By how much the image moves per metre of the target's move, with the camera's nominal focal length."""
+        return (self.focal_length / self.collimator.focal_length) ** 2
+
+    def geometric_zero(self, band: str) -> float:
+        """Defocus at which geometric blur takes all contrast at a band's Nyquist frequency, metres."""
+        f_number = self.focal_length / self.setup.camera.entrance_pupil
+        return 1.22 * f_number / self.ccds[band].band.nyquist
+
+    def _build_sites(self, advance: Advance) -> tuple[Site, ...]:
+        test, bands = self.setup.test, self.setup.camera.bands
+        keys = [(name, field) for name in bands for field in test.fields]
+        half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
+        places = np.array([[field * half[name], bands[name].offset] for name, field in keys])
+        directions = self.path.directions(places)
+        hits = self.path.places(self.camera.as_built, directions)
+        pupils = self.path.pupils(self.camera.as_built, directions, hits)
+        sites = []
+        for i, (name, field) in enumerate(keys):
+            advance("tables of the optics", i, len(keys))
+            sites.append(self._site(name, field, directions[i], hits[i], pupils[i]))
+        advance("tables of the optics", len(keys), len(keys))
+        return tuple(sites)
+
+    def _site(self, band: str, field: float, direction: np.ndarray, hit: np.ndarray, pupil: PupilFunction) -> Site:
+        test, ccd = self.setup.test, self.ccds[band]
+        local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
+        imagers, ratio = {}, {}
+        for k, edge in enumerate(EDGES):
+            shape = slanted_edge(test.edge.angle, _AXES[edge]).parts[0][1]
+            assert isinstance(shape, HalfPlane)
+            optics = EdgeOptics.build(pupil, ccd.band, shape.mapped(local).normal)
+            imagers[edge] = EdgeImager(optics, ccd, test.edge.region)
+            ratio[edge] = float(local.jacobian[k, k] ** 2)
+        # the pupil's mean direction in (Y', X') is the chief ray's but for coma
+        v, u = pupil.centre
+        ray = np.array([u, v, np.sqrt(1.0 - u * u - v * v)])
+        point = np.array([hit[1], hit[0], 0.0])
+        best = best_focus(imagers, ccd.band.nyquist)
+        return Site(band, field, point[:2], point, ray, imagers, ratio, best)
+
+    def budget(self) -> tuple[BudgetLine, ...]:
+        """What makes each band's MTF at Nyquist in the middle of the field, along the line and along the track."""
+        out = []
+        for name, ccd in self.ccds.items():
+            site = min((s for s in self.sites if s.band == name), key=lambda s: abs(s.field))
+            place = site.place[None, ::-1]
+            bare = TargetPath(self.camera.assembly, ROOT, ROOT, self.camera.model, self.path.backend)
+            pupil = bare.pupils({}, bare.directions(place), place)[0]
+            ideal = {
+                edge: EdgeImager(EdgeOptics.build(pupil, ccd.band, i.optics.normal, _SEARCH), ccd, i.region)
+                for edge, i in site.imagers.items()
+            }
+            focus = best_focus(ideal, ccd.band.nyquist)
+            for edge, imager in site.imagers.items():
+                f = ccd.band.nyquist
+                x, y = f * imager.optics.normal
+                diffraction = abs(complex(ideal[edge].optics.at(focus, np.array([f]))[0]))
+                actual = abs(complex(imager.optics.at(site.best, np.array([f]))[0]))
+                parts = {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
+                factors = {"diffraction": diffraction, "wavefront": actual / diffraction, **parts}
+                out.append(BudgetLine(name, edge, factors, imager.mtf(site.best, f)))
+        return tuple(out)
+
+
+def best_focus(imagers: Mapping[str, EdgeImager], frequency: float) -> float:
+    """Defocus at which the mean MTF of the edges is largest, metres."""
+
+    def loss(defocus: float) -> float:
+        return -sum(imager.mtf(defocus, frequency) for imager in imagers.values())
+
+    coarse = np.linspace(-_SEARCH, _SEARCH, 41)
+    start = int(np.argmin([loss(float(z)) for z in coarse]))
+    low, high = coarse[max(start - 1, 0)], coarse[min(start + 1, len(coarse) - 1)]
+    return float(minimize_scalar(loss, bounds=(low, high), method="bounded", options={"xatol": 1e-8}).x)
