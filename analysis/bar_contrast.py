@@ -126,13 +126,13 @@ def measure_bars(
     if other is not None:
         fitted, parameters = _fit(place, value, other, numbers)
     design = _design(place, fitted, numbers, parameters)
-    model = design[:, :-2] @ parameters
-    inverse = np.linalg.inv(design.T @ design)
+    model = parameters @ design[:-2]
+    inverse = np.linalg.inv(_gram(design, design))
     if noise is None:
-        variance = np.full(value.size, float(np.sum((value - model) ** 2)) / (value.size - design.shape[1]))
+        variance = np.full(value.size, float(np.sum((value - model) ** 2)) / (value.size - design.shape[0]))
     else:
         variance = noise.temporal_variance_dn2(model, frames) + noise.fixed_variance_dn2(model)
-    covariance = inverse @ ((design.T * variance) @ design) @ inverse
+    covariance = inverse @ _gram(design * variance, design) @ inverse
     c, s = parameters[1], parameters[2]
     amplitude = math.hypot(c, s)
     unit = np.array([c, s]) / max(amplitude, 1e-300)
@@ -292,39 +292,45 @@ def _separable(frequency: Array, shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _waves(place: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
-    """Columns 1, then cosine and sine of the fundamental and of each harmonic, (N, 3 + 2 K)."""
+    """Rows 1, then cosine and sine of the fundamental and of each harmonic, (3 + 2 K, N)."""
     phase = 2.0 * np.pi * (frequency @ place)
     turned = np.outer((1, *numbers), phase)
-    return np.concatenate(
-        [np.ones((1, phase.size)), np.stack([np.cos(turned), np.sin(turned)], 1).reshape(-1, phase.size)]
-    ).T
+    pairs = np.stack([np.cos(turned), np.sin(turned)], axis=1).reshape(-1, phase.size)
+    return np.concatenate([np.ones((1, phase.size)), pairs])
 
 
 def _design(place: Array, frequency: Array, numbers: tuple[int, ...], parameters: Array) -> Array:
-    """The waves, then the derivatives by the two components of the frequency, (N, P)."""
+    """The waves, then the derivatives by the two components of the frequency, (P, N)."""
     waves = _waves(place, frequency, numbers)
-    slope: Array = np.zeros(waves.shape[0])
+    slope = np.zeros(waves.shape[1])
     for k, h in enumerate((1, *numbers)):
-        cosine, sine = waves[:, 1 + 2 * k], waves[:, 2 + 2 * k]
-        slope = slope + 2.0 * np.pi * h * (parameters[2 + 2 * k] * cosine - parameters[1 + 2 * k] * sine)
-    return np.column_stack([waves, slope * place[0], slope * place[1]])
+        cosine, sine = waves[1 + 2 * k], waves[2 + 2 * k]
+        slope += 2.0 * np.pi * h * (parameters[2 + 2 * k] * cosine - parameters[1 + 2 * k] * sine)
+    return np.concatenate([waves, slope * place])
+
+
+def _gram(first: Array, second: Array) -> Array:
+    """Products summed over pixels. Not by a matrix product, whose threads wait for each other on a busy machine."""
+    return np.asarray(np.einsum("in,jn->ij", first, second))
+
+
+def _solved(design: Array, value: Array) -> Array:
+    """Least-squares parameters."""
+    return np.asarray(np.linalg.solve(_gram(design, design), design @ value))
 
 
 def _fit(place: Array, value: Array, start: Array, numbers: tuple[int, ...]) -> tuple[Array, Array]:
     """Least-squares frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps."""
     frequency = start
-    parameters: Array = np.zeros(3 + 2 * len(numbers))
     limit: Array = np.asarray(0.5 / np.ptp(place, axis=1))
     for _ in range(_STEPS):
         waves = _waves(place, frequency, numbers)
-        parameters = np.asarray(np.linalg.lstsq(waves, value, rcond=None)[0])
-        design = _design(place, frequency, numbers, parameters)
-        step = np.linalg.lstsq(design, value - waves @ parameters, rcond=None)[0][-2:]
+        parameters = _solved(waves, value)
+        step = _solved(_design(place, frequency, numbers, parameters), value - parameters @ waves)[-2:]
         frequency = np.asarray(frequency + np.clip(step, -limit, limit))
         if np.all(np.abs(step) < 1e-7 * limit):
             break
-    waves = _waves(place, frequency, numbers)
-    return frequency, np.asarray(np.linalg.lstsq(waves, value, rcond=None)[0])
+    return frequency, _solved(_waves(place, frequency, numbers), value)
 
 
 def _check_filled(

@@ -32,8 +32,8 @@ _CLIPPED_SHARE = 0.05
 _LARGEST_ANGLE = math.radians(40.0)
 _HALF_WINDOWS = (8.0, 6.0, 6.0)
 _NOT_FOLLOWED = (
-    "the edge cannot be followed through the region: in many lines there is no rise where the others have it (two edges, "
-    "a corner, or an edge that leaves the region); choose a region with one straight edge"
+    "the edge cannot be followed through the region: in many lines there is no rise where the others have it (two "
+    "edges, a corner, or an edge that leaves the region); choose a region with one straight edge"
 )
 
 

@@ -180,8 +180,8 @@ class EdgeSpread:
     def _solved(self, right: Array) -> Array:
         """Inverse normal matrix times (P, P), eight columns at a time.
 
-        All at once would be split over threads by the linear algebra library, which on a busy machine wait for each other
-        a hundred times longer than the solution takes.
+        All at once would be split over threads by the linear algebra library, which on a busy machine wait for each
+        other a hundred times longer than the solution takes.
         """
         columns = range(0, right.shape[1], 8)
         return np.hstack([cho_solve(self.factor, right[:, k : k + 8], check_finite=False) for k in columns])

@@ -272,7 +272,7 @@ def _draw(edge: EdgeMtf, pitch: float, path: Path) -> None:
     shown = np.abs(edge.place) <= reach
     spread.plot(edge.place[shown], edge.esf[shown], color="C0", label="least-squares curve")
     spread.set(title="edge-spread function", xlabel="along the normal / px", ylabel="grey value")
-    spread.legend()
+    spread.legend(loc="lower right")
     line.plot(edge.place[shown], edge.lsf[shown], color="C0")
     line.axhline(0.0, color="0.7", lw=0.8, zorder=0)
     line.set(title="line-spread function", xlabel="along the normal / px", ylabel="1/px")

@@ -40,6 +40,8 @@ _LARGEST_GAP = 0.3
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
 _OTHER_STRUCTURE = 0.1
 _LINE_STEPS = 2
+# Samples of the spread functions that are handed out.
+_SHOWN_PER_PIXEL = 16
 
 
 def measure_edge(
@@ -172,7 +174,7 @@ def _result(
     grey, columns = rising.ravel(), rising.shape[1]
     model = spread.value(design)
     _check_one_edge(rising, model.reshape(rising.shape), spread.contrast, line)
-    variance, dark_variance, bright_variance = _variances(grey, model, design.x, spread, noise, frames)
+    variance, dark_variance, bright_variance = _variances(grey, model, design, spread, noise, frames)
     covariance = spread.covariance(design, variance)
     transfer, gradient = spread.transform(frequency)
     modulus = np.abs(transfer)
@@ -199,8 +201,8 @@ def _result(
     offset = fitted.offset + shift / cosine
     if line.sign < 0:
         offset = columns - 1 - offset
-    reach = math.floor(min(-design.x.min(), design.x.max()) * spread.oversampling) / spread.oversampling
-    place = np.linspace(-reach, reach, round(2 * reach * spread.oversampling) + 1)
+    samples = math.floor(min(-design.x.min(), design.x.max()) * _SHOWN_PER_PIXEL)
+    place = np.arange(-samples, samples + 1) / _SHOWN_PER_PIXEL
     shown = spread.design(place)
     return EdgeMtf(
         axis=line.axis,
@@ -249,7 +251,7 @@ def _check_one_edge(rising: Array, model: Array, contrast: float, line: EdgeLine
 
 
 def _variances(
-    grey: Array, model: Array, distance: Array, spread: EdgeSpread, noise: NoiseModel | None, frames: int
+    grey: Array, model: Array, design: EdgeDesign, spread: EdgeSpread, noise: NoiseModel | None, frames: int
 ) -> tuple[Array, float, float]:
     """Variance of every pixel (N,), and of a dark and a bright one."""
     levels = np.array([spread.dark, spread.dark + spread.contrast])
@@ -259,7 +261,12 @@ def _variances(
         return variance, float(dark), float(bright)
     # two levels and a tail are fitted outside of the core: each side gives one degree of freedom and a half away
     square = (grey - model) ** 2
-    sides = [square[distance < -spread.core], square[distance > spread.core]]
-    dark, bright = (float(side.sum()) / max(side.size - 1.5, 1.0) for side in sides)
-    share = np.clip((model - spread.dark) / spread.contrast, 0.0, 1.0)
-    return dark + (bright - dark) * share, dark, bright
+    sides = design.x < -spread.core, design.x > spread.core
+    dark, bright = (float(square[side].sum()) / max(np.count_nonzero(side) - 1.5, 1.0) for side in sides)
+    # the tails of diffraction lie between the levels
+    low, high = (float(model[side].mean()) for side in sides)
+    slope = (bright - dark) / (high - low)
+    floor = 0.1 * min(dark, bright)
+    variance = np.maximum(dark + slope * (model - low), floor)
+    ends = [max(dark + slope * (level - low), floor) for level in levels]
+    return variance, float(ends[0]), float(ends[1])

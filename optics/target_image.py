@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -82,23 +83,15 @@ class EdgeProfile:
         _check_positive(cutoff=cutoff, reach=reach)
         normal = np.asarray(normal, float) / np.hypot(*normal)
         normal.setflags(write=False)
-        panels = _LEAST_PANELS + int(np.ceil(cutoff * reach))
-        node, weight = np.polynomial.legendre.leggauss(_NODES)
-        f = (cutoff / panels * (np.arange(panels)[:, None] + 0.5 * (node + 1.0))).ravel()
-        share = np.tile(0.5 * cutoff / panels * weight, panels) / (np.pi * f)
+        sampling = _edge_sampling(cutoff, reach)
+        f = sampling.frequency
         both = _ask(transfer, np.append(f, 0.0) * normal[0], np.append(f, 0.0) * normal[1])
         level = float(both[-1].real)
-        # distances as coarse + fine steps: exp(2 pi i f d) factors, and the sum becomes one matrix product
-        count = int(np.ceil(2.0 * reach * cutoff * _SAMPLES)) + 7
-        fine = int(np.ceil(np.sqrt(count)))
-        step = 2.0 * reach / (count - 7)
-        start = -reach - 3.0 * step
-        coarse = np.exp(2j * np.pi * (start + step * fine * np.arange(-(-count // fine)))[:, None] * f)
-        steps = np.exp(2j * np.pi * f[:, None] * (step * np.arange(fine)))
         with one_blas_thread():
-            table = (coarse * (share * both[:-1])) @ steps
-        values = 0.5 * level + table.imag.ravel()[:count]
-        return cls(normal, reach, level, make_interp_spline(start + step * np.arange(count), values, k=5))
+            table = (sampling.coarse * (sampling.share * both[:-1])) @ sampling.fine
+        distance = sampling.distance
+        values = 0.5 * level + table.imag.ravel()[: len(distance)]
+        return cls(normal, reach, level, make_interp_spline(distance, values, k=5))
 
     def __call__(self, distance: np.ndarray) -> np.ndarray:
         """Irradiance at distances from the edge, metres, positive on the bright side; bright is 1 where H(0) = 1.
@@ -122,6 +115,39 @@ class EdgeProfile:
         if np.max(np.abs(edge.normal - self.normal)) > 1e-12:
             raise ValueError(f"the profile belongs to the normal {self.normal}, the edge has {edge.normal}")
         return self(edge.distance(x.points(), y.points()[:, None]))
+
+
+@dataclass(frozen=True, eq=False)
+class _EdgeSampling:
+    """What the integral of an edge profile needs and the transfer function does not change.
+
+    Attributes:
+        frequency, share: Gauss' nodes (N,) and their weights over pi f.
+        distance: (D,) knots of the profile, metres.
+        coarse, fine: exp(2 pi i f d) of distances taken apart into coarse + fine steps, (A, N) and (N, B), A B >= D, so
+            that the sum over frequencies becomes one matrix product.
+    """
+
+    frequency: np.ndarray
+    share: np.ndarray
+    distance: np.ndarray
+    coarse: np.ndarray
+    fine: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def _edge_sampling(cutoff: float, reach: float) -> _EdgeSampling:
+    panels = _LEAST_PANELS + int(np.ceil(cutoff * reach))
+    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    f = (cutoff / panels * (np.arange(panels)[:, None] + 0.5 * (node + 1.0))).ravel()
+    share = np.tile(0.5 * cutoff / panels * weight, panels) / (np.pi * f)
+    count = int(np.ceil(2.0 * reach * cutoff * _SAMPLES)) + 7
+    fine = int(np.ceil(np.sqrt(count)))
+    step = 2.0 * reach / (count - 7)
+    start = -reach - 3.0 * step
+    coarse = np.exp(2j * np.pi * (start + step * fine * np.arange(-(-count // fine)))[:, None] * f)
+    steps = np.exp(2j * np.pi * f[:, None] * (step * np.arange(fine)))
+    return _EdgeSampling(f, share, start + step * np.arange(count), coarse, steps)
 
 
 def target_image(

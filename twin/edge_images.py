@@ -2,8 +2,8 @@
 
 The image of a straight edge depends on the optical transfer function along the edge's normal alone. So for every site
 and edge it is worked out once, over frequency and defocus, and interpolated: a move of the detector along its normal
-by micrometres, or of the collimator's target through focus, changes nothing else that matters (a tilt of the detector by
-arcminutes scales the direction cosines by 1e-6).
+by micrometres, or of the collimator's target through focus, changes nothing else that matters (a tilt of the detector
+by arcminutes scales the direction cosines by 1e-6).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ FREQUENCIES = 97
 """Samples of a transfer function from 0 to the cut-off."""
 
 DEFOCUS_STEP = 25e-6
-"""Step of the table over defocus, metres. The transfer function of an F/9 beam turns by one cycle in 250 um or more, and
-quintic splines through ten samples per cycle are right to 1e-5."""
+"""Step of the table over defocus, metres. The transfer function of an F/9 beam turns by one cycle in 250 um or
+more, and quintic splines through ten samples per cycle are right to 2e-4."""
 
 TABLE_REACH = 0.6e-3
 """Defocus up to which the table goes, metres; a few images farther out are worked out one by one."""
@@ -83,6 +83,12 @@ def _samples(
     return np.stack([values.real, values.imag], axis=-1)
 
 
+_ROUND_CUTOFF = 10e3
+"""Cut-offs are rounded up to multiples of this, cycles/m,"""
+_ROUND_REACH = 4.0
+"""and reaches to multiples of this, pixels."""
+
+
 @dataclass(frozen=True, eq=False)
 class EdgeImager:
     """Images of one edge at one site as a line CCD takes them.
@@ -119,6 +125,8 @@ class EdgeImager:
         def transfer(fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
             return self.transfer(defocus, np.hypot(fx, fy))
 
-        reach = 0.5 * self.region * pitch * float(np.sum(np.abs(normal))) + abs(offset)
-        profile = EdgeProfile.build(transfer, normal, self.optics.cutoff, reach)
+        # the same rounded numbers for all sites of a band, so that the profile's sampling is worked out once
+        reach = (0.5 * self.region * float(np.sum(np.abs(normal))) + abs(offset) / pitch) // _ROUND_REACH + 1.0
+        cutoff = _ROUND_CUTOFF * (self.optics.cutoff // _ROUND_CUTOFF + 1.0)
+        profile = EdgeProfile.build(transfer, normal, cutoff, _ROUND_REACH * reach * pitch)
         return np.maximum(profile.image(HalfPlane(offset * profile.normal, profile.normal), grid, grid), 0.0)

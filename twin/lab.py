@@ -33,9 +33,7 @@ Advance = Callable[[str, int, int], None]
 Setup = TypeVar("Setup")
 
 File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
-Out = Annotated[
-    Path | None, typer.Option(readable=False, help="Run folder to make. Default: runs/TEST-001, -002, ...")
-]
+Out = Annotated[Path | None, typer.Option(readable=False, help="Run folder to make. Default: runs/TEST-001, -002, ...")]
 Seed = Annotated[
     int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything drawn; overrides the file's.")
 ]
@@ -134,7 +132,9 @@ def _command(
         check_backend(options.backend)
         setup = resolve(file)
         number = setup.test.seed if options.seed is None else options.seed
-        folder = RunFolder(options.out if options.out is not None else next_free(Path("runs"), file.stem), options.force)
+        folder = RunFolder(
+            options.out if options.out is not None else next_free(Path("runs"), file.stem), options.force
+        )
         tracer = load_backend(options.backend)
         started, clock = time.time(), time.monotonic()
         columns = (

@@ -117,7 +117,7 @@ def test_luminance_weighs_the_channels(tmp_path):
 
 def test_pages_are_averaged(tmp_path):
     path = tmp_path / "pages.tiff"
-    tifffile.imwrite(path, np.stack([edge_frame(50.0, seed) for seed in range(16)]))
+    tifffile.imwrite(path, np.stack([edge_frame(50.0, seed) for seed in range(16)]), photometric="minisblack")
     all_pages = run_json(path, "--roi", ROI, "--pixel-size", "7 um")
     four = run_json(path, "--roi", ROI, "--pixel-size", "7 um", "--frames", 4)
     # the noise is estimated from some 3000 pixels of each: 2%
@@ -128,7 +128,7 @@ def test_pages_are_averaged(tmp_path):
 def test_one_saturated_page_is_enough(tmp_path):
     pages = np.stack([edge_frame(50.0, seed) for seed in range(4)])
     pages[2, 40, 80] = 65535
-    tifffile.imwrite(tmp_path / "pages.tiff", pages)
+    tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack")
     result = run(tmp_path / "pages.tiff", "--roi", ROI, "--pixel-size", "7 um")
     assert result.exit_code == 2
     assert "1 pixels reach the saturation level of 65535" in result.stderr

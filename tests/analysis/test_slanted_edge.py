@@ -1,7 +1,7 @@
 """Slanted-edge MTF against images whose MTF is known exactly.
 
-Truth is independent of the estimator: the optical transfer function of a circular pupil by formula, or by quadrature over
-the overlap of two pupils if it is aberrated, times the pixel's sincs; the edge-spread function by Gauss-Legendre
+Truth is independent of the estimator: the optical transfer function of a circular pupil by formula, or by quadrature
+over the overlap of two pupils if it is aberrated, times the pixel's sincs; the edge-spread function by Gauss-Legendre
 quadrature over frequency, evaluated at each pixel's distance from the edge. Nothing is oversampled, binned or cut off.
 
 Statistical limits are two-sided chi-square quantiles with a false-alarm rate of 1e-6 per comparison.
@@ -30,7 +30,7 @@ ACCURACY = 5e-4
 
 
 def pupil_transfer(s, coma):
-    """OTF of a unit pupil at shear s, (F,) 0 to 1 of the cut-off, with coma of the wavefront, waves of Z7 rms, along it."""
+    """OTF of a unit pupil at shear s, (F,) 0 to 1 of the cut-off; coma along it, waves rms of Z8."""
     if coma == 0.0:
         return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
     x, w = np.polynomial.legendre.leggauss(48)
@@ -59,7 +59,7 @@ def transfer(f, angle, pitch=PAN, coma=0.0, smear=0.0):
 
 @cache
 def edge_spread(angle, reach, pitch, coma, smear):
-    """E(d) = 1/2 + int_0^fc Im(H exp(2 pi i f d)) / (pi f) df on a grid of 0.01 px, as a spline (exact to 1e-9)."""
+    """E(d) = 1/2 + int_0^fc Im(H exp(2 pi i f d)) / (pi f) df on a grid of 0.01 px, as a spline."""
     cutoff = pitch / (WAVELENGTH * F_NUMBER)
     x, w = np.polynomial.legendre.leggauss(32)
     # a panel covers at most four periods; sin places panels closely at the cut-off, where H ends as (1 - s)^1.5
@@ -82,7 +82,7 @@ def edge_spread(angle, reach, pitch, coma, smear):
 
 
 def edge_image(degrees, rows=64, columns=None, pitch=PAN, coma=0.0, smear=0.0, bend=0.0):
-    """Noise-free grey values of a near-vertical edge that passes (row, column) = middle + MIDDLE, bright on the right."""
+    """Noise-free grey values of a near-vertical edge through (row, column) = middle + MIDDLE, bright on the right."""
     angle, columns = math.radians(degrees), columns or rows
     row = np.arange(rows)[:, None] - (rows - 1) / 2 - MIDDLE[0]
     column = np.arange(columns) - (columns - 1) / 2 - MIDDLE[1] - bend * row**2 / 2
@@ -119,7 +119,7 @@ def chi_square_limits(count):
     return stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], count - 1)
 
 
-# --- accuracy -----------------------------------------------------------------------------------------------------------
+# --- accuracy ---
 
 
 @pytest.mark.parametrize("pitch", [PAN, MULTISPECTRAL])
@@ -239,7 +239,7 @@ def test_speed():
     assert min(times) < 0.015
 
 
-# --- noise --------------------------------------------------------------------------------------------------------------
+# --- noise ---
 
 
 @pytest.mark.parametrize(("contrast_e", "use_model"), [(4000, True), (4000, False), (600, True)])
@@ -317,7 +317,7 @@ def test_curvature_is_found():
     assert abs(measure_edge(edge_image(4)).curvature) < 1e-6
 
 
-# --- bad input ----------------------------------------------------------------------------------------------------------
+# --- bad input ---
 
 
 def noisy(image, sigma=2.0):
