@@ -2,10 +2,10 @@
 
 1. `locate_spots`: energy centroids on the line CCD, L = (column - middle of the line) * pitch.
 2. `reduce_sets`: repeated sets to one (W, L) per point, gross errors out by Chauvenet's criterion.
-3. `Distortion.measure`: f, p and D = L - c - f tan W + p tan^2 W with a constant c beside eq. (2), which takes up the error of
-   the zero of W, and a smooth model of D. What the points scatter about that model beyond their noise is taken as one more
-   noise, the same at all points and independent from point to point: the subdivision error of the table above all, whose
-   period of arcseconds no calibration follows.
+3. `Distortion.measure`: f, p and D = L - c - f tan W + p tan^2 W with a constant c beside eq. (2), which takes up the
+   error of the zero of W, and a smooth model of D. What the points scatter about that model beyond their noise is taken
+   as one more noise, the same at all points and independent from point to point: the subdivision error of the table
+   above all, whose period of arcseconds no calibration follows.
 
 Metres and radians; N points, S sets.
 """
@@ -215,8 +215,8 @@ class Distortion:
 
     @property
     def rms_over_sets(self) -> Array:
-        """RMS of each point's distortion over the sets that are kept, (N,), metres, every set fitted by itself: what Table 2
-        of paper 004 is called.
+        """RMS of each point's distortion over the sets that are kept, (N,), metres, every set fitted by itself: what
+        Table 2 of paper 004 is called.
         """
         out = np.full(self.position.shape, np.nan)
         for s, keep in enumerate(self.means.keep.T):

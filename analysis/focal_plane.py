@@ -79,6 +79,19 @@ class FocalPlaneFit:
     p_value: float
     extra_sigma: float
 
+    @property
+    def noise_covariance(self) -> Array:
+        """(3, 3) of piston, slope_x, slope_y from the places' own sigmas alone.
+
+        How much another measurement of the same assembly would scatter: chips that are not coplanar stay as they are.
+        """
+        free = [k for k, name in enumerate(_NAMES) if name not in self.held]
+        weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
+        gain = self.covariance[np.ix_(free, free)] @ (_design(self.place)[:, free] * weight[:, None]).T
+        out = np.zeros((3, 3))
+        out[np.ix_(free, free)] = (gain * self.sigma**2) @ gain.T
+        return out
+
     def plane(self, place: ArrayLike) -> tuple[Array, Array]:
         """Height (...) of the fitted plane at places (..., 2), and its sigma (...); metres."""
         design = _design(np.asarray(place, np.float64))

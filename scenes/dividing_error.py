@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from scenes.errors import Problem
 from scenes.quantity import Quantity
-from scenes.spec import Name, Number, Spec, Text, Whole
+from scenes.spec import Name, Number, Seed, Spec, Text, Whole
 from scenes.units import ANGLE, format_quantity
 
 ErrorSize = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg")]
@@ -177,6 +177,7 @@ class TurntableTestSpec(Spec):
         reference: what the table is compared with.
         calibration: what is compared.
         camera_angle: reading of the table at the middle of the camera's field in the distortion test, radians.
+        seed: of everything that is drawn.
     """
 
     name: Name
@@ -185,6 +186,7 @@ class TurntableTestSpec(Spec):
     reference: ReferenceSpec
     calibration: CalibrationPlanSpec
     camera_angle: TableAngle
+    seed: Seed = 1
 
     @model_validator(mode="after")
     def _camera_is_calibrated(self) -> "TurntableTestSpec":

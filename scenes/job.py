@@ -17,6 +17,7 @@ from scenes.errors import InputError, Issue, KeyPath, Problem, names_text, neare
 from scenes.instrument import Frames
 from scenes.quantity import Quantity, Vector
 from scenes.spec import Name, NothingIsEmpty, Paths, Reference, Seed, Spec, Whole
+from scenes.targets import TARGET_IMAGES, TargetsSpec
 from scenes.units import ANGLE, LENGTH, SCALE
 
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
@@ -104,9 +105,10 @@ class PerturbationSpec(Spec):
 
 
 def _some(images: tuple[str, ...]) -> tuple[str, ...]:
+    """Every image once, the spots first."""
     if not images:
         raise Problem("nothing to render", "an empty list", "[spots]")
-    return images
+    return tuple(dict.fromkeys(("spots", *images)))
 
 
 class StraySpec(Spec):
@@ -128,16 +130,34 @@ class RenderSpec(Spec):
     """What is rendered.
 
     Attributes:
-        images: which images; at present the monitor's spots.
+        images: which images: the monitor's spots, which are always among them, and test targets on the line CCDs.
+        targets: how the test targets are turned and exposed, None for the defaults.
         stray: whether ghosts and stray light are path-traced and added: true, or the number of paths.
         frames: number of frames, None for as many as the instrument's monitor takes.
         seed: of every random number in the job.
     """
 
-    images: Annotated[tuple[Literal["spots"], ...], AfterValidator(_some)] = ("spots",)
+    images: Annotated[tuple[Literal["spots", "knife_edge", "bars", "star", "pinhole"], ...], AfterValidator(_some)] = (
+        "spots",
+    )
+    targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     frames: Frames | None = None
     seed: Seed = 1
+
+    @model_validator(mode="after")
+    def _targets_are_rendered(self) -> "RenderSpec":
+        if self.targets is not None and not self.target_images:
+            known = ", ".join(TARGET_IMAGES)
+            raise Problem(
+                "targets are described, but none is rendered", "no target among images", known, within=("images",)
+            )
+        return self
+
+    @property
+    def target_images(self) -> tuple[str, ...]:
+        """The test targets among the images, in the order of TARGET_IMAGES."""
+        return tuple(name for name in TARGET_IMAGES if name in self.images)
 
 
 class AnalysisSpec(Spec):

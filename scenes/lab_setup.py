@@ -1,6 +1,7 @@
 """A laboratory test together with everything it refers to, so that one file says all that went into a run."""
 
 from pathlib import Path
+from typing import Generic, Self, TypeVar
 
 from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
@@ -21,43 +22,55 @@ from scenes.spec import Paths, Source, Spec
 from scenes.translate import validate
 from scenes.yaml_file import dump_yaml, read_yaml
 
+TestType = TypeVar("TestType", FocusTestSpec, DistortionTestSpec, TurntableTestSpec)
 
-class FocusSetup(Spec):
+
+class LabSetup(Spec, Generic[TestType]):
+    """What all laboratory tests have.
+
+    Attributes:
+        test: what the test's file says.
+    """
+
+    test: TestType
+
+    def with_seed(self, seed: int) -> Self:
+        """The same with another seed, for one that a command overrides."""
+        return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
+
+    def to_yaml(self) -> str:
+        """Text of a config.yaml; the function that read the test reads it back to the same values."""
+        return dump_yaml(self.plain())
+
+
+class FocusSetup(LabSetup[FocusTestSpec]):
     """A focal-plane alignment with its camera and detectors.
 
     Attributes:
-        test: what the file says.
         camera: prescription and bands.
         detectors: as the bands name them -> data sheet.
     """
 
-    test: FocusTestSpec
     camera: CameraSpec
     detectors: Paths[DetectorSpec]
 
-    def to_yaml(self) -> str:
-        """Text that ``resolve_focus`` reads back to the same values."""
-        return dump_yaml(self.plain())
 
-
-class DistortionSetup(Spec):
+class DistortionSetup(LabSetup[DistortionTestSpec]):
     """A distortion test with its camera, detectors and turntable.
 
     Attributes:
-        test: what the file says.
         turntable: its dividing error and calibration.
         camera: prescription and bands.
         detectors: as the bands name them -> data sheet.
     """
 
-    test: DistortionTestSpec
     turntable: TurntableTestSpec
     camera: CameraSpec
     detectors: Paths[DetectorSpec]
 
-    def to_yaml(self) -> str:
-        """Text that ``resolve_distortion`` reads back to the same values."""
-        return dump_yaml(self.plain())
+
+class TurntableSetup(LabSetup[TurntableTestSpec]):
+    """A turntable test, which refers to nothing else."""
 
 
 def resolve_focus(path: str | Path) -> FocusSetup:
@@ -93,6 +106,18 @@ def resolve_distortion(path: str | Path) -> DistortionSetup:
     return DistortionSetup.model_construct(
         test=test, turntable=turntable, camera=camera, detectors=FrozenMap(load_band_detectors(camera))
     )
+
+
+def resolve_turntable(path: str | Path) -> TurntableSetup:
+    """Read a turntable test; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: the file cannot be read or is not valid.
+    """
+    if _is_resolved(path):
+        setup = validate(TurntableSetup, read_yaml(path))
+        return setup.model_copy(update={"test": _told(setup, setup.test)})
+    return TurntableSetup.model_construct(test=load_turntable_test(path))
 
 
 def _is_resolved(path: str | Path) -> bool:

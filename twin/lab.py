@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 from rich import box
@@ -19,18 +19,15 @@ from rich.table import Table
 from optics.backend import Backend, load_backend
 from scenes.errors import InputError
 from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.cli import BACKEND_HELP, LARGEST_SEED, InputErrorText, check_backend, exit_on_terminate, explained
-from twin.laboratory.distortion import run_distortion
-from twin.laboratory.focus import run_focus
-from twin.laboratory.output import RunFacts, write_lab
-from twin.laboratory.result import LabResult
+from twin.cli import BACKEND_HELP, LARGEST_SEED, check_backend, exit_on_terminate, explained
 from twin.laboratory.bench_error import BenchError
-from twin.laboratory.turntable import run_turntable
+from twin.laboratory.distortion import run_distortion
+from twin.laboratory.focus_result import run_focus
+from twin.laboratory.output import RunFacts, write_lab
+from twin.laboratory.result import Advance, LabResult
+from twin.laboratory.turntable_result import run_turntable_test
 from twin.report.page import cell_text
 from twin.run_folder import RunFolder, next_free
-
-Advance = Callable[[str, int, int], None]
-Setup = TypeVar("Setup")
 
 File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
 Out = Annotated[Path | None, typer.Option(readable=False, help="Run folder to make. Default: runs/TEST-001, -002, ...")]
@@ -75,7 +72,8 @@ def focus(
     focus.json holds, for every round, the confocal error, the line's level, MTF at Nyquist by band and the shims,
     and under `truth` what the exact trace says.
     """
-    _command("focus", file, resolve_focus, run_focus, _Options(out, seed, backend, force, as_json, quiet))
+    options = _Options(out, seed, backend, force, as_json, quiet)
+    _command("focus", file, resolve_focus, run_focus, options)
 
 
 @app.command()
@@ -91,9 +89,8 @@ def distortion(
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
     """
-    _command(
-        "distortion", file, resolve_distortion, run_distortion, _Options(out, seed, backend, force, as_json, quiet)
-    )
+    options = _Options(out, seed, backend, force, as_json, quiet)
+    _command("distortion", file, resolve_distortion, run_distortion, options)
 
 
 @app.command()
@@ -107,7 +104,9 @@ def turntable(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles."""
-    _command("turntable", file, resolve_turntable, run_turntable, _Options(out, seed, backend, force, as_json, quiet))
+    _command(
+        "turntable", file, resolve_turntable, run_turntable_test, _Options(out, seed, backend, force, as_json, quiet)
+    )
 
 
 @dataclass(frozen=True)

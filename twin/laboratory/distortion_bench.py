@@ -1,10 +1,10 @@
-"""The bench of the distortion test (paper 004, section 3.1): the camera hangs on a turntable and looks at a pinhole in a
-collimator that stands still.
+"""The bench of the distortion test (paper 004, section 3.1): the camera hangs on a turntable and looks at a pinhole in
+a collimator that stands still.
 
-World = camera frame. When the table turns by W the light's direction turns by +W about the table's axis, the camera's X
-but for a tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f tan W along the line. W counts from the
-true angle of the table at which the as-built camera images the pinhole to the middle of the line. The image is read out
-where the line's scan sees it: over the field its rows drift by the smile of the mapping.
+World = camera frame. When the table turns by W the light's direction turns by +W about the table's axis, the camera's
+X but for a tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f tan W along the line. W counts from
+the true angle of the table at which the as-built camera images the pinhole to the middle of the line. The image is read
+out where the line's scan sees it: over the field its rows drift by the smile of the mapping.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ from twin.target_path import TargetPath
 Advance = Callable[[str, int, int], None]
 
 LEAST_WIDTH = 2.0
-"""Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001 pixel."""
+"""Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001 of
+a pixel.
+"""
 
 MARGIN = 6
 """Pixels between the centroid's window and the image's edge: four rows of background, and the spot's place between
@@ -259,7 +261,8 @@ def _check_pinhole(setup: DistortionSetup, focal_length: float) -> None:
     allowed = f"{1e6 * LEAST_WIDTH * per_pixel:.0f} um to {1e6 * most * per_pixel:.0f} um"
     if width < LEAST_WIDTH:
         raise BenchError(
-            f"the pinhole's image is {width:.2g} pixels wide: too small for these pixels, which would bias its centroid",
+            f"the pinhole's image is {width:.2g} pixels wide: too small for these pixels, which would bias its "
+            "centroid",
             ("pinhole",),
             allowed,
         )

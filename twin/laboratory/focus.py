@@ -19,7 +19,7 @@ from optics.rotation import about_axis, rotation_matrix
 from twin.detector import FixedPattern
 from twin.laboratory.bench_error import BenchError
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_scan import NyquistMtf, Recorder, SiteScan, Standing, in_focus, scan
+from twin.laboratory.focus_scan import VERTEX_ERROR, NyquistMtf, Recorder, SiteScan, Standing, in_focus, scan
 from twin.laboratory.result import Advance, silent
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
@@ -48,12 +48,12 @@ class State:
     @property
     def defocus(self) -> np.ndarray:
         """Measured, (N,), metres, positive where the CCD stands downstream of best focus."""
-        return np.array([s.vertex.position for s in self.scans])
+        return np.array([s.defocus for s in self.scans])
 
     @property
     def defocus_sigma(self) -> np.ndarray:
         """Its sigma, (N,), metres."""
-        return np.array([s.vertex.sigma for s in self.scans])
+        return np.array([s.defocus_sigma for s in self.scans])
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,13 @@ class Shimming:
 
     plane: FocalPlaneFit
     plan: ShimPlan
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(3, 3) of piston, slope_x and slope_y against the true plane: noise and the vertices' own error."""
+        out = np.array(self.plane.noise_covariance)
+        out[0, 0] += VERTEX_ERROR**2
+        return out
 
 
 @dataclass(frozen=True, eq=False)

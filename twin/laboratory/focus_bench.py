@@ -47,8 +47,10 @@ class Site:
         place: (X', Y') on the nominal focal plane, metres.
         point, direction: of the chief ray in the focal-plane frame, (3,), metres and unit.
         imagers: edge -> its images.
-        defocus_per_shift: edge -> defocus of the image per metre of the target's move, as the edge's direction sees it.
-        best: Z' of best focus: where the mean of both edges' MTF at the Nyquist frequency is largest, metres.
+        defocus_per_shift: edge -> defocus of the image per metre of the target's move, as the edge's direction sees it:
+            (f / collimator's f)^2 with the focal length in that direction.
+        nominal_per_shift: the same of the prescription, which the analysis may know.
+        edge_focus: edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
     """
 
     band: str
@@ -58,7 +60,13 @@ class Site:
     direction: np.ndarray
     imagers: Mapping[str, EdgeImager]
     defocus_per_shift: Mapping[str, float]
-    best: float
+    nominal_per_shift: Mapping[str, float]
+    edge_focus: Mapping[str, float]
+
+    @property
+    def best(self) -> float:
+        """Z' of best focus: midway between those of the two edges, which astigmatism moves apart, metres."""
+        return float(np.mean([self.edge_focus[edge] for edge in EDGES]))
 
     @property
     def nyquist(self) -> float:
@@ -130,11 +138,6 @@ class FocusBench:
         self.focal_length = float(self.camera.model.first_order.focal_length[0])
         self.sites = self._build_sites(advance)
 
-    @property
-    def image_per_target_shift(self) -> float:
-        """By how much the image moves per metre of the target's move, with the camera's nominal focal length."""
-        return (self.focal_length / self.collimator.focal_length) ** 2
-
     def geometric_zero(self, band: str) -> float:
         """Defocus at which geometric blur takes all contrast at a band's Nyquist frequency, metres."""
         f_number = self.focal_length / self.setup.camera.entrance_pupil
@@ -158,19 +161,21 @@ class FocusBench:
     def _site(self, band: str, field: float, direction: np.ndarray, hit: np.ndarray, pupil: PupilFunction) -> Site:
         test, ccd = self.setup.test, self.ccds[band]
         local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
-        imagers, ratio = {}, {}
+        nominal = self.path.local_map({}, direction, ccd.band.pitch * test.edge.region)
+        imagers, ratio, nominal_ratio = {}, {}, {}
         for k, edge in enumerate(EDGES):
             shape = slanted_edge(test.edge.angle, _AXES[edge]).parts[0][1]
             assert isinstance(shape, HalfPlane)
             optics = EdgeOptics.build(pupil, ccd.band, shape.mapped(local).normal)
             imagers[edge] = EdgeImager(optics, ccd, test.edge.region)
             ratio[edge] = float(local.jacobian[k, k] ** 2)
+            nominal_ratio[edge] = float(nominal.jacobian[k, k] ** 2)
         # the pupil's mean direction in (Y', X') is the chief ray's but for coma
         v, u = pupil.centre
         ray = np.array([u, v, np.sqrt(1.0 - u * u - v * v)])
         point = np.array([hit[1], hit[0], 0.0])
-        best = best_focus(imagers, ccd.band.nyquist)
-        return Site(band, field, point[:2], point, ray, imagers, ratio, best)
+        focus = {edge: best_focus(imager, ccd.band.nyquist) for edge, imager in imagers.items()}
+        return Site(band, field, point[:2], point, ray, imagers, ratio, nominal_ratio, focus)
 
     def budget(self) -> tuple[BudgetLine, ...]:
         """What makes each band's MTF at Nyquist in the middle of the field, along the line and along the track."""
@@ -184,11 +189,10 @@ class FocusBench:
                 edge: EdgeImager(EdgeOptics.build(pupil, ccd.band, i.optics.normal, _SEARCH), ccd, i.region)
                 for edge, i in site.imagers.items()
             }
-            focus = best_focus(ideal, ccd.band.nyquist)
             for edge, imager in site.imagers.items():
                 f = ccd.band.nyquist
                 x, y = f * imager.optics.normal
-                diffraction = abs(complex(ideal[edge].optics.at(focus, np.array([f]))[0]))
+                diffraction = abs(complex(ideal[edge].optics.at(best_focus(ideal[edge], f), np.array([f]))[0]))
                 actual = abs(complex(imager.optics.at(site.best, np.array([f]))[0]))
                 parts = {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
                 factors = {"diffraction": diffraction, "wavefront": actual / diffraction, **parts}
@@ -196,11 +200,11 @@ class FocusBench:
         return tuple(out)
 
 
-def best_focus(imagers: Mapping[str, EdgeImager], frequency: float) -> float:
-    """Defocus at which the mean MTF of the edges is largest, metres."""
+def best_focus(imager: EdgeImager, frequency: float) -> float:
+    """Defocus at which the MTF is largest, metres."""
 
     def loss(defocus: float) -> float:
-        return -sum(imager.mtf(defocus, frequency) for imager in imagers.values())
+        return -imager.mtf(defocus, frequency)
 
     coarse = np.linspace(-_SEARCH, _SEARCH, 41)
     start = int(np.argmin([loss(float(z)) for z in coarse]))

@@ -12,7 +12,7 @@ from analysis.edge_location import EdgeError
 from analysis.slanted_edge import measure_edge
 from analysis.through_focus import FocusError, FocusVertex, focus_vertex
 from optics.pose import Pose
-from optics.threads import cores
+from optics.threads import cores, one_blas_thread
 from twin.detector import FixedPattern
 from twin.laboratory.bench_error import BenchError
 from twin.laboratory.focus_bench import ALONG, EDGES, FocusBench, Site
@@ -21,9 +21,14 @@ from twin.laboratory.result import Advance, silent
 NYQUIST = 0.5
 """Cycles per pixel."""
 
+VERTEX_ERROR = 0.5e-6
+"""Error that the form of the curve near its peak leaves in all vertices alike, metres, one sigma: wavefronts of 0.2
+waves shift them by so much."""
+
 _OFFSET, _FRAMES, _PATTERN = range(3)
-_COARSE_SITES = 4
+_COARSE = 4
 """Positions of the first scan that lie within the defocus at which all contrast is gone, at least."""
+_ATTEMPTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,24 +49,40 @@ class SiteScan:
     """One site through focus.
 
     Attributes:
-        shift: moves of the target, as moves of the image, metres, (Z,).
-        mtf, sigma: mean of both edges at the Nyquist frequency, (Z,).
-        vertex: its peak; the CCD stands downstream of best focus by the vertex's position.
-        frame: one recorded frame near the peak.
+        shift: edge -> moves of the target, as moves of the image in the edge's direction, metres, (Z,).
+        mtf, sigma: edge -> MTF at the Nyquist frequency, (Z,); an infinite sigma where no edge could be measured.
+        vertex: edge -> its peak.
+        frames: edge -> one recorded frame near the peak.
     """
 
-    shift: np.ndarray
-    mtf: np.ndarray
-    sigma: np.ndarray
-    vertex: FocusVertex
-    frame: np.ndarray
+    shift: Mapping[str, np.ndarray]
+    mtf: Mapping[str, np.ndarray]
+    sigma: Mapping[str, np.ndarray]
+    vertex: Mapping[str, FocusVertex]
+    frames: Mapping[str, np.ndarray]
+
+    @property
+    def defocus(self) -> float:
+        """How far the CCD stands downstream of best focus, midway between the edges' vertices, metres."""
+        return float(np.mean([v.position for v in self.vertex.values()]))
+
+    @property
+    def defocus_sigma(self) -> float:
+        """Its sigma from noise, metres; ``VERTEX_ERROR`` comes on top of it, the same for all sites."""
+        return float(np.sqrt(sum(v.sigma**2 for v in self.vertex.values())) / len(self.vertex))
 
 
 @dataclass(frozen=True, eq=False)
 class NyquistMtf:
-    """Measured MTF at the Nyquist frequency with the target at the collimator's focus: edge -> (value, sigma)."""
+    """Edges of one site with the target at the collimator's focus.
+
+    Attributes:
+        by_edge: edge -> MTF at the Nyquist frequency and its sigma.
+        frames: edge -> recorded frames (frames, region, region).
+    """
 
     by_edge: Mapping[str, tuple[float, float]]
+    frames: Mapping[str, np.ndarray]
 
 
 class Recorder:
@@ -87,21 +108,21 @@ class Recorder:
         self.patterns = patterns
 
     def frames(self, number: int, edge: str, shift: float, take: int) -> np.ndarray:
-        """Frames (frames, region, region) of an edge at site ``number``, the image moved by ``shift``; ``take`` tells
-        one exposure from another.
+        """Frames (frames, region, region) of an edge at site ``number``, the target moved by ``shift`` metres; ``take``
+        tells one exposure from another.
         """
         site, bench = self.bench.sites[number], self.bench
         height = self.standing.heights[site.band]
         ccd = bench.ccds[site.band]
         offset_seed, frame_seed = (self._stream(which, number, EDGES.index(edge), take) for which in (_OFFSET, _FRAMES))
         offset = float(np.random.default_rng(offset_seed).uniform(-0.5, 0.5)) * ccd.band.pitch
-        share = site.image(edge, self.standing.pose, height, shift / bench.image_per_target_shift, offset)
+        share = site.image(edge, self.standing.pose, height, shift, offset)
         photons = ccd.white_photons(bench.setup.test.white) * share
         column = site.column(self.standing.pose, height)
         return ccd.expose(photons, column, self.patterns[site.band], bench.setup.test.frames, frame_seed)
 
     def measure(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray]:
-        """MTF at the Nyquist frequency, its sigma, and the first frame.
+        """MTF at the Nyquist frequency, its sigma, and the frames.
 
         Raises:
             EdgeError: no edge can be measured in the image.
@@ -110,7 +131,7 @@ class Recorder:
         ccd = self.bench.ccds[self.bench.sites[number].band]
         result = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames))
         value, sigma = result.at(NYQUIST)
-        return value, sigma, frames[0]
+        return value, sigma, frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
         """As ``measure``; where the image is too blurred, or otherwise not good for it, MTF 0 with an infinite sigma,
@@ -119,7 +140,7 @@ class Recorder:
         try:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
-            return 0.0, np.inf, np.zeros((1, 1), np.uint16), str(error)
+            return 0.0, np.inf, np.zeros((1, 1, 1), np.uint16), str(error)
 
     def _stream(self, *key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(self.seed.entropy, spawn_key=(*self.seed.spawn_key, *key))
@@ -139,7 +160,7 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
     """
     count = len(recorder.bench.sites)
     done: list[SiteScan] = []
-    with ThreadPoolExecutor(cores()) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
         for result in pool.map(lambda n: _scan_site(recorder, n, search), range(count)):
             done.append(result)
             advance("through focus", len(done), count)
@@ -151,9 +172,9 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
 
     def site(number: int) -> NyquistMtf:
         takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in EDGES}
-        return NyquistMtf({edge: (value, sigma) for edge, (value, sigma, _) in takes.items()})
+        return NyquistMtf({e: (t[0], t[1]) for e, t in takes.items()}, {e: t[2] for e, t in takes.items()})
 
-    with ThreadPoolExecutor(cores()) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
         return tuple(pool.map(site, range(len(recorder.bench.sites))))
 
 
@@ -161,34 +182,40 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
     bench = recorder.bench
     site, plan = bench.sites[number], bench.setup.test.scan
     zero = bench.geometric_zero(site.band)
+    ratio = site.nominal_per_shift
     centre = _search(recorder, number, zero) if search else 0.0
-    half = plan.depth * zero
-    for attempt in range(3):
-        shift = centre + np.linspace(-half, half, plan.points)
-        taken = [
-            [recorder.attempt(number, edge, float(s), 1000 * (attempt + 1) + k) for edge in EDGES]
-            for k, s in enumerate(shift)
-        ]
-        value = np.array([[one[0] for one in both] for both in taken])
-        sigma = np.array([[one[1] for one in both] for both in taken])
-        mean, error = value.mean(axis=1), np.sqrt(np.sum(sigma**2, axis=1)) / len(EDGES)
+    steps = plan.depth * zero / ratio[ALONG] * np.linspace(-1.0, 1.0, plan.points)
+    for attempt in range(_ATTEMPTS):
+        target = centre + steps
+        taken = {
+            edge: [recorder.attempt(number, edge, float(s), 1000 * (attempt + 1) + k) for k, s in enumerate(target)]
+            for edge in EDGES
+        }
+        shift = {edge: target * ratio[edge] for edge in EDGES}
+        mtf = {edge: np.array([one[0] for one in taken[edge]]) for edge in EDGES}
+        sigma = {edge: np.array([one[1] for one in taken[edge]]) for edge in EDGES}
         try:
-            vertex = focus_vertex(shift, mean, error)
-            return SiteScan(shift, mean, error, vertex, taken[int(np.argmax(mean))][0][2])
+            vertex = {edge: focus_vertex(shift[edge], mtf[edge], sigma[edge]) for edge in EDGES}
         except FocusError as problem:
-            if attempt == 2:
+            if attempt == _ATTEMPTS - 1:
                 raise _lost(site, problem) from problem
-            centre = _search(recorder, number, zero) if attempt == 0 else float(shift[np.argmax(mean)])
+            # the first scan may have met a side lobe or a flank: go to the highest point, then look everywhere again
+            best = int(np.argmax(sum(mtf.values())))
+            centre = _search(recorder, number, zero) if attempt == 1 or not search else float(target[best])
+            continue
+        frames = {edge: taken[edge][int(np.argmax(mtf[edge]))][2][0] for edge in EDGES}
+        return SiteScan(shift, mtf, sigma, vertex, frames)
     raise AssertionError("unreachable")
 
 
 def _search(recorder: Recorder, number: int, zero: float) -> float:
-    """Rough place of the peak: where the scan over the whole reach shows most contrast along the line."""
+    """Rough place of the peak, as a move of the target: where the whole reach shows most contrast along the line."""
     plan = recorder.bench.setup.test.scan
     site = recorder.bench.sites[number]
     # wide peaks need no more positions than that some of them meet the peak
-    step = max(plan.step, 2.0 * zero / _COARSE_SITES)
-    shift = np.linspace(-plan.reach, plan.reach, 2 * int(np.ceil(plan.reach / step)) + 1)
+    step = max(plan.step, 2.0 * zero / _COARSE)
+    reach = plan.reach / site.nominal_per_shift[ALONG]
+    shift = np.linspace(-reach, reach, 2 * int(np.ceil(plan.reach / step)) + 1)
     taken = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift)]
     if all(np.isinf(one[1]) for one in taken):
         raise BenchError(

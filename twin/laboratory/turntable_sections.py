@@ -5,14 +5,10 @@ from __future__ import annotations
 from analysis.monitoring import ARCSEC
 from scenes.units import ANGLE, format_quantity
 from twin.artefact import SvgFigure, Table
+from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC
 from twin.laboratory.section import Section
 from twin.laboratory.turntable import TurntableRun
 from twin.laboratory.turntable_figure import FIT_NAMES, drawn
-
-PAPER_REPEAT, PAPER_CHAUVENET, PAPER_FIT = 0.081, 0.037, 0.2
-"""Paper 004, section 3.3, arcsec: largest RMS of the repeats, the same after Chauvenet's criterion, bound on the fit's
-RMS.
-"""
 
 
 def sections(run: TurntableRun) -> tuple[Section, ...]:
@@ -41,7 +37,7 @@ def _comparison(run: TurntableRun) -> Section:
             "gross errors that hide each other. Those angles are given the sigma of their own repeats; "
             "measure them again."
         )
-    paper = {"repeat_rms_arcsec": PAPER_REPEAT, "chauvenet_rms_arcsec": PAPER_CHAUVENET}
+    paper = {"repeat_rms_arcsec": REPEAT_RMS_ARCSEC, "chauvenet_rms_arcsec": CHAUVENET_RMS_ARCSEC}
     names = {
         "repeat_rms_arcsec": "repeats, as read",
         "chauvenet_rms_arcsec": "repeats, after Chauvenet's criterion",
@@ -76,7 +72,7 @@ def _fits(run: TurntableRun) -> Section:
         f"Five fits of the means, ranked at {len(run.held_out.angle)} held-out readings in the middle of the steps, "
         f"measured in a series of their own with σ = {result['heldout_sigma_arcsec']:.4f}″ each. Cross-validation "
         f"on the calibration points alone chooses the {FIT_NAMES[chosen]}; it has {held:.4f}″ at the held-out "
-        f"readings, {'below' if held < PAPER_FIT else 'not below'} the paper's {PAPER_FIT}″."
+        f"readings, {'below' if held < FIT_RMS_ARCSEC else 'not below'} the paper's {FIT_RMS_ARCSEC}″."
         + ("" if best == chosen else f" There the {FIT_NAMES[best]} is the best.")
     ]
     if abs(periods - round(periods)) < 1e-6:

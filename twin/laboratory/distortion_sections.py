@@ -1,0 +1,258 @@
+"""What a laboratory report says of the distortion test."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.monitoring import ARCSEC
+from optics.frozen_map import FrozenMap
+from scenes.units import ANGLE, LENGTH, format_quantity
+from twin.artefact import Cell, SvgFigure, Table
+from twin.laboratory import printed_004
+from twin.laboratory.distortion import DistortionRun, rms
+from twin.laboratory.distortion_figure import curve_svg, points_svg, spot_svg
+from twin.laboratory.distortion_json import to_dict
+from twin.laboratory.result import LabResult
+from twin.laboratory.section import Section
+from twin.laboratory.turntable_figure import FIT_NAMES
+
+Array = NDArray[np.float64]
+SHOWN = 3
+"""Points whose frames are kept: first, middle, last."""
+
+
+def lab_result(run: DistortionRun) -> LabResult:
+    """The test as the command gives it."""
+    data = to_dict(run)
+    truth, test = data["truth"], run.setup.test
+    fit = run.compensated.fit
+    count, sets = run.record.reading.shape
+    numbers = np.linspace(0, count - 1, SHOWN).astype(int)
+    width = run.bench.images.width
+    return LabResult(
+        kind="distortion",
+        title="Interior orientation and distortion",
+        lead=(
+            f"Principal distance {data['principal_distance_mm']:.3f} ± {data['principal_distance_mm_sigma']:.3f} mm "
+            f"(truth {truth['principal_distance_mm']:.3f} mm).",
+            fit.point.statement,
+            f"Distortion is measured to {truth['error_rms_compensated_um']:.2f} µm rms with compensated angles and "
+            f"{truth['error_rms_raw_um']:.2f} µm with angles as read (paper 004 claims "
+            f"{printed_004.DISTORTION_ACCURACY_UM} µm).",
+        ),
+        facts=(
+            ("camera", f"{test.camera}, band {test.band}"),
+            (
+                "points, sets",
+                f"{count} over ±{np.degrees(run.bench.turn[-1]):.3f}°, {sets} sets of {test.frames} frames",
+            ),
+            (
+                "pinhole",
+                f"{format_quantity(test.pinhole, LENGTH)} in a collimator of "
+                f"{format_quantity(test.collimator.focal_length, LENGTH)}: {width:.1f} pixels in the image",
+            ),
+            ("turntable", f"{run.setup.turntable.name}, dividing error by {FIT_NAMES[run.compensation.fit.name]}"),
+            (
+                "spots along the track",
+                f"over {truth['row_smile_um']:.0f} µm: smile of the mapping and tilt of the axis",
+            ),
+        ),
+        data=data,
+        summary=_summary(run),
+        sections=(_curve(run), _compensation(run), _estimates(run), _noise(run)),
+        images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
+        warnings=_warnings(run),
+    )
+
+
+def _warnings(run: DistortionRun) -> tuple[str, ...]:
+    out = []
+    kept = int(np.sum(run.truth.gross & run.means.keep))
+    if kept:
+        out.append(f"{kept} of the gross errors stay in: Chauvenet's criterion does not see two of them at one point")
+    left = run.bench.true_offset - run.bench.design_offset
+    slope = float(np.polyfit(np.tan(run.bench.turn), left, 1)[0])
+    sigma = run.compensated.fit.sigma("principal_distance")
+    if abs(slope) > 0.5 * sigma:
+        out.append(
+            "as-built coma that grows over the field moves energy centroids against chief rays and f by "
+            f"{1e6 * slope:.0f} um, which no sigma holds ({1e6 * sigma:.0f} um): measure the wavefront at several "
+            "fields"
+        )
+    return tuple(out)
+
+
+def _summary(run: DistortionRun) -> Table:
+    data = to_dict(run)
+    truth = data["truth"]
+    rows: list[tuple[Cell, ...]] = [
+        (
+            "principal distance, mm",
+            data["principal_distance_mm"],
+            data["principal_distance_mm_sigma"],
+            truth["principal_distance_mm"],
+        ),
+        (
+            "principal point, mm",
+            data["principal_point_mm"],
+            data["principal_point_mm_sigma"],
+            truth["principal_point_mm"],
+        ),
+        ("correlation of the two", data["correlation"], None, None),
+        ("residual of smooth model, raw angles, um rms", data["rms_raw_um"], None, None),
+        ("residual of smooth model, compensated, um rms", data["rms_compensated_um"], None, None),
+        ("error of distortion, raw angles, um rms", truth["error_rms_raw_um"], None, None),
+        ("error of distortion, compensated, um rms", truth["error_rms_compensated_um"], None, None),
+    ]
+    caption = (
+        "f and p with compensated angles, by least squares with a constant: paper 004, eq. 2, with an unknown zero of "
+        "the angles."
+    )
+    return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows)
+
+
+def _curve(run: DistortionRun) -> Section:
+    own = run.compensated
+    ratio = rms(run.error(own) / own.sigma)
+    text = (
+        "D is what is left of the spots' places after a constant, f tan W and p tan² W, measured and true alike. "
+        "Error bars hold the scatter of the sets, the covariance of the turntable's calibration (compensated angles "
+        "only) and what the points scatter about a smooth curve beyond that. With angles as read the long waves of "
+        "the dividing error pass for distortion, and no error bar knows of them.",
+        f"The errors are {ratio:.2f} sigma rms with compensated angles, "
+        f"{rms(run.error(run.raw) / run.raw.sigma):.2f} with angles as read.",
+    )
+    figure = SvgFigure(
+        "distortion-curve",
+        "Distortion over the field",
+        "Above: measured with sigma, and by exact chief rays of the as-built camera. Below: the error.",
+        curve_svg(run),
+    )
+    return Section("Distortion", text, (figure,))
+
+
+def _compensation(run: DistortionRun) -> Section:
+    raw, own = run.raw, run.compensated
+    printed = [np.array(v) for v in (printed_004.DISTORTION_RAW_UM, printed_004.DISTORTION_COMPENSATED_UM)]
+    pairs: tuple[tuple[str, Array, Array], ...] = (
+        ("error of the distortion (needs the truth)", 1e6 * run.error(raw), 1e6 * run.error(own)),
+        ("distance from the smooth curve", 1e6 * raw.smooth.residual, 1e6 * own.smooth.residual),
+        ("RMS of distortion over the sets", 1e6 * raw.rms_over_sets, 1e6 * own.rms_over_sets),
+        ("paper 004, Table 2", printed[0], printed[1]),
+    )
+    rows: list[tuple[Cell, ...]] = [
+        (name, a, b, 100.0 * (1.0 - b / a), float(np.max(np.abs(first))), float(np.max(np.abs(second))))
+        for name, first, second in pairs
+        for a, b in ((rms(first), rms(second)),)
+    ]
+    lower = [100.0 * (1.0 - size(printed[1]) / size(printed[0])) for size in (rms, np.sum, np.max)]
+    text = (
+        "Paper 004 says that compensated angles lower the RMS of the distortion by "
+        f"{100 * printed_004.REDUCTION:.0f}%. Its own table gives {lower[0]:.0f}% in the RMS of all points, "
+        f"{lower[1]:.0f}% in their sum and {lower[2]:.0f}% in the largest.",
+        "How much an RMS falls depends on what else is in it. That of the distortion itself holds the design's "
+        "distortion, which a dividing error may even cancel in part, so that it can rise. The distance from a "
+        "smooth curve does not see the long waves of the dividing error. Only the error against the truth tells "
+        "what compensation brings. It differs from table to table: the constant, f and p take up what is longer "
+        "than the field.",
+    )
+    table = Table(
+        "distortion-reduction",
+        "What compensation brings",
+        "RMS over the points, and the largest.",
+        ("quantity", "raw, um", "compensated, um", "reduction, %", "largest raw, um", "largest compensated, um"),
+        rows,
+    )
+    figure = SvgFigure(
+        "distortion-points",
+        "Point by point",
+        "Here without the design's distortion; the paper's table holds whatever distortion its camera has.",
+        points_svg(run),
+    )
+    return Section("Raw and compensated angles", text, (figure, table))
+
+
+_ESTIMATES = {
+    "eq2": "(2): f and p",
+    "eq3": "(3): f, p = 0",
+    "eq4": "(4): p, with f of (3)",
+    "eq2_zero_from_constant": "(2), W counted from the fitted zero",
+    "constant": "constant, f, p (taken)",
+    "constant_radial3": "constant, f, p, radial",
+}
+
+
+def _estimates(run: DistortionRun) -> Section:
+    mm = 1e3
+    rows: list[tuple[Cell, ...]] = [
+        (
+            _ESTIMATES[name],
+            mm * e.f,
+            None if e.f_sigma is None else mm * e.f_sigma,
+            mm * (e.f - e.f_true),
+            mm * e.p,
+            None if e.p_sigma is None else mm * e.p_sigma,
+            mm * (e.p - e.p_true),
+            1e6 * e.error,
+        )
+        for name, e in run.estimates.items()
+    ]
+    smooth = run.compensated.smooth
+    zero = (run.compensated.zero - run.truth.zero) / ARCSEC
+    text = (
+        "The printed equations (1) to (4) have no constant: W has to count exactly from the direction that is "
+        f"imaged to the line's middle. The middle was put on the pinhole to {run.truth.zero / ARCSEC:.2f}″, and the "
+        "compensation at that reading has an error of its own. (2) turns such an offset into a principal point, (3) "
+        f"leaves it in the distortion of every point. The constant finds it: {run.compensated.zero / ARCSEC:.2f}″, "
+        f"{zero:+.3f}″ from the truth.",
+        "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
+        "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
+        "own truth.",
+        run.compensated.fit.point.statement,
+    )
+    estimates = Table(
+        "distortion-estimates",
+        "The printed equations and fits with a constant",
+        "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
+        ("estimate", "f, mm", "sigma", "error", "p, mm", "sigma of p", "error of p", "error of D, um rms"),
+        rows,
+    )
+    correlation = Table(
+        "distortion-correlation",
+        "Correlation of the terms",
+        "Of the fit with radial distortion.",
+        ("", *(name.replace("_", " ") for name in smooth.terms)),
+        [
+            (name.replace("_", " "), *(float(v) for v in row))
+            for name, row in zip(smooth.terms, smooth.correlation, strict=True)
+        ],
+    )
+    return Section("Estimators and what can be observed", text, (estimates, correlation))
+
+
+def _noise(run: DistortionRun) -> Section:
+    data = to_dict(run)
+    noise, truth = data["noise"], data["truth"]
+    plan = run.setup.turntable.dividing_error
+    about = run.compensated.fit.value("principal_distance")
+    text = (
+        f"One exposure scatters by {noise['exposure_um']:.2f} µm between the sets; the table's repeatability, "
+        f"{format_quantity(plan.repeatability, ANGLE)}, makes {1e6 * about * plan.repeatability:.2f} µm of it and "
+        f"noise of the frames {noise['centroid_um']:.3f} µm. Chauvenet's criterion takes out {noise['rejected']} of "
+        f"{run.record.reading.size} exposures, {noise['rejected_expected_of_good']:.0f} of them expected without any "
+        f"gross error; {truth['gross_errors']} had one.",
+        f"Differences of the line's columns move a spot by {noise['centroid_columns_um']:.3f} µm; every row of a TDI "
+        "line sees the same columns.",
+        f"Beyond this, points scatter by {noise['white_compensated_um']:.2f} µm about a smooth curve "
+        f"({noise['white_raw_um']:.2f} µm with angles as read): the subdivision error, which the calibration's steps "
+        "cannot see.",
+    )
+    figure = SvgFigure(
+        "distortion-spot",
+        "A spot, enlarged",
+        "Mean of the frames of one exposure in the middle of the field; the cross is the energy centroid, the "
+        "circle its window.",
+        spot_svg(run),
+    )
+    return Section("Spots and noise", text, (figure,))

@@ -1,0 +1,249 @@
+"""What a focal-plane alignment gives: focus.json, the main table, the report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.aim import AimError
+from optics.backend import Backend
+from optics.trace import BeamMissedError
+from twin.artefact import SvgFigure, Table
+from twin.laboratory.bench_error import BenchError
+from twin.laboratory.focus import Alignment, align
+from twin.laboratory.focus_bench import ALONG, EDGES, TRACK, FocusBench
+from twin.laboratory.focus_figure import EDGE_NAMES, defocus_svg, edges_svg, mtf_svg, through_focus_svg
+from twin.laboratory.focus_json import ARCMIN, UM, to_dict
+from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
+from twin.laboratory.result import Advance, LabResult
+from twin.laboratory.section import Section
+from twin.report.numbers import fixed
+
+if TYPE_CHECKING:
+    from scenes.lab_setup import FocusSetup
+
+
+def run_focus(setup: FocusSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
+    """Build the bench, align, and put the result together.
+
+    Raises:
+        InputError: the camera cannot be built as the file says.
+        BenchError: what the file asks for cannot be done.
+    """
+    try:
+        bench = FocusBench(setup, backend, advance)
+    except (AimError, BeamMissedError, ValueError) as error:
+        raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
+    return focus_result(align(bench, seed, advance))
+
+
+def focus_result(alignment: Alignment) -> LabResult:
+    """Numbers, table and report of an alignment."""
+    first, last = alignment.states[0], alignment.states[-1]
+    bench = alignment.bench
+    data = to_dict(alignment)
+    end = data["rounds"][-1]
+    lead = (
+        f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
+        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} µm from best focus, in every field "
+        f"and band (the paper reached {CONFOCAL_UM:.0f} µm), "
+        f"and the line to {abs(end['line_level_arcmin']):.2f}′ of level (the paper: {LINE_LEVEL_ARCMIN:g}′).",
+    )
+    images = {
+        f"{bench.sites[i].band}_field{k}_{edge}": scan.frames[edge]
+        for i, scan in enumerate(last.focus)
+        for edge in EDGES
+        for k in [bench.setup.test.fields.index(bench.sites[i].field) + 1]
+    }
+    return LabResult(
+        "focus",
+        f"Focal-plane alignment of {bench.setup.camera.name}",
+        lead,
+        _facts(alignment),
+        data,
+        _summary(alignment),
+        (_alignment_section(alignment), _mtf_section(alignment), _shim_section(alignment)),
+        images,
+    )
+
+
+def _number(rounds: int) -> str:
+    return "One round" if rounds == 1 else f"{rounds} rounds"
+
+
+def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
+    setup = alignment.bench.setup
+    test, camera = setup.test, setup.camera
+    bands = ", ".join(
+        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM * b.pitch:g} µm"
+        for name, b in camera.bands.items()
+    )
+    level = test.white
+    electrons = ", ".join(
+        f"{name} {level * ccd.detector.full_well_e:.3g} e" for name, ccd in alignment.bench.ccds.items()
+    )
+    return (
+        (
+            "Camera",
+            f"{camera.name}: f {alignment.bench.focal_length:.3f} m, pupil {camera.entrance_pupil:g} m; {bands}",
+        ),
+        (
+            "Collimator",
+            f"f {test.collimator.focal_length:g} m, aperture {test.collimator.aperture:g} m; a slanted edge of "
+            f"{np.degrees(test.edge.angle):g}° at its focus, regions of {test.edge.region} × {test.edge.region} pixels",
+        ),
+        ("Light", f"bright side at {100 * level:.0f}% of the full well ({electrons}); {test.frames} frames averaged"),
+        ("Fields", ", ".join(f"{f:g}" for f in test.fields) + " of half the line, all bands"),
+        (
+            "Mount",
+            f"{len(test.mount.holes)} holes, surface inclined by {np.degrees(test.mount.tilt):g}° against the focal "
+            f"plane, shims ground in steps of {UM * test.mount.step:g} µm",
+        ),
+    )
+
+
+def _summary(alignment: Alignment) -> Table:
+    data = to_dict(alignment)
+    stages = [("before", data["initial"], data["truth"]["initial"])]
+    for k, (measured, true) in enumerate(zip(data["rounds"], data["truth"]["rounds"], strict=True)):
+        stages.append((f"after round {k + 1}", measured, true))
+    rows = []
+    for name, measured, true in stages:
+        rows.append(
+            (
+                name,
+                f"{measured['confocal_um_max']:.1f} ± {measured['confocal_um_sigma']:.1f}",
+                fixed(true["confocal_um_max"], 1),
+                f"{fixed(measured['line_level_arcmin'], 2)} ± {measured['line_level_arcmin_sigma']:.2f}",
+                fixed(true["line_level_arcmin"], 2),
+            )
+        )
+    rows.append(("paper 004", f"{CONFOCAL_UM:.0f}", "", f"{LINE_LEVEL_ARCMIN:g}", ""))
+    return Table(
+        "alignment",
+        "Before and after",
+        "Confocal error: largest distance of any CCD from best focus, over all fields and bands.",
+        ("", "confocal error, µm", "true", "line level, arcmin", "true"),
+        rows,
+    )
+
+
+def _alignment_section(alignment: Alignment) -> Section:
+    text = (
+        "The target is moved through the collimator's focus; a slanted edge is recorded at every position in both "
+        "directions, and its MTF at the band's Nyquist frequency is fitted by its main peak. The image moves along the "
+        "line's direction with f² of that direction over the collimator's f², which differ by "
+        f"{100 * _anamorphism(alignment):.1f}% in this camera; each direction is reduced with its own.",
+        "Best focus is midway between those of the two directions, which astigmatism moves apart.",
+    )
+    figures = (
+        SvgFigure(
+            "through-focus",
+            "Through focus",
+            "Measured MTF at Nyquist with one sigma; dotted, the fitted best focus of each field. Black: the CCD.",
+            through_focus_svg(alignment),
+        ),
+        SvgFigure(
+            "defocus",
+            "Where the CCDs stand",
+            "Points: measured with one sigma. Dashes: truth from the traced pupils. Grey band: what the paper reached.",
+            defocus_svg(alignment),
+        ),
+    )
+    return Section("Alignment", text, figures)
+
+
+def _anamorphism(alignment: Alignment) -> float:
+    site = alignment.bench.sites[0]
+    return float(abs(site.nominal_per_shift[TRACK] / site.nominal_per_shift[ALONG] - 1.0))
+
+
+def _mtf_section(alignment: Alignment) -> Section:
+    data = to_dict(alignment)
+    end, true = data["rounds"][-1], data["truth"]["rounds"][-1]
+    rows = [
+        (
+            band,
+            MTF_NYQUIST.get(band),
+            f"{end['mtf_nyquist'][band]:.3f} ± {end['mtf_nyquist_sigma'][band]:.3f}",
+            true["mtf_nyquist"][band],
+            f"{end['mtf_nyquist_along_line'][band]:.3f} ± {end['mtf_nyquist_along_line_sigma'][band]:.3f}",
+        )
+        for band in alignment.bench.ccds
+    ]
+    names = list(data["mtf_budget"][0]["factors"])
+    budget = [
+        (
+            line["band"],
+            EDGE_NAMES[line["direction"]],
+            *(f"{line['factors'][n]:.3f}" for n in names),
+            f"{line['total']:.3f}",
+        )
+        for line in data["mtf_budget"]
+    ]
+    text = (
+        "The paper's values are compared with the MTF along the track, which has everything in it: optics, pixel, "
+        "charge diffusion and the motion of the image over the stages.",
+        "A perfect camera would have the first factor times the pixel's. The other factors are the degradations that "
+        "bring it to the paper's class; the paper names none of them, so that they are one plausible set among others.",
+    )
+    return Section(
+        "MTF at the Nyquist frequency",
+        text,
+        (
+            Table(
+                "mtf",
+                "Measured in focus, mean over the fields",
+                "The noise's sigma; truth from the traced pupils at the places where the CCDs really stand.",
+                ("band", "paper 004", "along the track", "true", "along the line"),
+                rows,
+            ),
+            Table(
+                "mtf-budget",
+                "What makes it, in the middle of the field",
+                "Transfer of each effect at Nyquist, from the trace and the data sheets; wavefront: the camera's and "
+                "the collimator's errors at best focus midway between the directions.",
+                ("band", "direction", *(n.replace("_", " ") for n in names), "product"),
+                budget,
+            ),
+            SvgFigure(
+                "mtf-curves",
+                "MTF curves in the middle of the field, after the alignment",
+                "Measured from the slanted edge, with two sigma; dashed: the traced pupil times the detector's "
+                "factors. Dotted: Nyquist frequency.",
+                mtf_svg(alignment),
+            ),
+            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", edges_svg(alignment)),
+        ),
+    )
+
+
+def _shim_section(alignment: Alignment) -> Section:
+    tables = []
+    for number, shimming in enumerate(alignment.shimmings):
+        plan = shimming.plan
+        assert plan.thickness is not None
+        rows = [
+            (
+                k + 1,
+                UM * float(plan.change[k]),
+                UM * float(plan.change_sigma[k]),
+                UM * float(plan.rounded_change[k]),
+                UM * float(plan.thickness[k]),
+                1e3 * float(np.linalg.norm(plan.slide[k])),
+            )
+            for k in range(len(plan.thickness))
+        ]
+        tables.append(
+            Table(
+                f"shims-{number + 1}",
+                f"Shims of round {number + 1}",
+                f"Changes of thickness under each hole. The turn in the mounting surface of {plan.turn / ARCMIN:.2f}′ "
+                f"is set by hand; without it the line would be off level by {plan.level_coupling / ARCMIN:.2f}′, "
+                "since the mounting surface is not parallel to the focal plane.",
+                ("hole", "change, µm", "sigma, µm", "ground, µm", "new shim, µm", "slide, mm"),
+                rows,
+            )
+        )
+    return Section("Shims", (), tuple(tables))
