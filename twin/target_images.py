@@ -7,7 +7,7 @@ recorded follows the image by whole pixels, so that the image lies on the pixels
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -228,7 +228,7 @@ class TargetCamera:
         """Nominal (along, across) of PLACES, metres."""
         self.directions = path.directions(self.places)
 
-    def views(self, state: State, progress: Callable[[], None] = lambda: None) -> dict[str, View]:
+    def views(self, state: State) -> dict[str, View]:
         """Every place in a state.
 
         Raises:

@@ -70,7 +70,7 @@ def _warnings(run: DistortionRun) -> tuple[str, ...]:
     out = []
     kept = int(np.sum(run.truth.gross & run.means.keep))
     if kept:
-        out.append(f"{kept} of the gross errors stay in: Chauvenet's criterion does not see two of them at one point")
+        out.append(f"gross errors that Chauvenet's criterion does not find and that stay in the means: {kept}")
     left = run.bench.true_offset - run.bench.design_offset
     slope = float(np.polyfit(np.tan(run.bench.turn), left, 1)[0])
     sigma = run.compensated.fit.sigma("principal_distance")
@@ -89,9 +89,10 @@ def _summary(run: DistortionRun) -> Table:
     rows: list[tuple[Cell, ...]] = [
         (
             "principal distance, mm",
-            data["principal_distance_mm"],
+            # six digits, which tables show of a number, are too few here
+            f"{data['principal_distance_mm']:.4f}",
             data["principal_distance_mm_sigma"],
-            truth["principal_distance_mm"],
+            f"{truth['principal_distance_mm']:.4f}",
         ),
         (
             "principal point, mm",
@@ -188,7 +189,7 @@ def _estimates(run: DistortionRun) -> Section:
     rows: list[tuple[Cell, ...]] = [
         (
             _ESTIMATES[name],
-            mm * e.f,
+            f"{mm * e.f:.4f}",
             None if e.f_sigma is None else mm * e.f_sigma,
             mm * (e.f - e.f_true),
             mm * e.p,

@@ -59,7 +59,7 @@ def _through_focus(alignment: Alignment) -> Figure:
     bench = alignment.bench
     bands = list(bench.ccds)
     figure = new_figure(5.6)
-    grid = figure.subplots(2, len(bands), squeeze=False, sharey="row")
+    grid = figure.subplots(2, len(bands), squeeze=False)
     fields = list(dict.fromkeys(site.field for site in bench.sites))
     for row, (state, title) in enumerate(((alignment.states[0], "before"), (alignment.states[-1], "after"))):
         for column, band in enumerate(bands):

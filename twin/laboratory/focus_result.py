@@ -46,8 +46,8 @@ def focus_result(alignment: Alignment) -> LabResult:
     end = data["rounds"][-1]
     lead = (
         f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
-        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} µm from best focus, in every field "
-        f"and band (the paper reached {CONFOCAL_UM:.0f} µm), "
+        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} µm from best focus, in every "
+        f"field and band (the paper reached {CONFOCAL_UM:.0f} µm), "
         f"and the line to {abs(end['line_level_arcmin']):.2f}′ of level (the paper: {LINE_LEVEL_ARCMIN:g}′).",
     )
     images = {
@@ -165,9 +165,9 @@ def _mtf_section(alignment: Alignment) -> Section:
     rows = [
         (
             band,
-            MTF_NYQUIST.get(band),
+            f"{MTF_NYQUIST[band]:.2f}" if band in MTF_NYQUIST else "",
             f"{end['mtf_nyquist'][band]:.3f} ± {end['mtf_nyquist_sigma'][band]:.3f}",
-            true["mtf_nyquist"][band],
+            f"{true['mtf_nyquist'][band]:.3f}",
             f"{end['mtf_nyquist_along_line'][band]:.3f} ± {end['mtf_nyquist_along_line_sigma'][band]:.3f}",
         )
         for band in alignment.bench.ccds
@@ -226,12 +226,11 @@ def _shim_section(alignment: Alignment) -> Section:
         assert plan.thickness is not None
         rows = [
             (
-                k + 1,
-                UM * float(plan.change[k]),
-                UM * float(plan.change_sigma[k]),
-                UM * float(plan.rounded_change[k]),
-                UM * float(plan.thickness[k]),
-                1e3 * float(np.linalg.norm(plan.slide[k])),
+                f"{k + 1}",
+                f"{fixed(UM * float(plan.change[k]), 1)} ± {UM * float(plan.change_sigma[k]):.1f}",
+                fixed(UM * float(plan.rounded_change[k]), 0),
+                fixed(UM * float(plan.thickness[k]), 0),
+                fixed(1e3 * float(np.linalg.norm(plan.slide[k])), 3),
             )
             for k in range(len(plan.thickness))
         ]
@@ -242,7 +241,7 @@ def _shim_section(alignment: Alignment) -> Section:
                 f"Changes of thickness under each hole. The turn in the mounting surface of {plan.turn / ARCMIN:.2f}′ "
                 f"is set by hand; without it the line would be off level by {plan.level_coupling / ARCMIN:.2f}′, "
                 "since the mounting surface is not parallel to the focal plane.",
-                ("hole", "change, µm", "sigma, µm", "ground, µm", "new shim, µm", "slide, mm"),
+                ("hole", "change, µm", "ground, µm", "new shim, µm", "slide, mm"),
                 rows,
             )
         )

@@ -1,0 +1,172 @@
+"""Test targets in the main job: rendered, exposed and measured for every camera, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from analysis.bar_contrast import BarError, BarMtf, measure_bars
+from analysis.slanted_edge import EdgeError, EdgeMtf, measure_edge
+from optics.backend import Backend
+from optics.tree import State
+from scenes.channel import BASE
+from scenes.instrument_model import Instrument
+from scenes.resolved import ResolvedJob, target_band
+from scenes.targets import TargetsSpec
+from twin.detector import FixedPattern
+from twin.line_ccd import LineCcd
+from twin.target_images import (
+    DIRECTIONS,
+    PLACES,
+    BarDesign,
+    TargetCamera,
+    View,
+    pinhole_target,
+    star_target,
+)
+from twin.target_path import TargetPath
+from twin.target_result import (
+    NYQUIST,
+    BarReading,
+    CameraTargets,
+    EdgeReading,
+    PlaceTargets,
+    TargetRun,
+    TargetShots,
+)
+
+CURVE = np.linspace(0.0, 1.0, 65)
+"""Frequencies of the measured curves, cycles/pixel: to twice the Nyquist frequency."""
+
+LARGEST_FRAMES = 400_000_000
+"""Pixels of all frames together, which are kept: 0.8 GB."""
+
+_PATTERN, _EXPOSURE = 3, 4
+"""Random streams of the job's seed, beside those of the monitor."""
+
+
+def render_targets(
+    resolved: ResolvedJob,
+    instrument: Instrument,
+    backend: Backend,
+    state: State,
+    seed: int,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+) -> TargetRun:
+    """Render, expose and measure the job's test targets.
+
+    Args:
+        resolved: the job, with targets among its images.
+        instrument: as built from it.
+        backend: where to trace.
+        state: after the perturbation.
+        seed: of the noise.
+        advance: told how many of how many windows are done.
+
+    Raises:
+        InputError: the windows do not fit the line, or there are too many frames.
+        TargetLostError: the perturbation moves the light off.
+    """
+    job, settings = resolved.job, resolved.targets
+    frames, images = settings.frames or 1, job.render.target_images
+    kinds = sum(len(DIRECTIONS) if name in ("knife_edge", "bars") else 1 for name in images)
+    total = len(instrument.cameras) * len(PLACES) * 2
+    each = total * kinds * settings.region**2
+    if each * frames > LARGEST_FRAMES:
+        raise job.error(
+            "the frames of the test targets do not fit into memory",
+            ("render", "targets", "frames"),
+            found=str(frames),
+            allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
+        )
+    cameras, done = {}, 0
+    for number, (name, model) in enumerate(instrument.cameras.items()):
+        reference = resolved.instrument.cameras[name].camera
+        band = target_band(resolved.cameras[reference])
+        assert resolved.line_detectors is not None
+        ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
+        path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend)
+        try:
+            camera = TargetCamera(path, ccd, settings.region)
+        except ValueError as error:
+            raise job.error(f"camera {name}, band {band}: {error}", ("render", "targets", "region")) from error
+        before = camera.views({})
+        after = camera.views(state) if state else before
+        pattern = ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN, number)))
+        places = {}
+        for k, place in enumerate(PLACES):
+            shooter = _Shooter(settings, images, before[place], pattern)
+            shots = []
+            for when, view in enumerate((before[place], after[place])):
+                advance(done, total)
+                shots.append(shooter.shoot(view, np.random.SeedSequence(seed, spawn_key=(_EXPOSURE, number, k, when))))
+                done += 1
+            places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
+        cameras[name] = CameraTargets(band, ccd.band.pitch, places)
+    advance(done, total)
+    return TargetRun(cameras, frames)
+
+
+class _Shooter:
+    """Takes the images of all targets at one place."""
+
+    def __init__(self, settings: TargetsSpec, images: tuple[str, ...], nominal: View, pattern: FixedPattern) -> None:
+        self.settings = settings
+        self.images = images
+        self.pattern = pattern
+        self.bars = {d: BarDesign.build(nominal, d) for d in DIRECTIONS} if "bars" in images else {}
+
+    def shoot(self, view: View, seed: np.random.SeedSequence) -> TargetShots:
+        """Expose and measure every target in one state."""
+        frames: dict[str, np.ndarray] = {}
+        edges, bars = {}, {}
+
+        def expose(name: str, share: np.ndarray) -> np.ndarray:
+            photons = view.ccd.white_photons(self.settings.white) * share
+            count = self.settings.frames or 1
+            frames[name] = view.ccd.expose(photons, view.column, self.pattern, count, seed.spawn(1)[0])
+            return np.asarray(frames[name].mean(axis=0))
+
+        if "knife_edge" in self.images:
+            for direction in DIRECTIONS:
+                imager = view.edge(direction, self.settings.angle)
+                mean = expose(f"knife_edge_{direction}", view.edge_image(imager))
+                edges[direction] = read_edge(view, imager.optics.normal, mean, self.settings.frames or 1)
+        for direction, design in self.bars.items():
+            mean = expose(f"bars_{direction}", view.image(design.target))
+            bars[direction] = read_bars(view, design, mean, self.settings.frames or 1)
+        if "star" in self.images:
+            expose("star", view.image(star_target(view.band.pitch, view.region)))
+        if "pinhole" in self.images:
+            expose("pinhole", view.image(pinhole_target(view.band.pitch)))
+        return TargetShots(frames, view.column, edges, bars)
+
+
+def read_edge(view: View, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
+    """Measure the mean (H, W) of some frames of a knife edge with this normal, and trace the truth."""
+    frequency = CURVE / view.band.pitch
+    wanted = np.append(frequency, NYQUIST / view.band.pitch)
+    true = np.abs(view.transfer(wanted[:, None] * normal))
+    found: EdgeMtf | None = None
+    reason = ""
+    try:
+        found = measure_edge(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE)
+    except EdgeError as error:
+        reason = str(error)
+    return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]))
+
+
+def read_bars(view: View, design: BarDesign, mean: np.ndarray, frames: int) -> BarReading:
+    """Measure the mean (H, W) of some frames of a bar target, and trace the truth."""
+    true = float(np.abs(view.transfer(design.seen(view)[None]))[0])
+    found: BarMtf | None = None
+    reason = ""
+    try:
+        found = measure_bars(
+            mean[design.group], mean[design.dark], mean[design.bright], design.per_pixel,
+            noise=view.ccd.noise, frames=frames,
+        )  # fmt: skip
+    except BarError as error:
+        reason = str(error)
+    return BarReading(found, reason, true)

@@ -1,0 +1,208 @@
+"""What the images of test targets gave: frames, measured MTF and the truth beside it; the contract of mtf.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.bar_contrast import BarMtf
+from analysis.edge_mtf import EdgeMtf
+
+NYQUIST = 0.5
+"""Of any pixel, cycles/pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeReading:
+    """MTF from one knife edge.
+
+    Attributes:
+        measured: from the frames, None if they cannot be measured.
+        reason: why not.
+        frequency: (F,) along the edge's normal, cycles/m.
+        true: (F,) MTF of the traced pupil and the detector there.
+        true_nyquist: the same at the Nyquist frequency.
+    """
+
+    measured: EdgeMtf | None
+    reason: str
+    frequency: np.ndarray
+    true: np.ndarray
+    true_nyquist: float
+
+    @property
+    def nyquist(self) -> tuple[float, float] | None:
+        """Measured MTF at the Nyquist frequency, and its sigma."""
+        return None if self.measured is None else self.measured.at(NYQUIST)
+
+    @property
+    def nyquist_bias(self) -> float | None:
+        """How much noise lengthens the measured MTF at the Nyquist frequency on the average."""
+        edge = self.measured
+        return None if edge is None else float(np.interp(NYQUIST, edge.frequency, edge.noise_bias))
+
+
+@dataclass(frozen=True, eq=False)
+class BarReading:
+    """MTF from one bar target near the Nyquist frequency.
+
+    Attributes:
+        measured: from the frames, None if they cannot be measured.
+        reason: why not.
+        true: MTF of the traced pupil and the detector at the bars' frequency.
+    """
+
+    measured: BarMtf | None
+    reason: str
+    true: float
+
+    @property
+    def reading(self) -> tuple[float, float] | None:
+        """Measured MTF and its sigma."""
+        return None if self.measured is None else (self.measured.mtf, self.measured.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetShots:
+    """All targets at one place in one state.
+
+    Attributes:
+        frames: name of the image -> grey values, uint16 (N, H, W).
+        column: of the windows' first pixels on the line.
+        edges, bars: direction -> reading; empty if not rendered.
+    """
+
+    frames: Mapping[str, np.ndarray]
+    column: int
+    edges: Mapping[str, EdgeReading]
+    bars: Mapping[str, BarReading]
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceTargets:
+    """Before and after at one place of a line.
+
+    Attributes:
+        place: nominal (along, across) on the focal plane, metres.
+        shift: true move of the image of a fixed direction on the focal plane, (along, across), metres.
+        before, after: the images.
+    """
+
+    place: np.ndarray
+    shift: np.ndarray
+    before: TargetShots
+    after: TargetShots
+
+    @property
+    def shots(self) -> dict[str, TargetShots]:
+        """By their names in files and results."""
+        return {"before": self.before, "after": self.after}
+
+
+@dataclass(frozen=True, eq=False)
+class CameraTargets:
+    """One camera.
+
+    Attributes:
+        band: name of the line CCD's band.
+        pitch: of its pixels, metres.
+        places: left, centre, right.
+    """
+
+    band: str
+    pitch: float
+    places: Mapping[str, PlaceTargets]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetRun:
+    """All cameras.
+
+    Attributes:
+        cameras: by name.
+        frames: of each image.
+    """
+
+    cameras: Mapping[str, CameraTargets]
+    frames: int
+
+    def images(self) -> Iterator[tuple[str, str, np.ndarray]]:
+        """Stem of its file, name of the image, and the frames (N, H, W) of every image."""
+        for camera, found in self.cameras.items():
+            for place, targets in found.places.items():
+                for when, shots in targets.shots.items():
+                    for name, frames in shots.frames.items():
+                        yield f"{camera}_{place}_{name}_{when}", name, frames
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What could not be measured, and why."""
+        out = []
+        for camera, found in self.cameras.items():
+            for place, targets in found.places.items():
+                for when, shots in targets.shots.items():
+                    kinds = (("knife edge", shots.edges), ("bars", shots.bars))
+                    for what, readings in kinds:
+                        for direction, reading in readings.items():
+                            if reading.measured is None:
+                                out.append(
+                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF: {reading.reason}"
+                                )
+        return tuple(out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Contents of mtf.json. What could not be measured is null; ``truth`` has the shape of ``cameras``."""
+        cameras, truth = {}, {}
+        for name, camera in self.cameras.items():
+            places, true_places = {}, {}
+            for place, targets in camera.places.items():
+                along, across = (1e3 * targets.place + 0.0).tolist()
+                places[place] = {"along_mm": along, "across_mm": across, **_directions(targets, _measured)}
+                shift = dict(zip(("along", "across"), (1e6 * targets.shift + 0.0).tolist(), strict=True))
+                true_places[place] = {"image_shift_um": shift, **_directions(targets, _true)}
+            cameras[name] = {
+                "band": camera.band,
+                "pixel_um": 1e6 * camera.pitch,
+                "nyquist_per_mm": 1e-3 * NYQUIST / camera.pitch,
+                "places": places,
+            }
+            truth[name] = {"places": true_places}
+        return {"frames": self.frames, "cameras": cameras, "truth": {"cameras": truth}}
+
+
+def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
+    """Direction -> before/after -> what ``say`` makes of the readings."""
+    out: dict[str, Any] = {}
+    for when, shots in targets.shots.items():
+        for direction in sorted({*shots.edges, *shots.bars}):
+            out.setdefault(direction, {})[when] = say(shots.edges.get(direction), shots.bars.get(direction))
+    return out
+
+
+def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    if edge is not None:
+        value, sigma = edge.nyquist or (None, None)
+        found = edge.measured
+        out |= {"mtf_nyquist": value, "mtf_nyquist_sigma": sigma, "mtf_nyquist_noise_bias": edge.nyquist_bias}
+        out["curve"] = None if found is None else {**_curve(edge, found.mtf), "mtf_sigma": found.sigma.tolist()}
+    if bars is not None:
+        value, sigma = bars.reading or (None, None)
+        out |= {"bars_mtf": value, "bars_mtf_sigma": sigma}
+    return out
+
+
+def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    if edge is not None:
+        out |= {"mtf_nyquist": edge.true_nyquist, "curve": _curve(edge, edge.true)}
+    if bars is not None:
+        out["bars_mtf"] = bars.true
+    return out
+
+
+def _curve(edge: EdgeReading, mtf: np.ndarray) -> dict[str, list[float]]:
+    return {"frequency_per_mm": (1e-3 * edge.frequency).tolist(), "mtf": mtf.tolist()}
