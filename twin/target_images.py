@@ -43,7 +43,7 @@ MARGIN = 0.02
 """Share of the line's pixels kept between each end and the nominal windows, so that an image may move."""
 
 BAR_TILT = float(np.radians(7.0))
-"""Of the bars' normal from the axis: within the group every sampling phase occurs twice, even in 96 pixels."""
+"""Of the bars' normal from the axis: within the group every sampling phase occurs twice, even in 112 pixels."""
 
 BAR_SHARE = 0.36
 """Half width of the bar group, as a share of half the region: leaves room for the bars' length when they are tilted."""
