@@ -30,7 +30,12 @@ AIM_TOLERANCE = 1e-12
 
 
 def aim_collimated(
-    backend: Backend, to_stop: SystemBatch, direction: np.ndarray, launch: np.ndarray, target: np.ndarray
+    backend: Backend,
+    to_stop: SystemBatch,
+    direction: np.ndarray,
+    launch: np.ndarray,
+    target: np.ndarray,
+    first: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays of collimated beams that meet given points of the stop.
 
@@ -41,6 +46,8 @@ def aim_collimated(
         launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane
             wavefront through it.
         target: stop coordinates, (N, 2), metres.
+        first: world vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the
+            coordinate axis least along it, which is not the same for all directions.
 
     Returns:
         Launch points (B, N, 3) and the two axes of the wavefront (B, 2, 3).
@@ -51,8 +58,9 @@ def aim_collimated(
     count = to_stop.count
     along = np.broadcast_to(direction, (count, 3))[:, None]
     origin = np.broadcast_to(launch, (count, 3))[:, None]
-    # any transverse axis will do; the coordinate axis least along the beam is well conditioned
-    across = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+    # for aiming any transverse axis will do; the coordinate axis least along the beam is well conditioned
+    least = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+    across = least if first is None else np.broadcast_to(first, along.shape)
     axes = transverse_axes(along, across)
     fan = RayFan(origin, along, axes, moves_position=True)
     middle, slope = aim(backend, to_stop, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
@@ -72,6 +80,7 @@ def imaging_field(
     wavelength: float,
     origin: np.ndarray | None = None,
     incoming: Callable[[np.ndarray], np.ndarray] | None = None,
+    first: np.ndarray | None = None,
 ) -> PupilField:
     """Plane waves at the detector for B systems that image a far point.
 
@@ -87,6 +96,7 @@ def imaging_field(
         origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
         incoming: optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse
             coordinates (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
+        first: as for ``aim_collimated``.
 
     Returns:
         Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
@@ -96,7 +106,7 @@ def imaging_field(
         BeamMissedError: no ray reaches the detector.
     """
     target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
-    launched, axes = aim_collimated(backend, to_stop, direction, launch, target)
+    launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
     count = len(launched)
     heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], launched.shape)
     stop_index = len(to_stop.structure) - 1

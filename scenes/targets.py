@@ -28,6 +28,6 @@ class TargetsSpec(Spec):
     """
 
     angle: EdgeAngle = float(np.radians(5.0))
-    region: Annotated[Whole, Field(ge=112, le=512)] = 128
+    region: Annotated[Whole, Field(ge=112, le=512)] = 112
     white: White = 0.6
     frames: Frames | None = None

@@ -9,12 +9,13 @@ import numpy as np
 import xarray as xr
 
 from twin.course import CourseRun
-from twin.image_file import preview_png, tiff
+from twin.image_file import SPOT_STRETCH, preview_png, tiff
 from twin.report import write_report
 from twin.results import RenderRun
 from twin.run_folder import MANIFEST, RunFolder
 from twin.scene_file import write_scene
 from twin.summary_figure import write_summary
+from twin.target_result import TargetRun
 from twin.versions import versions
 
 
@@ -46,6 +47,8 @@ def write_run(
         folder.write_json("stray.json", run.stray.to_dict())
     if run.course is not None:
         _write_course(run, run.course, folder)
+    if run.targets is not None:
+        _write_targets(run.targets, folder)
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
@@ -71,6 +74,14 @@ def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
         folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", tiff(course.frames[:, i]))
     time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
     folder.write_bytes("course.nc", _netcdf(_images(run, "time", time, course.photons)))
+
+
+def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
+    """MTF and frames; the faint rings of a pinhole are stretched in its preview, levels of the others are not."""
+    folder.write_json("mtf.json", targets.to_dict())
+    for stem, name, frames in targets.images():
+        folder.write_bytes(f"images/{stem}.tiff", tiff(frames))
+        folder.write_bytes(f"images/{stem}.png", preview_png(frames, SPOT_STRETCH if name == "pinhole" else None))
 
 
 def _netcdf(data: xr.Dataset) -> bytes:

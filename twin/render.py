@@ -27,6 +27,8 @@ from twin.picture_light import PictureError
 from twin.render_job import STAGES, render_job
 from twin.results import RenderRun
 from twin.run_folder import RunFolder, next_free
+from twin.target_images import DIRECTIONS, PLACES
+from twin.target_result import EdgeReading, TargetRun
 
 WRITE = "write the run folder"
 LABELS = {
@@ -36,6 +38,9 @@ LABELS = {
     "d_f_um": ("d_f um", 2),
 }
 """How the terminal's table names a parameter, and its decimals."""
+
+_ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
+"""How the terminal names the direction in which the MTF is measured."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -91,6 +96,10 @@ def main(
     A job with a course, a table of temperatures over time (scenes/examples/orbit.yaml), also gets every time's
     numbers and images: course.json, course.nc and images/CAMERA_SIDE_course.tiff.
 
+    With `render: {images: [spots, knife_edge, bars]}` (also star and pinhole) test targets at infinity are imaged on
+    every camera's panchromatic line CCD, in its middle and near its ends, before and after; mtf.json has the MTF
+    measured in the images beside that of the traced pupil (scenes/examples/targets.yaml).
+
     With `render: {stray: true}` ghosts and scattered light are path-traced and added to the images; stray.json lists
     them.
 
@@ -108,7 +117,8 @@ def main(
         run, problem = _run(folder, resolved, backend, frames, seed, picture, silent=as_json or quiet, errors=errors)
     if as_json:
         course = {"course": run.course.to_dict()} if run.course is not None else {}
-        result = {"truth": run.truth_dict(), "recovered": run.recovered_dict(), **course}
+        mtf = {"mtf": run.targets.to_dict()} if run.targets is not None else {}
+        result = {"truth": run.truth_dict(), "recovered": run.recovered_dict(), **course, **mtf}
         json.dump(result, sys.stdout, allow_nan=False)
         sys.stdout.write("\n")
     elif not quiet:
@@ -176,6 +186,10 @@ def _print_result(run: RenderRun, target: Path) -> None:
     # a number that is cut is worse than a line that wraps
     console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
     console.print(table)
+    if run.targets is not None:
+        lines = _mtf_table(run.targets)
+        if lines is not None:
+            console.print(lines)
     console.print(
         "The model assumes that only the line CCD moves and the optics scale; other motions read as these: "
         "see crosstalk in the report.",
@@ -191,6 +205,33 @@ def _print_result(run: RenderRun, target: Path) -> None:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _mtf_table(targets: TargetRun) -> Table | None:
+    """MTF at the Nyquist frequency from the knife edges, before -> after (true); None if there are none."""
+    title = f"MTF at the Nyquist frequency from the knife edge, before -> after (true), {targets.frames} frames"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for head in ("", "measured", *PLACES):
+        table.add_column(head, no_wrap=True)
+    for name, camera in targets.cameras.items():
+        for direction in DIRECTIONS:
+            pairs = [
+                (place.before.edges[direction], place.after.edges[direction])
+                for place in camera.places.values()
+                if direction in place.before.edges
+            ]
+            if not pairs:
+                return None
+            cells = [
+                f"{_value(before)} -> {_value(after)} ({before.true_nyquist:.3f} -> {after.true_nyquist:.3f})"
+                for before, after in pairs
+            ]
+            table.add_row(f"[bold]{escape(name)}[/] {escape(camera.band)}", _ALONG[direction], *cells)
+    return table
+
+
+def _value(edge: EdgeReading) -> str:
+    return "none" if edge.nyquist is None else f"{edge.nyquist[0]:.3f}"
 
 
 def _table(run: RenderRun) -> Table:

@@ -23,6 +23,9 @@ from twin.experiment import MonitorExperiment
 from twin.path_tracing.stray import NominalPathLost
 from twin.results import RenderRun, StrayPair
 from twin.stray_light import stray_light
+from twin.target_images import TargetLostError
+from twin.target_measurement import render_targets
+from twin.target_result import TargetRun
 from twin.truth import trace_truth
 
 STAGES = (
@@ -41,6 +44,9 @@ COURSE = "times of the course"
 
 STRAY = "trace ghosts and stray light"
 """A long part of jobs that ask for it."""
+
+TARGETS = "render the targets"
+"""Another one."""
 
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
@@ -65,7 +71,7 @@ def render_job(
         frames: per state; overrides the job's.
         seed: of all noise; overrides the job's.
         progress: called with each of STAGES when it begins.
-        advance: told of the long parts COURSE and STRAY how many of how many times or paths are done.
+        advance: told of the long parts COURSE, STRAY and TARGETS how many of how many times, paths or places are done.
 
     Raises:
         InputError: an unknown node, or a perturbation so large that light misses the mirrors or a spot its CCD.
@@ -113,6 +119,7 @@ def render_job(
         raise _too_large(resolved, f"a spot cannot be measured ({reasons})") from error
     progress(STAGES[7])
     tables = crosstalk(experiment, _covariances(recovery))
+    targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -130,9 +137,11 @@ def render_job(
             *_warnings(experiment, resolved, nominal, photons[0], before, after[0]),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
+            *(targets.warnings if targets is not None else ()),
         ),
         course=series,
         stray=stray,
+        targets=targets,
     )
 
 
@@ -155,6 +164,21 @@ def _stray(
         say = partial(_second_half, advance, sources)
         return StrayPair(before, stray_light(experiment, state, paths, seed, say), taken)
     except NominalPathLost as error:
+        raise _too_large(resolved, str(error)) from error
+
+
+def _targets(
+    experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
+) -> TargetRun:
+    """Test targets before and after the perturbation.
+
+    Raises:
+        InputError: their light is lost, or they cannot be recorded as the job says.
+    """
+    say = partial(advance, TARGETS)
+    try:
+        return render_targets(resolved, experiment.instrument, experiment.backend, state, seed, say)
+    except TargetLostError as error:
         raise _too_large(resolved, str(error)) from error
 
 

@@ -17,6 +17,7 @@ from twin.course import CourseRun
 from twin.crosstalk import CameraCrosstalk
 from twin.experiment import MonitorExperiment
 from twin.stray_light import StrayLight
+from twin.target_result import TargetRun
 from twin.truth import Truth
 
 
@@ -51,6 +52,7 @@ class RenderRun:
         warnings: what the user should know.
         course: all times of the job's course, None if it has none; the rest is then about the time it shows.
         stray: ghosts and stray light, None if not asked for.
+        targets: test targets on the line CCDs, None if not asked for.
     """
 
     resolved: ResolvedJob
@@ -68,6 +70,7 @@ class RenderRun:
     warnings: tuple[str, ...]
     course: CourseRun | None = None
     stray: StrayPair | None = None
+    targets: TargetRun | None = None
 
     def true_parameters(self, camera: str) -> dict[str, float]:
         """True change of a camera in the units of the keys."""

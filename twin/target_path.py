@@ -164,6 +164,8 @@ class TargetPath:
             self.model.spec.wavelength,
             origin,
             None if collimator is None else lambda point: collimator.path(point, target_shift),
+            # the collimator's own axes: the first along the line, the second along the flight direction
+            self._axes[:, 1],
         )
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
         return fit_pupils(turned, self.nodes)

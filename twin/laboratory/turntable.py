@@ -18,6 +18,7 @@ from analysis.angle_fits import FITS, AngleFit, angles_left, fewest
 from analysis.chauvenet import rejection_rate
 from analysis.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
 from analysis.monitoring import ARCSEC
+from optics.threads import one_blas_thread
 from scenes.dividing_error import TurntableTestSpec
 from twin.laboratory.dividing_error import TurntableModel
 
@@ -160,8 +161,10 @@ def run_turntable(
     say("compare the table with the reference")
     model = TurntableModel(spec, seed)
     series, held_out = model.calibrate(), model.held_out()
-    choice = choose(series, seed, names, plan.folds, say)
-    return TurntableRun(model, series, held_out, choice, compensate(series, choice, held_out))
+    # the network's matrices are small
+    with one_blas_thread():
+        choice = choose(series, seed, names, plan.folds, say)
+        return TurntableRun(model, series, held_out, choice, compensate(series, choice, held_out))
 
 
 def _rms(value: Array) -> float:

@@ -35,16 +35,19 @@ def turntable_result(run: TurntableRun) -> LabResult:
         f"Chauvenet's criterion. Cross-validation chooses the {FIT_NAMES[chosen]}, which misses held-out angles by "
         f"{held:.3f}″ RMS.{also}",
     )
-    rows: list[tuple[str, float, float | None]] = [
-        ("repeats, largest RMS of an angle", data["repeat_rms_arcsec"], REPEAT_RMS_ARCSEC),
-        ("the same after Chauvenet's criterion", data["chauvenet_rms_arcsec"], CHAUVENET_RMS_ARCSEC),
-        ("what averaging alone gives", data["averaging_alone_rms_arcsec"], None),
+    rows = [
+        ("repeats, largest RMS of an angle", _text(data["repeat_rms_arcsec"]), _text(REPEAT_RMS_ARCSEC)),
+        ("the same after Chauvenet's criterion", _text(data["chauvenet_rms_arcsec"]), _text(CHAUVENET_RMS_ARCSEC)),
+        ("what averaging alone gives", _text(data["averaging_alone_rms_arcsec"]), ""),
     ]
     rows += [
-        (f"fit on held-out angles: {FIT_NAMES[name]}", data["fits"][name]["heldout_rms_arcsec"], None)
+        (
+            f"{FIT_NAMES[name]} on held-out angles{', chosen' if name == chosen else ''}",
+            _text(data["fits"][name]["heldout_rms_arcsec"]),
+            f"below {FIT_RMS_ARCSEC:g}" if name == "network" else "",
+        )
         for name in data["ranking"]
     ]
-    rows.append(("bound on the fit's RMS", held, FIT_RMS_ARCSEC))
     return LabResult(
         "turntable",
         "Dividing error of the turntable",
@@ -67,3 +70,7 @@ def turntable_result(run: TurntableRun) -> LabResult:
         ),
         sections(run),
     )
+
+
+def _text(arcsec: float) -> str:
+    return f"{arcsec:.3f}"
