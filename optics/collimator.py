@@ -1,4 +1,4 @@
-"""A collimator as the camera sees it: a plane wave with the collimator's own errors, curved when its target is moved."""
+"""A collimator as the camera sees it: a plane wave with errors of its own, curved when its target is moved."""
 
 from __future__ import annotations
 

@@ -17,6 +17,8 @@ class DistortionTestSpec(CameraUnderTestSpec):
     Attributes:
         name: as the file is called.
         description: for people.
+        camera: prescription, by name or path.
+        as_built: how it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
         collimator: what the camera looks into.
         turntable: its dividing error and calibration, by name or path.
         pinhole: diameter of the target, metres.

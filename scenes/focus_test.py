@@ -88,6 +88,8 @@ class FocusTestSpec(CameraUnderTestSpec):
     Attributes:
         name: as the file is called.
         description: for people.
+        camera: prescription, by name or path.
+        as_built: how it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
         collimator: what the camera looks into.
         edge: the target.
         fields: where along the line it is imaged, as shares of half the line's length, -1 to 1.

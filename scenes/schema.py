@@ -16,7 +16,10 @@ from pydantic_core import SchemaSerializer, core_schema
 
 from scenes.camera import CameraSpec
 from scenes.detector import DetectorSpec
+from scenes.distortion_test import DistortionTestSpec
+from scenes.dividing_error import TurntableTestSpec
 from scenes.error_budget import ErrorBudgetSpec
+from scenes.focus_test import FocusTestSpec
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.spec import Spec
@@ -29,6 +32,9 @@ MODELS: dict[str, type[Spec]] = {
     "detector": DetectorSpec,
     "error_budget": ErrorBudgetSpec,
     "principle_experiment": PrincipleExperimentSpec,
+    "focus_test": FocusTestSpec,
+    "distortion_test": DistortionTestSpec,
+    "turntable_test": TurntableTestSpec,
 }
 _ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from twin.report.numbers import fixed
+
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
 _SVG_NAMESPACE = 'xmlns="http://www.w3.org/2000/svg"'
 
@@ -92,10 +94,26 @@ class PngFigure(Artefact):
 
 @dataclass(frozen=True, eq=False)
 class Table(Artefact):
-    """A table for the report, and as CSV; heads carry the units."""
+    """A table for the report, and as CSV; heads carry the units.
+
+    ``decimals`` are those that the report shows of a column's numbers, None for six significant digits; the CSV holds
+    all digits.
+    """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
+    decimals: Sequence[int | None] = ()
+
+    def shown(self) -> list[list[Cell]]:
+        """The rows as the report shows them."""
+        places = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
+        return [
+            [
+                fixed(cell, place) if isinstance(cell, float) and place is not None else cell
+                for cell, place in zip(row, places, strict=True)
+            ]
+            for row in self.rows
+        ]
 
     @property
     def kind(self) -> str:

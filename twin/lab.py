@@ -181,7 +181,7 @@ def _print_result(result: LabResult, target: Path) -> None:
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(head, justify="left" if text else "right", no_wrap=text)
-    for row in summary.rows:
+    for row in summary.shown():
         table.add_row(*(cell_text(cell) for cell in row))
     console = Console()
     # a number that is cut is worse than a line that wraps

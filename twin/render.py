@@ -209,9 +209,10 @@ def _print_result(run: RenderRun, target: Path) -> None:
 
 def _mtf_table(targets: TargetRun) -> Table | None:
     """MTF at the Nyquist frequency from the knife edges, before -> after (true); None if there are none."""
-    title = f"MTF at the Nyquist frequency from the knife edge, before -> after (true), {targets.frames} frames"
+    title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
+    title += "\nbefore -> after, below it the true one"
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for head in ("", "measured", *PLACES):
+    for head in ("", *PLACES):
         table.add_column(head, no_wrap=True)
     for name, camera in targets.cameras.items():
         for direction in DIRECTIONS:
@@ -223,10 +224,10 @@ def _mtf_table(targets: TargetRun) -> Table | None:
             if not pairs:
                 return None
             cells = [
-                f"{_value(before)} -> {_value(after)} ({before.true_nyquist:.3f} -> {after.true_nyquist:.3f})"
+                f"{_value(before)} -> {_value(after)}\n[dim]{before.true_nyquist:.3f} -> {after.true_nyquist:.3f}[/]"
                 for before, after in pairs
             ]
-            table.add_row(f"[bold]{escape(name)}[/] {escape(camera.band)}", _ALONG[direction], *cells)
+            table.add_row(f"[bold]{escape(name)}[/] {escape(camera.band)}, {_ALONG[direction]}", *cells)
     return table
 
 

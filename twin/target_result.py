@@ -138,6 +138,11 @@ class TargetRun:
                         yield f"{camera}_{place}_{name}_{when}", name, frames
 
     @property
+    def has_edges(self) -> bool:
+        """Whether there are curves."""
+        return any(place.before.edges for camera in self.cameras.values() for place in camera.places.values())
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What could not be measured, and why."""
         out = []

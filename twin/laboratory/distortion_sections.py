@@ -110,7 +110,7 @@ def _summary(run: DistortionRun) -> Table:
         "f and p with compensated angles, by least squares with a constant: paper 004, eq. 2, with an unknown zero of "
         "the angles."
     )
-    return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows)
+    return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows, (None, 3, 3, 3))
 
 
 def _curve(run: DistortionRun) -> Section:
@@ -164,6 +164,7 @@ def _compensation(run: DistortionRun) -> Section:
         "RMS over the points, and the largest.",
         ("quantity", "raw, um", "compensated, um", "reduction, %", "largest raw, um", "largest compensated, um"),
         rows,
+        (None, 2, 2, 0, 1, 1),
     )
     figure = SvgFigure(
         "distortion-points",
@@ -218,6 +219,7 @@ def _estimates(run: DistortionRun) -> Section:
         "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
         ("estimate", "f, mm", "sigma", "error", "p, mm", "sigma of p", "error of p", "error of D, um rms"),
         rows,
+        (None, 3, 3, 3, 2, 2, 2, 2),
     )
     correlation = Table(
         "distortion-correlation",
@@ -228,6 +230,7 @@ def _estimates(run: DistortionRun) -> Section:
             (name.replace("_", " "), *(float(v) for v in row))
             for name, row in zip(smooth.terms, smooth.correlation, strict=True)
         ],
+        (None, *(3 for _ in smooth.terms)),
     )
     return Section("Estimators and what can be observed", text, (estimates, correlation))
 

@@ -51,6 +51,7 @@ def _comparison(run: TurntableRun) -> Section:
         "The paper prints no RMS of a mean.",
         ("RMS of", "here, arcsec", "paper 004, arcsec"),
         rows,
+        (None, 3, 3),
     )
     figure = SvgFigure(
         "turntable-comparisons",
@@ -105,6 +106,7 @@ def _fits(run: TurntableRun) -> Section:
         "region and all phases of the signal, and the same without a constant, which differences of angles do not see.",
         (*heads, "truth", "truth, no constant"),
         rows,
+        (None, None, 4, 4, 4, 1, 4, 4),
     )
     curve = SvgFigure(
         "turntable-curve",

@@ -9,12 +9,13 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from twin.light_paths import trace_light_paths
-from twin.report import content, course_content, crosstalk_content, labels, stray_content
+from twin.report import content, course_content, crosstalk_content, labels, stray_content, target_content
 from twin.report.course_figure import parameters_svg, temperatures_svg
 from twin.report.light_path_figure import footprints_svg, side_view_svg
 from twin.report.numbers import FAR
 from twin.report.residual_figure import residuals_svg
 from twin.report.spots_figure import spots_svg
+from twin.report.target_figure import curves_svg, images_svg
 from twin.results import RenderRun
 from twin.versions import versions
 
@@ -48,12 +49,18 @@ def render_report(run: RenderRun) -> str:
     if run.course is not None:
         figures["temperatures"] = Markup(temperatures_svg(run.course))
         figures["course"] = Markup(parameters_svg(run.course, labels.ESTIMATOR_NAMES))
+    if run.targets is not None:
+        cameras = run.targets.cameras
+        figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}
+        if run.targets.has_edges:
+            figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
     return template.render(
         setup=content.setup(run),
         course=course_content.course_content(run),
         stray=stray_content.stray_content(run),
+        targets=target_content.target_content(run),
         tables=tables,
         summary=content.summary(tables),
         spots=content.spots(run),

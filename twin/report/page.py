@@ -37,7 +37,7 @@ def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
     elif isinstance(artefact, PngFigure):
         out["image"] = artefact.address
     elif isinstance(artefact, Table):
-        rows = [[cell_text(value) for value in row] for row in artefact.rows]
+        rows = [[cell_text(value) for value in row] for row in artefact.shown()]
         texts = [all(isinstance(row[k], str) for row in artefact.rows) for k in range(len(artefact.heads))]
         out["table"] = {"heads": artefact.heads, "rows": rows, "texts": texts}
     elif not isinstance(artefact, Data):
