@@ -11,6 +11,10 @@ from optics import zernike
 from optics.frozen_map import FrozenMap
 
 
+class TooNarrowError(ValueError):
+    """The collimator's aperture does not hold the camera's beam."""
+
+
 @dataclass(frozen=True)
 class Collimator:
     """A collimator with a target at its focus.
@@ -42,14 +46,14 @@ class Collimator:
             (...,) metres.
 
         Raises:
-            ValueError: a point outside the aperture.
+            TooNarrowError: a point outside the aperture.
         """
         square = np.sum(point**2, axis=-1)
         if np.max(square) > self.radius**2:
             reach = 2e3 * float(np.sqrt(np.max(square)))
-            raise ValueError(
+            raise TooNarrowError(
                 f"the camera's beam is {reach:.0f} mm wide about the collimator's axis, the collimator's aperture "
-                f"{2e3 * self.radius:.0f} mm; take a wider collimator"
+                f"{2e3 * self.radius:.0f} mm"
             )
         out = 0.5 * target_shift / self.focal_length**2 * square
         if self.wavefront:

@@ -81,10 +81,12 @@ def resolve_focus(path: str | Path) -> FocusSetup:
     """
     if _is_resolved(path):
         setup = validate(FocusSetup, read_yaml(path))
-        return setup.model_copy(update={"test": _told(setup, setup.test)})
+        test = _told(setup, setup.test)
+        _require_plane(test, setup.camera)
+        return setup.model_copy(update={"test": test})
     test = load_lab_test(FocusTestSpec, path)
     camera = load_camera(find_camera(test))
-    _require_bands(test, camera)
+    _require_plane(test, camera)
     return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load_band_detectors(camera)))
 
 
@@ -132,6 +134,17 @@ def _is_file(path: str | Path) -> bool:
 def _told(setup: Spec, test: Spec) -> Spec:
     """The test, knowing where it was read."""
     return test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
+
+
+def _require_plane(test: Spec, camera: CameraSpec) -> None:
+    """Bands at one X' alone do not tell the tilt about the line."""
+    _require_bands(test, camera)
+    if len({band.offset for band in camera.bands.values()}) < 2:
+        raise test.error(
+            f"all bands of the camera {camera.name} stand at one X', so the tilt about the line cannot be told",
+            ("camera",),
+            allowed="a camera with bands at different offsets",
+        )
 
 
 def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> None:

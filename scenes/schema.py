@@ -36,7 +36,7 @@ MODELS: dict[str, type[Spec]] = {
     "distortion_test": DistortionTestSpec,
     "turntable_test": TurntableTestSpec,
 }
-_ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
+_ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -70,7 +70,8 @@ def _describe(model: dict[str, Any]) -> None:
     """Move what a class's docstring says of its attributes to where an editor shows it."""
     text = model.get("description", "")
     model["description"] = text.split("\n\n")[0]
-    for name, said in _ATTRIBUTE.findall(text):
+    each = [(name, said) for names, said in _ATTRIBUTE.findall(text) for name in names.split(", ")]
+    for name, said in each:
         item = model.get("properties", {}).get(name)
         if item is not None:
             said = " ".join(said.split())

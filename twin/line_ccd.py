@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 WIDEST_STEP = 100e-9
 """Mean distance of the wavelengths of a band, metres: mean transfer functions are then right to 1e-4."""
 
+_SIGMAS = 5.0
+
 
 def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre wavelengths (K,), metres, and their weights, for light that is evenly spread over the band."""
@@ -73,6 +75,20 @@ class LineCcd:
     def white_photons(self, share: float) -> float:
         """Photons per pixel over all stages that fill the well to that share."""
         return share * self.detector.full_well_e / self.detector.quantum_efficiency
+
+    @property
+    def largest_white(self) -> float:
+        """Share of the full well up to which no pixel of an even field saturates, at five sigma of a pixel's response
+        and of its noise.
+        """
+        sheet, noise = self.detector, self.noise
+        level = (sheet.saturation_dn - sheet.offset_dn) / sheet.system_gain_dn_per_e - noise.dark_signal_e
+        # electrons e with e (1 + 5 prnu) + 5 sqrt(e + dark + read noise^2) = level, by iteration from above
+        electrons = level
+        for _ in range(20):
+            spread = np.sqrt(max(electrons, 0.0) + noise.dark_signal_e + sheet.dark_noise_e**2)
+            electrons = (level - _SIGMAS * spread) / (1.0 + _SIGMAS * sheet.prnu)
+        return float(electrons / sheet.full_well_e)
 
     @property
     def exposure(self) -> float:

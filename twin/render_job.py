@@ -24,7 +24,7 @@ from twin.path_tracing.stray import NominalPathLost
 from twin.results import RenderRun, StrayPair
 from twin.stray_light import stray_light
 from twin.target_images import TargetLostError
-from twin.target_measurement import render_targets
+from twin.target_measurement import check_targets, render_targets
 from twin.target_result import TargetRun
 from twin.truth import trace_truth
 
@@ -80,6 +80,7 @@ def render_job(
     number = resolved.job.render.seed if seed is None else seed
     # the run's config.yaml has to repeat the run, overrides included
     resolved = resolved.with_render(count, number)
+    check_targets(resolved)
     progress(STAGES[0])
     experiment = MonitorExperiment(resolved, backend)
     check_nodes(resolved.job, experiment.instrument.nodes)
@@ -173,7 +174,7 @@ def _targets(
     """Test targets before and after the perturbation.
 
     Raises:
-        InputError: their light is lost, or they cannot be recorded as the job says.
+        InputError: their light is lost.
     """
     say = partial(advance, TARGETS)
     try:

@@ -203,6 +203,11 @@ def pinhole_target(pitch: float) -> Target:
     return pinhole(PINHOLE * pitch)
 
 
+def usable_pixels(pixels: int, region: int) -> float:
+    """How far the windows' middles may spread on a line, pixels; not positive where they do not fit."""
+    return (1.0 - 2.0 * MARGIN) * pixels - region
+
+
 class TargetCamera:
     """A camera before targets at infinity.
 
@@ -217,7 +222,7 @@ class TargetCamera:
 
     def __init__(self, path: TargetPath, ccd: LineCcd, region: int) -> None:
         band = ccd.band
-        usable = (1.0 - 2.0 * MARGIN) * band.pixels - region
+        usable = usable_pixels(band.pixels, region)
         if usable <= 0.0:
             raise ValueError(f"windows of {region} pixels do not fit a line of {band.pixels} pixels")
         self.path = path

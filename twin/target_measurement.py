@@ -24,6 +24,7 @@ from twin.target_images import (
     View,
     pinhole_target,
     star_target,
+    usable_pixels,
 )
 from twin.target_path import TargetPath
 from twin.target_result import (
@@ -46,6 +47,38 @@ _PATTERN, _EXPOSURE = 3, 4
 """Random streams of the job's seed, beside those of the monitor."""
 
 
+def check_targets(resolved: ResolvedJob) -> None:
+    """See before any work whether the targets can be recorded as the job says.
+
+    Raises:
+        InputError: the windows do not fit the line, or there are too many frames.
+    """
+    job, settings = resolved.job, resolved.targets
+    names = job.render.target_images
+    if not names:
+        return
+    kinds = sum(len(DIRECTIONS) if name in ("knife_edge", "bars") else 1 for name in names)
+    each = len(resolved.instrument.cameras) * len(PLACES) * 2 * kinds * settings.region**2
+    if each * (settings.frames or 1) > LARGEST_FRAMES:
+        raise job.error(
+            "the frames of the test targets do not fit into memory",
+            ("render", "targets", "frames"),
+            found=str(settings.frames),
+            allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
+        )
+    for mounted in resolved.instrument.cameras.values():
+        camera = resolved.cameras[mounted.camera]
+        name = target_band(camera)
+        pixels = camera.bands[name].pixels
+        if usable_pixels(pixels, settings.region) <= 0.0:
+            raise job.error(
+                f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
+                ("render", "targets", "region"),
+                found=f"{settings.region} pixels on a line of {pixels}",
+                allowed="a smaller region or a longer line",
+            )
+
+
 def render_targets(
     resolved: ResolvedJob,
     instrument: Instrument,
@@ -57,7 +90,7 @@ def render_targets(
     """Render, expose and measure the job's test targets.
 
     Args:
-        resolved: the job, with targets among its images.
+        resolved: the job, with targets among its images, as ``check_targets`` lets it pass.
         instrument: as built from it.
         backend: where to trace.
         state: after the perturbation.
@@ -65,21 +98,11 @@ def render_targets(
         advance: told how many of how many windows are done.
 
     Raises:
-        InputError: the windows do not fit the line, or there are too many frames.
         TargetLostError: the perturbation moves the light off.
     """
-    job, settings = resolved.job, resolved.targets
-    frames, images = settings.frames or 1, job.render.target_images
-    kinds = sum(len(DIRECTIONS) if name in ("knife_edge", "bars") else 1 for name in images)
+    settings, images = resolved.targets, resolved.job.render.target_images
+    frames = settings.frames or 1
     total = len(instrument.cameras) * len(PLACES) * 2
-    each = total * kinds * settings.region**2
-    if each * frames > LARGEST_FRAMES:
-        raise job.error(
-            "the frames of the test targets do not fit into memory",
-            ("render", "targets", "frames"),
-            found=str(frames),
-            allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
-        )
     cameras, done = {}, 0
     for number, (name, model) in enumerate(instrument.cameras.items()):
         reference = resolved.instrument.cameras[name].camera
@@ -87,10 +110,7 @@ def render_targets(
         assert resolved.line_detectors is not None
         ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
         path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend)
-        try:
-            camera = TargetCamera(path, ccd, settings.region)
-        except ValueError as error:
-            raise job.error(f"camera {name}, band {band}: {error}", ("render", "targets", "region")) from error
+        camera = TargetCamera(path, ccd, settings.region)
         before = camera.views({})
         after = camera.views(state) if state else before
         pattern = ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN, number)))

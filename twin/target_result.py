@@ -52,12 +52,12 @@ class BarReading:
     Attributes:
         measured: from the frames, None if they cannot be measured.
         reason: why not.
-        true: MTF of the traced pupil and the detector at the bars' frequency.
+        true_nyquist: MTF of the traced pupil and the detector at the bars' frequency.
     """
 
     measured: BarMtf | None
     reason: str
-    true: float
+    true_nyquist: float
 
     @property
     def reading(self) -> tuple[float, float] | None:
@@ -154,7 +154,8 @@ class TargetRun:
                         for direction, reading in readings.items():
                             if reading.measured is None:
                                 out.append(
-                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF: {reading.reason}"
+                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF at Nyquist, truly "
+                                    f"{reading.true_nyquist:.3f}: {reading.reason}"
                                 )
         return tuple(out)
 
@@ -165,7 +166,9 @@ class TargetRun:
             places, true_places = {}, {}
             for place, targets in camera.places.items():
                 along, across = (1e3 * targets.place + 0.0).tolist()
-                places[place] = {"along_mm": along, "across_mm": across, **_directions(targets, _measured)}
+                columns = {when: shots.column for when, shots in targets.shots.items()}
+                where = {"along_mm": along, "across_mm": across, "columns": columns}
+                places[place] = {**where, **_directions(targets, _measured)}
                 shift = dict(zip(("along", "across"), (1e6 * targets.shift + 0.0).tolist(), strict=True))
                 true_places[place] = {"image_shift_um": shift, **_directions(targets, _true)}
             cameras[name] = {
@@ -205,7 +208,7 @@ def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
     if edge is not None:
         out |= {"mtf_nyquist": edge.true_nyquist, "curve": _curve(edge, edge.true)}
     if bars is not None:
-        out["bars_mtf"] = bars.true
+        out["bars_mtf"] = bars.true_nyquist
     return out
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analysis.focal_plane import FocalPlaneFit, LineLevel, fit_focal_plane
+from analysis.rigid_motion import RigidMotion
 from analysis.shims import Mount, ShimError, ShimPlan, shim_plan
 from optics.pose import Pose
 from optics.rotation import about_axis, rotation_matrix
@@ -21,6 +23,9 @@ from twin.laboratory.bench_error import BenchError
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import VERTEX_ERROR, NyquistMtf, Recorder, SiteScan, Standing, in_focus, scan
 from twin.laboratory.result import Advance, silent
+
+if TYPE_CHECKING:
+    from scenes.focus_test import FocusTestSpec
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
 
@@ -95,12 +100,12 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
     """Mis-set the focal plane at random and align it.
 
     Raises:
-        BenchError: best focus lies outside of the scan, or the shims cannot make the motion.
+        BenchError: best focus lies outside of the scan, or the mount does not allow the motion.
     """
     test = bench.setup.test
     standing = misset(bench, seed)
     patterns = {name: ccd.pattern(_stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
-    mount = mount_of(bench)
+    mount = mount_of(test)
     present = np.full(len(test.mount.holes), test.mount.thickness)
     states: list[State] = [_look(bench, standing, patterns, seed, 0, advance)]
     shimmings: list[Shimming] = []
@@ -109,10 +114,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
         state = states[-1]
         # the plane wants how far best focus lies downstream of the CCD
         plane = fit_focal_plane(places, -state.defocus, state.defocus_sigma, estimate_extra=True)
-        try:
-            plan = shim_plan(plane.correction(state.level), mount, present)
-        except ShimError as error:
-            raise BenchError(str(error), ("mount",), "another mount, or a smaller misset") from error
+        plan = plan_shims(plane.correction(state.level), mount, present)
         assert plan.thickness is not None
         present = plan.thickness
         shimmings.append(Shimming(plane, plan))
@@ -132,10 +134,39 @@ def misset(bench: FocusBench, seed: int) -> Standing:
     return Standing(Pose(rotation, shift), heights)
 
 
-def mount_of(bench: FocusBench) -> Mount:
-    """The mounting surface as its drawing has it, in the assembly's frame."""
-    spec = bench.setup.test.mount
-    return Mount.of(np.array(spec.holes), about_axis(1, spec.tilt)[:, 2], spec.clearance, spec.step)
+def mount_of(test: FocusTestSpec) -> Mount:
+    """The mounting surface as its drawing has it, in the assembly's frame.
+
+    Raises:
+        BenchError: holes that cannot carry a tilt.
+    """
+    spec = test.mount
+    try:
+        return Mount.of(np.array(spec.holes), about_axis(1, spec.tilt)[:, 2], spec.clearance, spec.step)
+    except ShimError as error:
+        raise BenchError(str(error), ("mount", "holes"), "three holes or more that span a plane") from error
+
+
+def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> ShimPlan:
+    """Shims for a correction.
+
+    Raises:
+        BenchError: the mount does not allow the motion.
+    """
+    move = correction.displacement(mount.holes)
+    slide = np.linalg.norm(move - np.outer(move @ mount.normal, mount.normal), axis=1)
+    far = int(np.argmax(slide))
+    if slide[far] > mount.clearance:
+        raise BenchError(
+            f"the alignment would slide hole_{far + 1} by {1e3 * slide[far]:.3g} mm in the mounting surface, "
+            f"the screws allow {1e3 * mount.clearance:.3g} mm",
+            ("mount", "clearance"),
+            "more clearance, or a smaller misset",
+        )
+    try:
+        return shim_plan(correction, mount, present)
+    except ShimError as error:
+        raise BenchError(str(error), ("mount", "thickness"), "thicker shims to begin with") from error
 
 
 def line_turn(pose: Pose) -> float:

@@ -23,7 +23,7 @@ from scenes.camera_under_test import ROOT, CameraUnderTest, build_camera_under_t
 from twin.edge_images import EdgeImager, EdgeOptics
 from twin.laboratory.result import Advance, silent
 from twin.line_ccd import LineCcd
-from twin.target_path import TargetPath
+from twin.target_path import LocalMap, TargetPath
 
 if TYPE_CHECKING:
     from scenes.lab_setup import FocusSetup
@@ -48,7 +48,7 @@ class Site:
         point, direction: of the chief ray in the focal-plane frame, (3,), metres and unit.
         imagers: edge -> its images.
         defocus_per_shift: edge -> defocus of the image per metre of the target's move, as the edge's direction sees it:
-            (f / collimator's f)^2 with the focal length in that direction.
+            (f / collimator's f)^2 with the focal length in the direction of the edge's normal.
         nominal_per_shift: the same of the prescription, which the analysis may know.
         edge_focus: edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
     """
@@ -163,13 +163,13 @@ class FocusBench:
         local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
         nominal = self.path.local_map({}, direction, ccd.band.pitch * test.edge.region)
         imagers, ratio, nominal_ratio = {}, {}, {}
-        for k, edge in enumerate(EDGES):
+        for edge in EDGES:
             shape = slanted_edge(test.edge.angle, _AXES[edge]).parts[0][1]
             assert isinstance(shape, HalfPlane)
-            optics = EdgeOptics.build(pupil, ccd.band, shape.mapped(local).normal)
-            imagers[edge] = EdgeImager(optics, ccd, test.edge.region)
-            ratio[edge] = float(local.jacobian[k, k] ** 2)
-            nominal_ratio[edge] = float(nominal.jacobian[k, k] ** 2)
+            normal = shape.mapped(local).normal
+            imagers[edge] = EdgeImager(EdgeOptics.build(pupil, ccd.band, normal), ccd, test.edge.region)
+            ratio[edge] = _longitudinal(local, normal)
+            nominal_ratio[edge] = _longitudinal(nominal, shape.mapped(nominal).normal)
         # the pupil's mean direction in (Y', X') is the chief ray's but for coma
         v, u = pupil.centre
         ray = np.array([u, v, np.sqrt(1.0 - u * u - v * v)])
@@ -198,6 +198,15 @@ class FocusBench:
                 factors = {"diffraction": diffraction, "wavefront": actual / diffraction, **parts}
                 out.append(BudgetLine(name, edge, factors, imager.mtf(site.best, f)))
         return tuple(out)
+
+
+def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:
+    """Longitudinal magnification in the direction of an edge's normal.
+
+    A target moved by s adds s |p|^2 / 2F^2 to the path at p in the entrance pupil. By Lagrange's invariant p = F J^T u
+    for direction cosines u at the image and the map's Jacobian J, so the image's curvature is s J J^T.
+    """
+    return float(np.sum((local.jacobian.T @ normal) ** 2))
 
 
 def best_focus(imager: EdgeImager, frequency: float) -> float:

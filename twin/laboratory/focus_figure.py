@@ -72,7 +72,7 @@ def _through_focus(alignment: Alignment) -> Figure:
                 error = np.sqrt(sum(scan.sigma[e] ** 2 for e in EDGES)) / len(EDGES)
                 good = np.isfinite(error)
                 shift = np.mean([scan.shift[e] for e in EDGES], axis=0)
-                label = f"field {site.field:g}" if row == 0 and column == 0 else None
+                label = f"field {site.field:g}".replace("-", "−") if row == 0 and column == 0 else None
                 axes.errorbar(
                     UM * shift[good], mean[good], error[good], fmt="o-", ms=2.4, lw=0.9, color=colour, label=label
                 )

@@ -8,10 +8,11 @@ import numpy as np
 
 from optics.aim import AimError
 from optics.backend import Backend
+from optics.collimator import TooNarrowError
 from optics.trace import BeamMissedError
 from twin.artefact import SvgFigure, Table
 from twin.laboratory.bench_error import BenchError
-from twin.laboratory.focus import Alignment, align
+from twin.laboratory.focus import Alignment, align, mount_of
 from twin.laboratory.focus_bench import ALONG, EDGES, TRACK, FocusBench
 from twin.laboratory.focus_figure import EDGE_NAMES, defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.laboratory.focus_json import ARCMIN, UM, to_dict
@@ -31,11 +32,28 @@ def run_focus(setup: FocusSetup, backend: Backend, seed: int, advance: Advance) 
         InputError: the camera cannot be built as the file says.
         BenchError: what the file asks for cannot be done.
     """
+    mount_of(setup.test)
     try:
         bench = FocusBench(setup, backend, advance)
+    except TooNarrowError as error:
+        raise BenchError(str(error), ("collimator", "aperture"), "a wider collimator") from error
     except (AimError, BeamMissedError, ValueError) as error:
         raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
+    _check_light(bench)
     return focus_result(align(bench, seed, advance))
+
+
+def _check_light(bench: FocusBench) -> None:
+    """BenchError when the bright side of the edge would saturate, which would falsify its MTF."""
+    most = {name: ccd.largest_white for name, ccd in bench.ccds.items()}
+    name = min(most, key=lambda n: most[n])
+    white = bench.setup.test.white
+    if white > most[name]:
+        raise BenchError(
+            f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}",
+            ("white",),
+            f"{np.floor(100 * most[name]):.0f} percent or less",
+        )
 
 
 def focus_result(alignment: Alignment) -> LabResult:
@@ -72,6 +90,11 @@ def _number(rounds: int) -> str:
     return "One round" if rounds == 1 else f"{rounds} rounds"
 
 
+def _thousands(value: float) -> str:
+    """A large number with narrow spaces."""
+    return f"{value:,.0f}".replace(",", "\u202f")
+
+
 def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
     setup = alignment.bench.setup
     test, camera = setup.test, setup.camera
@@ -81,7 +104,7 @@ def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
     )
     level = test.white
     electrons = ", ".join(
-        f"{name} {level * ccd.detector.full_well_e:.3g} e" for name, ccd in alignment.bench.ccds.items()
+        f"{name} {_thousands(level * ccd.detector.full_well_e)} e" for name, ccd in alignment.bench.ccds.items()
     )
     return (
         (
@@ -94,7 +117,7 @@ def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
             f"{np.degrees(test.edge.angle):g}° at its focus, regions of {test.edge.region} × {test.edge.region} pixels",
         ),
         ("Light", f"bright side at {100 * level:.0f}% of the full well ({electrons}); {test.frames} frames averaged"),
-        ("Fields", ", ".join(f"{f:g}" for f in test.fields) + " of half the line, all bands"),
+        ("Fields", ", ".join(f"{f:g}".replace("-", "−") for f in test.fields) + " of half the line, all bands"),
         (
             "Mount",
             f"{len(test.mount.holes)} holes, surface inclined by {np.degrees(test.mount.tilt):g}° against the focal "
@@ -166,9 +189,9 @@ def _mtf_section(alignment: Alignment) -> Section:
         (
             band,
             f"{MTF_NYQUIST[band]:.2f}" if band in MTF_NYQUIST else "",
-            f"{end['mtf_nyquist'][band]:.3f} ± {end['mtf_nyquist_sigma'][band]:.3f}",
-            f"{true['mtf_nyquist'][band]:.3f}",
-            f"{end['mtf_nyquist_along_line'][band]:.3f} ± {end['mtf_nyquist_along_line_sigma'][band]:.3f}",
+            f"{end['mtf_nyquist'][band]:.4f} ± {end['mtf_nyquist_sigma'][band]:.4f}",
+            f"{true['mtf_nyquist'][band]:.4f}",
+            f"{end['mtf_nyquist_along_line'][band]:.4f} ± {end['mtf_nyquist_along_line_sigma'][band]:.4f}",
         )
         for band in alignment.bench.ccds
     ]
@@ -196,7 +219,7 @@ def _mtf_section(alignment: Alignment) -> Section:
                 "mtf",
                 "Measured in focus, mean over the fields",
                 "The noise's sigma; truth from the traced pupils at the places where the CCDs really stand.",
-                ("band", "paper 004", "along the track", "true", "along the line"),
+                ("band", "paper 004", "along the track", "along the track, true", "along the line"),
                 rows,
             ),
             Table(
@@ -238,8 +261,10 @@ def _shim_section(alignment: Alignment) -> Section:
             Table(
                 f"shims-{number + 1}",
                 f"Shims of round {number + 1}",
-                f"Changes of thickness under each hole. The turn in the mounting surface of {plan.turn / ARCMIN:.2f}′ "
-                f"is set by hand; without it the line would be off level by {plan.level_coupling / ARCMIN:.2f}′, "
+                "Changes of thickness under each hole; their sigma has in it that the sites do not lie on one plane "
+                f"({UM * shimming.plane.extra_sigma:.1f} µm rms: chips, curvature of field). The turn in the mounting "
+                f"surface of {plan.turn / ARCMIN:.2f}′ is set by hand; without it the line would be off level by "
+                f"{plan.level_coupling / ARCMIN:.2f}′, "
                 "since the mounting surface is not parallel to the focal plane.",
                 ("hole", "change, µm", "ground, µm", "new shim, µm", "slide, mm"),
                 rows,

@@ -168,10 +168,22 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
 
 
 def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
-    """MTF of every site with the target at the collimator's focus."""
+    """MTF of every site with the target at the collimator's focus.
+
+    Raises:
+        BenchError: no edge can be measured there.
+    """
 
     def site(number: int) -> NyquistMtf:
-        takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in EDGES}
+        try:
+            takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in EDGES}
+        except EdgeError as error:
+            where = recorder.bench.sites[number]
+            raise BenchError(
+                f"the edge cannot be measured after the alignment in {where.band} at field {where.field:g}: {error}",
+                ("misset", "chips"),
+                "chips nearer to one plane, so that all of them come into focus together",
+            ) from error
         return NyquistMtf({e: (t[0], t[1]) for e, t in takes.items()}, {e: t[2] for e, t in takes.items()})
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from twin.report.numbers import FAR, decimals_for, fixed, plain, residual, residual_text, significant
+from twin.report.numbers import FAR, fixed, plain, residual, residual_text, significant
 from twin.results import RenderRun
 from twin.target_images import DIRECTIONS
 from twin.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, PlaceTargets
 
 DIRECTION_NAMES = dict(zip(DIRECTIONS, ("along the line", "along the track"), strict=True))
-LEAST_PLACES = 3
-"""Decimals of an MTF at least, and those of one without a sigma."""
+METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
+DECIMALS = 4
+"""Of an MTF."""
 
 
 def target_content(run: RenderRun) -> dict[str, Any] | None:
@@ -28,6 +29,7 @@ def target_content(run: RenderRun) -> dict[str, Any] | None:
         "edges": edges,
         "bars": bars,
         "kinds": kinds,
+        "methods": ", ".join(METHODS[kind] for kind in kinds),
         "width": 2 + 4 * len(kinds),
         "rows": rows,
         "bias": _largest_bias(run) if edges else "",
@@ -71,25 +73,26 @@ def _readings(targets: PlaceTargets, direction: str, kind: str) -> list[tuple[st
 
 
 def _cell(key: str, reading: EdgeReading | BarReading) -> dict[str, str]:
-    """One measured value and its truth; the bars' sigma leaves a systematic error out, so it gives no verdict."""
+    """One measured value and its truth; the bars' sigma is small beside their systematic error, so it
+    gives no verdict.
+    """
     is_edge = isinstance(reading, EdgeReading)
     found = reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
-    true = reading.true_nyquist if isinstance(reading, EdgeReading) else reading.true
     if found is None:
-        return {
-            "key": key, "value": "not measurable", "sigma": "", "residual": "", "mark": "", "true": fixed(true, 4),
-        }  # fmt: skip
+        nothing = dict.fromkeys(("sigma", "residual", "mark"), "")
+        return {"key": key, "value": "not measurable", "true": fixed(reading.true_nyquist, DECIMALS), **nothing}
     value, sigma = found
-    places = max(decimals_for(sigma), LEAST_PLACES)
-    ratio = residual(value - true, sigma) if is_edge else None
-    far = ratio is not None and abs(ratio) > FAR
+    true = reading.true_nyquist
+    ratio = residual(value - true, sigma)
+    far = is_edge and ratio is not None and abs(ratio) > FAR
+    difference = fixed(value - true, DECIMALS, sign=True)
     return {
         "key": key,
-        "value": fixed(value, places),
-        "sigma": fixed(sigma, places),
-        "residual": residual_text(ratio) if ratio is not None else "",
-        "mark": "" if ratio is None else "far" if far else "near",
-        "true": fixed(true, places),
+        "value": fixed(value, DECIMALS),
+        "sigma": fixed(sigma, DECIMALS) if is_edge else "",
+        "residual": f"{residual_text(ratio)} \N{GREEK SMALL LETTER SIGMA}" if is_edge else difference,
+        "mark": "" if not is_edge else "far" if far else "near",
+        "true": fixed(true, DECIMALS),
     }
 
 

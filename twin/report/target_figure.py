@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import AsinhNorm, Normalize
 
 from twin.report.svg import BLUE, GREY, LIGHT, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.target_images import DIRECTIONS
@@ -12,44 +13,63 @@ from twin.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading
 COLOURS = {"before": BLUE, "after": VERMILION}
 MARKS = {"before": "o", "after": "D"}
 BAND = 2.0
-"""Half width of the band about a measured curve, sigma."""
+"""Half width of the band about zero, sigma."""
+LEAST_SPAN = 4.0
+"""Half height of the panels of differences at least, thousandths."""
 EVERY = 2
 """Every how many-th frequency gets a dot."""
 TITLES = dict(zip(DIRECTIONS, ("along the line", "along the track"), strict=True))
 IMAGE_NAMES = {
-    "knife_edge_along": "knife edge,\nMTF along line",
-    "knife_edge_track": "knife edge,\nMTF along track",
-    "bars_along": "bars,\nMTF along line",
-    "bars_track": "bars,\nMTF along track",
+    "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
+    "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
+    "bars_along": "bars, along line",
+    "bars_track": "bars, along track",
     "star": "star",
-    "pinhole": "pinhole",
+    "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
 }
+"""Of the images, with the direction of their MTF."""
+CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
+"""Side of what is shown, pixels; the others are shown whole."""
+STRETCH = 100.0
+"""The pinhole's stretch is linear up to this fraction (1/STRETCH) of the peak."""
 
 
 def curves_svg(name: str, camera: CameraTargets) -> str:
     """Measured and true MTF, a row for each direction and a column for each place."""
     with look(f"mtf-{name}"):
-        figure = new_figure(5.6)
-        panels = figure.subplots(len(DIRECTIONS), len(camera.places), sharex=True, sharey=True, squeeze=False)
+        figure = new_figure(8.4)
+        heights = (3.0, 1.2) * len(DIRECTIONS)
+        panels = figure.subplots(
+            len(heights), len(camera.places), sharex=True, sharey="row", squeeze=False, height_ratios=heights
+        )
         for column, (place, targets) in enumerate(camera.places.items()):
             for row, direction in enumerate(DIRECTIONS):
-                axes = panels[row, column]
-                plain_axes(axes)
-                axes.grid(color=LIGHT, lw=0.5)
-                axes.set_axisbelow(True)
+                axes, below = panels[2 * row : 2 * row + 2, column]
                 nyquist = 1e-3 * NYQUIST / camera.pitch
-                axes.axvline(nyquist, color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+                for each in (axes, below):
+                    plain_axes(each)
+                    each.grid(color=LIGHT, lw=0.5)
+                    each.set_axisbelow(True)
+                    each.axvline(nyquist, color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+                below.axhline(0.0, color=GREY, lw=0.8)
                 for when, shots in targets.shots.items():
                     _curve(axes, when, shots.edges[direction])
+                    _difference(below, when, shots.edges[direction])
                     if direction in shots.bars:
                         _bars(axes, when, shots.bars[direction], camera.pitch)
                 axes.set(xlim=(0.0, 2.0 * nyquist), ylim=(0.0, 1.03))
                 axes.set_title(f"{place}, {TITLES[direction]}", loc="left")
                 if column == 0:
                     axes.set_ylabel("MTF")
+                    below.set_ylabel("error [10$^{-3}$]")
                 if row == len(DIRECTIONS) - 1:
-                    axes.set_xlabel("frequency [cycles/mm]")
+                    below.set_xlabel("frequency [cycles/mm]")
+        for below in panels[1::2, 0]:
+            # about zero, and noise alone does not fill a panel
+            span = max(LEAST_SPAN, *(abs(limit) for limit in below.get_ylim()))
+            below.set_ylim(-span, span)
         handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.align_ylabels()
         unique = dict(zip(labels, handles, strict=True))
         figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
         return to_svg(figure)
@@ -61,13 +81,20 @@ def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
     found = edge.measured
     if found is None:
         return
-    axes.fill_between(
-        frequency, found.mtf - BAND * found.sigma, found.mtf + BAND * found.sigma, color=colour, alpha=0.25, lw=0.0
-    )
     axes.plot(
         frequency[::EVERY], found.mtf[::EVERY], MARKS[when], color=colour, ms=3.2, mec="white", mew=0.4,
         label=f"measured, {when}",
     )  # fmt: skip
+
+
+def _difference(axes: Axes, when: str, edge: EdgeReading) -> None:
+    """Measured less true, thousandths."""
+    found = edge.measured
+    if found is None:
+        return
+    frequency, error, sigma = 1e-3 * edge.frequency, 1e3 * (found.mtf - edge.true), 1e3 * found.sigma
+    axes.fill_between(frequency, -BAND * sigma, BAND * sigma, color=COLOURS[when], alpha=0.18, lw=0.0)
+    axes.plot(frequency, error, color=COLOURS[when], lw=1.1)
 
 
 def _bars(axes: Axes, when: str, bars: BarReading, pitch: float) -> None:
@@ -77,6 +104,13 @@ def _bars(axes: Axes, when: str, bars: BarReading, pitch: float) -> None:
             1e-3 * NYQUIST / pitch, bars.measured.mtf, "s", color="none", mec=COLOURS[when], mew=1.3, ms=6.5,
             label=f"bars, {when}",
         )  # fmt: skip
+
+
+def _norm(target: str, image: np.ndarray) -> Normalize:
+    low, high = float(image.min()), max(float(image.max()), float(image.min()) + 1.0)
+    if target == "pinhole":
+        return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
+    return Normalize(low, high)
 
 
 def images_svg(name: str, camera: CameraTargets) -> str:
@@ -91,7 +125,9 @@ def images_svg(name: str, camera: CameraTargets) -> str:
             for row, target in enumerate(names):
                 axes = grid[row, column]
                 mean = np.asarray(shots.frames[target].mean(axis=0))
-                axes.imshow(mean, cmap="gray", interpolation="none")
+                skip = (len(mean) - CROPS.get(target, len(mean))) // 2
+                shown = mean[skip : len(mean) - skip, skip : len(mean) - skip]
+                axes.imshow(shown, cmap="gray", interpolation="none", norm=_norm(target, shown))
                 axes.set_xticks([])
                 axes.set_yticks([])
                 if row == 0:

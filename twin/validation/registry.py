@@ -7,10 +7,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from scenes.errors import nearest
-from twin.validation import error_budget_001, formulas_001, principle_001
+from twin.validation import error_budget_001, formulas_001, laboratory_004, principle_001
 from twin.validation.group import CheckGroup, matches
 
-GROUPS: tuple[CheckGroup, ...] = (formulas_001.GROUP, principle_001.GROUP, error_budget_001.GROUP)
+GROUPS: tuple[CheckGroup, ...] = (
+    formulas_001.GROUP,
+    principle_001.GROUP,
+    error_budget_001.GROUP,
+    *laboratory_004.GROUPS,
+)
 """Every group, in the order in which they run. A new one is added here."""
 
 

@@ -1,0 +1,148 @@
+"""The collimator: a target moved out of its focus (Newton), its wavefront in the pupil of a traced camera."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from optics import quadrature, zernike
+from optics.backend import Backend
+from optics.collimator import Collimator, TooNarrowError
+from optics.pupil_function import PupilFunction
+from optics.transfer import transfer
+from optics.tree import Motion
+from scenes.camera_under_test import ROOT, build_camera_under_test
+from scenes.collimator import CameraUnderTestSpec
+from scenes.load import load_camera
+from twin.target_path import TargetPath
+
+LONG = 20.0
+RADIUS = 0.302
+"""Just wider than gf7's beam, so that the wavefront's rms over the aperture is nearly that over the beam."""
+WAVELENGTH = 650e-9
+NYQUIST = 1 / 14e-6
+MIDDLE, EDGE = np.array([[0.0, 0.0]]), np.array([[0.1, 0.01]])
+
+
+class Bench:
+    """gf7 as designed in front of collimators."""
+
+    def __init__(self, backend: Backend) -> None:
+        self.backend = backend
+        self.test = build_camera_under_test(CameraUnderTestSpec(camera="gf7"), load_camera("gf7"), backend)
+
+    def pupil(
+        self, collimator: Collimator | None, place: np.ndarray = MIDDLE, shift: float = 0.0, detector: float = 0.0
+    ) -> PupilFunction:
+        """Pupil at a place, for a target moved by ``shift`` or a focal plane moved by ``detector`` along Z'."""
+        path = TargetPath(self.test.assembly, ROOT, ROOT, self.test.model, self.backend, collimator)
+        state = {f"{ROOT}/focal_plane": Motion(shift=(0.0, 0.0, detector))}
+        direction = path.directions(place)
+        return path.pupils(state, direction, path.places(state, direction), shift)[0]
+
+
+@pytest.fixture(scope="module")
+def bench(backend) -> Bench:
+    return Bench(backend)
+
+
+def added(pupil: PupilFunction, without: PupilFunction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Direction cosines (N, 2) of nodes of the pupil, their weights, and the path that was added, without its mean."""
+    nodes = quadrature.disk(8)
+    p = 0.999 * (nodes.x + 1j * nodes.y)
+    u, v, _ = pupil.cosines(p)
+    assert np.allclose(pupil.axes, without.axes, atol=1e-9)
+    path = pupil.values(p)[0] - without.values(p)[0]
+    return np.stack([u, v], axis=-1), nodes.weight, path - np.average(path, weights=nodes.weight)
+
+
+def curvatures(pupil: PupilFunction, without: PupilFunction) -> tuple[float, float]:
+    """Second derivatives of the added path along both axes of the image, metres."""
+    cosines, weight, path = added(pupil, without)
+    u, v = cosines.T
+    design = np.stack([np.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], axis=-1)
+    terms = np.linalg.lstsq(design * np.sqrt(weight)[:, None], path * np.sqrt(weight), rcond=None)[0]
+    return float(terms[3]), float(terms[5])
+
+
+def test_the_beam_diverges_from_the_targets_image() -> None:
+    """With the pupil in the collimator's front focal plane the target's image stands F^2 / s away (Newton): path to
+    points of the pupil from there, with the sagitta's next order as the tolerance.
+    """
+    point = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, -0.2], [0.2, 0.2]])
+    square = np.sum(point**2, axis=-1)
+    for shift in (2e-3, 20e-3):
+        away = LONG**2 / shift
+        exact = square / (np.sqrt(away**2 + square) + away)
+        got = Collimator(LONG, 0.4).path(point, shift)
+        np.testing.assert_allclose(got, exact, rtol=0.0, atol=0.13 * np.max(square) ** 2 / away**3)
+        np.testing.assert_allclose(Collimator(LONG, 0.4).path(point, -shift), -got, rtol=0.0, atol=1e-18)
+
+
+def test_a_moved_target_is_a_moved_detector(bench, gf7) -> None:
+    """Curvature of the added wavefront against that of a detector moved along Z', axis by axis: s (f / F)^2 with the
+    focal length of chief rays, which differ by 2.9% in this camera. Downstream image, so upstream detector.
+    """
+    shift, detector = 1e-3, 100e-6
+    nominal = bench.pupil(Collimator(LONG, RADIUS))
+    per_metre = np.array(curvatures(bench.pupil(None, detector=detector), bench.pupil(None))) / detector
+    # image space is nearly telecentric, and a move along Z' has the same curvature in both directions
+    assert per_metre[0] == pytest.approx(per_metre[1], rel=1e-3)
+    by_target = np.array(curvatures(bench.pupil(Collimator(LONG, RADIUS), shift=shift), nominal))
+    moved = -by_target / per_metre
+    focal_length = np.abs(np.diag(gf7.first_order.scale[0]))
+    np.testing.assert_allclose(focal_length, [5.5104, 5.6715], rtol=1e-4)
+    # coma of the pupil: the beam's edge is 1e-3 off the first-order imaging of the pupil
+    np.testing.assert_allclose(moved, shift * (focal_length / LONG) ** 2, rtol=2e-3)
+    assert np.all(moved > 0.0)
+
+
+@pytest.mark.parametrize("shift", [1.5e-3, -1e-3])
+def test_best_focus_goes_with_the_target(bench, gf7, shift: float) -> None:
+    """The detector's place with most contrast at 71 cycles/mm, along the line and along the track."""
+    pupils = [bench.pupil(Collimator(LONG, RADIUS), shift=s) for s in (0.0, shift)]
+    for axis, focal_length in enumerate(np.abs(np.diag(gf7.first_order.scale[0]))):
+        frequency = NYQUIST * np.eye(2)[axis : axis + 1]
+
+        def contrast(z: float, pupil: PupilFunction, frequency: np.ndarray = frequency) -> float:
+            return -float(np.abs(transfer(pupil, frequency, WAVELENGTH, np.array([z])))[0, 0])
+
+        expected = shift * (focal_length / LONG) ** 2
+        before, after = (
+            minimize_scalar(
+                contrast, bounds=(z - 60e-6, z + 60e-6), args=(pupil,), method="bounded", options={"xatol": 1e-9}
+            ).x
+            for pupil, z in zip(pupils, (0.0, expected), strict=True)
+        )
+        # the two directions differ by 4.5 um per mm; half a micrometre for 0.02 waves of aberration
+        assert after - before == pytest.approx(expected, abs=0.3e-6)
+
+
+@pytest.mark.parametrize("place", [MIDDLE, EDGE])
+@pytest.mark.parametrize("term", [2, 5, 6, 7, 8, 11])
+def test_the_wavefront_appears_in_the_pupil(bench, term: int, place: np.ndarray) -> None:
+    """Sign, orientation and rms: the beam fills 0.99 of the aperture; a wave that is ahead has the shorter path.
+
+    x of the aperture is the camera's Y. Light through +Y of a converging beam travels toward -Y at the image.
+    """
+    size = 10e-9
+    pupil, without = (bench.pupil(Collimator(LONG, RADIUS, w), place) for w in ({term: size}, {}))
+    cosines, weight, path = added(pupil, without)
+    rms = float(np.sqrt(np.average(path**2, weights=weight)))
+    # 0.3 / 0.302 to the power of the term's order, at most 4; the beam's outline is elliptical by 0.5%
+    assert rms == pytest.approx(size, rel=0.05)
+    ahead = zernike.zernike(term, *aperture_coordinates(cosines - pupil.centre, pupil))
+    correlation = float(np.average(-path * ahead, weights=weight) / rms)
+    assert correlation == pytest.approx(1.0, abs=0.01)
+
+
+def aperture_coordinates(cosines: np.ndarray, pupil: PupilFunction) -> tuple[np.ndarray, np.ndarray]:
+    """Place in the unit beam of rays by their direction at the image: converging, so opposite in sense."""
+    size = np.linalg.norm(pupil.axes, axis=1)
+    return -cosines[:, 0] / size[0], -cosines[:, 1] / size[1]
+
+
+def test_too_small_an_aperture(bench) -> None:
+    with pytest.raises(TooNarrowError, match=r"beam is 59\d mm wide .* aperture 598 mm"):
+        bench.pupil(Collimator(LONG, 0.299 - 1e-9 * LONG))
+    with pytest.raises(TooNarrowError, match="aperture 500 mm"):
+        bench.pupil(Collimator(LONG, 0.25))

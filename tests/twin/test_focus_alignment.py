@@ -1,0 +1,308 @@
+"""Alignments from random mis-settings: where they end by the trace, and whether the sigmas say so beforehand.
+
+Seeds are fixed, so that a test passes or fails for good. Every chi-square test has a false-alarm rate of 1e-4 per side.
+"""
+
+import json
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from analysis.rigid_motion import RigidMotion
+from optics.backend import load_backend
+from optics.frozen_map import FrozenMap
+from optics.pose import Pose
+from optics.rotation import rotation_matrix, rotation_vector
+from scenes.lab_setup import FocusSetup, resolve_focus
+from scenes.load import LAB, LIBRARY
+from twin.laboratory.bench_error import BenchError
+from twin.laboratory.focus import Alignment, align, line_turn, misset, mount_of, plan_shims
+from twin.laboratory.focus_bench import TRACK, FocusBench
+from twin.laboratory.focus_json import to_dict
+from twin.laboratory.focus_result import run_focus
+from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
+from twin.laboratory.result import silent
+
+FILE = LIBRARY / LAB / "focus.yaml"
+ARCMIN = np.pi / 180 / 60
+CONFOCAL = 40e-6
+"""Paper 004, section 2: all line CCDs within +-0.04 mm of one focus,"""
+LEVEL = ARCMIN
+"""and level within +-1 arcmin."""
+FALSE_ALARM = 1e-4
+SEEDS = (1, 2)
+MANY = range(100, 150)
+PROCESSES = 2
+
+
+def reduced() -> FocusSetup:
+    """The example with fewer fields, bands and positions of the target, which takes seconds."""
+    setup = resolve_focus(FILE)
+    camera = setup.camera.model_copy(
+        update={"bands": FrozenMap({name: setup.camera.bands[name] for name in ("P", "B4")})}
+    )
+    scan = setup.test.scan.model_copy(update={"reach": 0.5e-3, "step": 0.12e-3, "points": 7})
+    test = setup.test.model_copy(update={"fields": (-0.9, 0.0, 0.9), "scan": scan})
+    return setup.model_copy(update={"camera": camera, "test": test})
+
+
+def with_test(bench: FocusBench, **changes: object) -> FocusBench:
+    """The same optics and fields with another plan of the test: the tables are taken over."""
+    other = object.__new__(FocusBench)
+    other.__dict__.update(bench.__dict__)
+    other.setup = bench.setup.model_copy(update={"test": bench.setup.test.model_copy(update=changes)})
+    return other
+
+
+@pytest.fixture(scope="module")
+def bench(backend) -> FocusBench:
+    return FocusBench(reduced(), backend)
+
+
+@pytest.fixture(scope="module")
+def alignments(bench) -> dict[int, Alignment]:
+    return {seed: align(bench, seed) for seed in SEEDS}
+
+
+@pytest.fixture(scope="module")
+def coarse(bench) -> Alignment:
+    """The first seed with shims ground in steps of 50 um, and a second round."""
+    mount = bench.setup.test.mount.model_copy(update={"step": 50e-6})
+    return align(with_test(bench, mount=mount, rounds=2), SEEDS[0])
+
+
+def test_one_round_ends_where_the_paper_did(alignments) -> None:
+    for alignment in alignments.values():
+        before, after = alignment.states
+        # it had something to do
+        assert np.max(np.abs(before.true_defocus)) > 5.0 * CONFOCAL
+        assert np.max(np.abs(after.true_defocus)) < CONFOCAL
+        assert abs(after.true_level) < LEVEL
+
+
+def test_measured_defocus_agrees_with_the_traced_one(alignments) -> None:
+    """Chi-square with the sites' noise and the common error that the curves' form leaves."""
+    states = [state for alignment in alignments.values() for state in alignment.states]
+    total, count = 0.0, 0
+    for state in states:
+        error = state.defocus - state.true_defocus
+        covariance = np.diag(state.defocus_sigma**2) + VERTEX_ERROR**2
+        total += float(error @ np.linalg.solve(covariance, error))
+        count += len(error)
+    low, high = chi2.ppf([FALSE_ALARM, 1.0 - FALSE_ALARM], count)
+    assert count == 24
+    assert low < total < high
+    # a sigma that is far larger than the errors it is for would also pass a chi-square of few degrees of freedom
+    assert max(np.max(state.defocus_sigma) for state in states) < 5e-6
+
+
+def test_level_is_read_and_set_with_the_theodolites_sigma(alignments) -> None:
+    """The reading, and the line after the turn that takes out the reading: its error and that of the setting."""
+    sigma = next(iter(alignments.values())).bench.setup.test.level
+    read = [(s.level.angle - s.true_level) / sigma for a in alignments.values() for s in a.states]
+    left = [a.states[1].true_level / (np.sqrt(2.0) * sigma) for a in alignments.values()]
+    for values in (read, left):
+        low, high = chi2.ppf([FALSE_ALARM, 1.0 - FALSE_ALARM], len(values))
+        assert low < np.sum(np.square(values)) < high
+
+
+def test_the_seed_decides(alignments, coarse) -> None:
+    """The coarse shims' run repeats the first seed as far as the first shims."""
+    first, second = (to_dict(alignments[seed]) for seed in SEEDS)
+    again = to_dict(coarse)
+    assert again["initial"] == first["initial"]
+    assert again["truth"]["initial"] == first["truth"]["initial"]
+    for part in ("initial", "rounds"):
+        assert first[part] != second[part]
+        assert first["truth"][part] != second["truth"][part]
+
+
+def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
+    """400 draws: variances of rotations, shifts and chips by chi-square."""
+    spec = bench.setup.test.misset
+    draws = [misset(bench, seed) for seed in range(400)]
+    values = np.array(
+        [[*rotation_vector(d.pose.rotation), *d.pose.translation, *d.heights.values()] for d in draws],
+    )
+    sigma = np.array([*spec.rotate, *spec.shift, *[spec.chips] * len(bench.ccds)])
+    low, high = chi2.ppf([FALSE_ALARM, 1.0 - FALSE_ALARM], len(draws))
+    sums = np.sum((values / sigma) ** 2, axis=0)
+    assert np.all((low < sums) & (sums < high))
+
+
+def test_json(bench, alignments) -> None:
+    alignment = alignments[SEEDS[0]]
+    data = json.loads(json.dumps(to_dict(alignment), allow_nan=False))
+    assert len(data["rounds"]) == bench.setup.test.rounds == 1
+    end, truth = data["rounds"][0], data["truth"]
+    assert {"confocal_um_max", "line_level_arcmin", "mtf_nyquist", "shims_um"} <= set(end)
+    assert list(end["mtf_nyquist"]) == ["P", "B4"]
+    assert list(end["shims_um"]) == ["hole_1", "hole_2", "hole_3", "hole_4"]
+    mount = bench.setup.test.mount
+    for name, thickness in end["shims_um"].items():
+        assert thickness / (1e6 * mount.step) == pytest.approx(round(thickness / (1e6 * mount.step)), abs=1e-9)
+        assert thickness - end["shim_changes_um"][name] == pytest.approx(1e6 * mount.thickness, abs=1e-6)
+    assert end["confocal_um_max"] == max(abs(site["defocus_um"]) for site in end["sites"])
+    assert truth["rounds"][0]["confocal_um_max"] == max(abs(v) for v in truth["rounds"][0]["defocus_um"])
+    # five sigma of the measured MTF, and what the measurement of an edge leaves
+    for band, value in end["mtf_nyquist"].items():
+        allowed = 5.0 * end["mtf_nyquist_sigma"][band] + 1e-3
+        assert value == pytest.approx(truth["rounds"][0]["mtf_nyquist"][band], abs=allowed)
+
+
+def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse) -> None:
+    """Steps of 50 um: every hole is off by up to 25 um, and the plan says what that leaves at the CCDs."""
+    fine = alignments[SEEDS[0]]
+    plan = coarse.shimmings[0].plan
+    # the same images before the shims, so the same plane
+    np.testing.assert_array_equal(plan.change, fine.shimmings[0].plan.change)
+    assert np.max(np.abs(plan.rounded_change - plan.change)) <= 25e-6
+    places = np.array([site.place for site in bench.sites])
+    predicted = fine.shimmings[0].plan.focus_error(places) - plan.focus_error(places)
+    found = coarse.states[1].true_defocus - fine.states[1].true_defocus
+    # the plan's plane is at the nominal places; the chips stand up to 1 mm beside them, on slopes of 0.1 mrad
+    np.testing.assert_allclose(predicted, found, rtol=0.0, atol=0.2e-6)
+    assert np.max(np.abs(found)) > 3e-6
+
+
+def test_a_second_round_goes_on_from_the_first(coarse) -> None:
+    assert len(coarse.states) == 3
+    first, second = (s.plan for s in coarse.shimmings)
+    assert first.thickness is not None
+    assert second.thickness is not None
+    np.testing.assert_allclose(second.thickness - second.rounded_change, first.thickness, rtol=0.0, atol=1e-12)
+    # what is left to do is what rounding left, and what the first plane was wrong by
+    wrong = np.sqrt(np.diag(first.change_covariance))
+    assert np.all(np.abs(second.change) < 25e-6 + 5.0 * wrong)
+    for state in coarse.states[1:]:
+        assert np.max(np.abs(state.true_defocus)) < CONFOCAL
+        assert abs(state.true_level) < LEVEL
+
+
+def test_sense_of_the_motion(bench) -> None:
+    """A CCD 80 um downstream of best focus sees the edge sharply when the target is moved along the light, which takes
+    the image downstream as well, and not when it is moved against it.
+    """
+    number = next(i for i, site in enumerate(bench.sites) if site.band == "P" and site.field == 0.0)
+    site = bench.sites[number]
+    patterns = {name: ccd.pattern(np.random.SeedSequence(1)) for name, ccd in bench.ccds.items()}
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, site.best + 80e-6]))
+    standing = Standing(pose, dict.fromkeys(bench.ccds, 0.0))
+    assert site.defocus(pose, 0.0) == pytest.approx(80e-6, abs=1e-12)
+    recorder = Recorder(bench, standing, np.random.SeedSequence(2), patterns)
+    move = 80e-6 / site.nominal_per_shift[TRACK]
+    there, here, away = (recorder.measure(number, TRACK, shift, 0)[0] for shift in (move, 0.0, -move))
+    assert there > here + 0.02 > away + 0.04
+    # the line turns about +Z' from +Y' toward -X'
+    turned = rotation_matrix(np.array([0.0, 0.0, 5.0 * ARCMIN]))
+    assert turned[0, 1] < 0.0
+    assert line_turn(Pose(turned)) == pytest.approx(5.0 * ARCMIN, abs=1e-15)
+
+
+def test_what_cannot_be_done_names_the_key(bench, backend) -> None:
+    setup = bench.setup
+    spec = setup.test.mount
+    line = spec.model_copy(update={"holes": ((-0.1, 0.0, 0.0), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0))})
+    with pytest.raises(BenchError, match="on one line") as caught:
+        mount_of(setup.test.model_copy(update={"mount": line}))
+    assert caught.value.key == ("mount", "holes")
+
+    mount = mount_of(setup.test)
+    present = np.full(len(spec.holes), spec.thickness)
+    far = RigidMotion.of([0.0, 0.0, 0.02], np.zeros(3))  # holes 3 mm around, at 150 mm
+    with pytest.raises(BenchError, match=r"slide hole_\d by 3\.\d+ mm .*, the screws allow 1 mm") as caught:
+        plan_shims(far, mount, present)
+    assert caught.value.key == ("mount", "clearance")
+    low = RigidMotion.of(np.zeros(3), [0.0, 0.0, -1e-3])
+    with pytest.raises(BenchError, match=r"hole 0 would get -0\.5") as caught:
+        plan_shims(low, mount, np.full(4, 0.45e-3))
+    assert caught.value.key == ("mount", "thickness")
+
+    narrow = setup.test.collimator.model_copy(update={"aperture": 0.5})
+    test = setup.test.model_copy(update={"collimator": narrow})
+    with pytest.raises(BenchError, match=r"beam is \d+ mm wide .* aperture 500 mm") as caught:
+        run_focus(setup.model_copy(update={"test": test}), backend, 1, silent)
+    assert caught.value.key == ("collimator", "aperture")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one alignment of many leaves behind.
+
+    Attributes:
+        error: (3,) measured minus true plane: piston and slopes.
+        covariance: (3, 3) predicted.
+        measured, true: (2, N) defocus before and after, metres.
+        sigma: (2, N) of the measured one.
+        level: (2,) true, radians.
+    """
+
+    error: np.ndarray
+    covariance: np.ndarray
+    measured: np.ndarray
+    true: np.ndarray
+    sigma: np.ndarray
+    level: np.ndarray
+
+
+_bench: FocusBench | None = None
+
+
+def start_worker() -> None:
+    """Build the full bench once in every process."""
+    global _bench
+    _bench = FocusBench(resolve_focus(FILE), load_backend("llvm"))
+
+
+def outcome(seed: int) -> Outcome:
+    """One alignment on the process's bench."""
+    assert _bench is not None
+    done = align(_bench, seed)
+    plane = done.shimmings[0].plane
+    return Outcome(
+        np.array([plane.piston, plane.slope_x, plane.slope_y]) - done.true_plane(0),
+        done.shimmings[0].covariance,
+        np.array([state.defocus for state in done.states]),
+        np.array([state.true_defocus for state in done.states]),
+        np.array([state.defocus_sigma for state in done.states]),
+        np.array([state.true_level for state in done.states]),
+    )
+
+
+def many_outcomes() -> list[Outcome]:
+    """Fifty alignments; a spawned process does not inherit the threads of this one."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(PROCESSES, context, start_worker) as pool:
+        return list(pool.map(outcome, MANY))
+
+
+def judge(outcomes: list[Outcome]) -> None:
+    """What must hold of many alignments."""
+    confocal = np.array([np.max(np.abs(o.true[1])) for o in outcomes])
+    level = np.array([abs(o.level[1]) for o in outcomes])
+    # nearly all of them began outside
+    assert np.mean([np.max(np.abs(o.true[0])) > CONFOCAL for o in outcomes]) > 0.9
+    assert np.mean((confocal < CONFOCAL) & (level < LEVEL)) >= 0.95
+    # measured confocal error against the true one: the largest of 25 is off by less than four sigma of a single site
+    for o in outcomes:
+        measured, true = (np.max(np.abs(v[1])) for v in (o.measured, o.true))
+        assert abs(measured - true) < 4.0 * np.hypot(np.max(o.sigma[1]), VERTEX_ERROR)
+    # the plane's sigma: the slopes have noise alone, and the piston noise and an error common to all alignments
+    error = np.array([o.error for o in outcomes])
+    noise = np.array([np.diag(o.covariance) for o in outcomes]) - [VERTEX_ERROR**2, 0.0, 0.0]
+    common = np.average(error[:, 0], weights=1.0 / noise[:, 0])
+    assert abs(common) < 2.0 * VERTEX_ERROR
+    freedom = np.array([len(outcomes) - 1, len(outcomes), len(outcomes)])
+    total = np.sum((error - [common, 0.0, 0.0]) ** 2 / noise, axis=0)
+    low, high = chi2.ppf(np.array([[FALSE_ALARM], [1.0 - FALSE_ALARM]]), freedom)
+    assert np.all((low < total) & (total < high)), (low, total, high)
+
+
+@pytest.mark.slow
+def test_fifty_random_missettings() -> None:
+    """Rotations of 3, 10 and 3 arcmin and a piston of 0.3 mm, one sigma each, with all bands and fields."""
+    judge(many_outcomes())

@@ -1,0 +1,197 @@
+"""Test targets in the main job: files, mtf.json, the report, and errors that say what to change."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+import tifffile
+import yaml
+
+import twin.render as command
+from analysis.slanted_edge import measure_edge
+from scenes.job import JobSpec
+from scenes.load import EXAMPLES, LIBRARY
+from scenes.resolved import resolve, resolve_job
+from tests.twin.commands import files, invoke
+from twin.experiment import MonitorExperiment
+from twin.target_images import DIRECTIONS, PLACES
+from twin.target_measurement import render_targets
+
+run = partial(invoke, command.app)
+PITCH, FRAMES, REGION = 7e-6, 4, 112
+STATES = ("before", "after")
+NAMES = ("knife_edge_along", "knife_edge_track")
+IMAGES = {f"images/one_{p}_{n}_{t}" for p in PLACES for n in NAMES for t in STATES}
+# false alarms of one in a million, two-sided, of some 12 comparisons
+FAR = 5.3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A run of an instrument with one camera: M2 moves, and the camera turns by 2 arcsec about X."""
+    place = tmp_path_factory.mktemp("targets")
+    instrument = yaml.safe_load((LIBRARY / "instruments" / "gf7_pair.yaml").read_text())
+    instrument["name"], instrument["cameras"] = "single", {"one": instrument["cameras"]["forward"]}
+    del instrument["baffles"]
+    (place / "single.yaml").write_text(yaml.safe_dump(instrument))
+    (place / "job.yaml").write_text(
+        "instrument: single.yaml\n"
+        "perturb:\n"
+        "  base/one: {rotate: [2 arcsec, 0 arcsec, 0 arcsec]}\n"
+        "  base/one/M2: {shift: [0 um, 0 um, 30 um]}\n"
+        f"render: {{images: [knife_edge], frames: 2, targets: {{frames: {FRAMES}}}}}\n"
+    )
+    done = run(place / "job.yaml", "--out", place / "run")
+    assert done.exit_code == 0, done.output
+    (place / "said.txt").write_text(done.stdout)
+    return place
+
+
+@pytest.fixture(scope="module")
+def mtf(folder):
+    return json.loads((folder / "run" / "mtf.json").read_text())
+
+
+def test_files(folder):
+    found = files(folder / "run")
+    assert {f"{image}.tiff" for image in IMAGES} | {f"{image}.png" for image in IMAGES} | {"mtf.json"} <= found
+    assert {"images/one_left_before.tiff", "recovered.json"} <= found  # the spots are always rendered
+    pages = tifffile.imread(folder / "run" / "images" / "one_left_knife_edge_track_after.tiff")
+    assert pages.dtype == np.uint16
+    assert pages.shape == (FRAMES, REGION, REGION)
+    # dark above, white at 60% of the well below: 0.6 x 16000 DN on the black level of 100 DN
+    assert pages[:, :30].max() < 300
+    assert pages[:, -30:].mean() == pytest.approx(9700.0, rel=0.01)
+
+
+def test_measured_agrees_with_truth(mtf):
+    assert mtf["frames"] == FRAMES
+    camera, truth = mtf["cameras"]["one"], mtf["truth"]["cameras"]["one"]
+    assert camera["band"] == "P"
+    assert camera["nyquist_per_mm"] == pytest.approx(1.0 / 14e-3, rel=1e-12)
+    assert list(camera["places"]) == ["left", "centre", "right"]
+    assert camera["places"]["left"]["along_mm"] > 100.0  # left is +Y', near the end of a line of 229 mm
+    for place in PLACES:
+        for direction in DIRECTIONS:
+            for when in STATES:
+                found, true = (side["places"][place][direction][when] for side in (camera, truth))
+                assert abs(found["mtf_nyquist"] - true["mtf_nyquist"]) < FAR * found["mtf_nyquist_sigma"] + 5e-4
+                assert 0.0 <= found["mtf_nyquist_noise_bias"] < 1e-3
+                # one sigma at full light; the report's curve is no line of guesses
+                assert found["mtf_nyquist_sigma"] < 4e-3
+                assert found["curve"]["frequency_per_mm"] == true["curve"]["frequency_per_mm"]
+                assert found["curve"]["frequency_per_mm"][32] == pytest.approx(1.0 / 14e-3, rel=1e-12)
+                assert found["curve"]["mtf"][32] == pytest.approx(found["mtf_nyquist"], rel=1e-9)
+                assert true["curve"]["mtf"][0] == pytest.approx(1.0, abs=1e-9)
+            drop = [truth["places"][place][direction][when]["mtf_nyquist"] for when in STATES]
+            assert drop[1] < 0.95 * drop[0]  # 30 um of M2 defocus the camera
+
+
+def test_image_shift_is_where_the_edge_went(folder, mtf):
+    """Edges measured in the files, and the columns of their windows on the line, move as the chief rays do."""
+    for place in PLACES:
+        true = mtf["truth"]["cameras"]["one"]["places"][place]["image_shift_um"]
+        # 2 arcsec about X: f_y theta = 53.4 um toward -Y'; M2 adds a change of scale, at most 3 um at the line's ends
+        assert true["along"] == pytest.approx(-53.4, abs=3.5)
+        places, sigmas = [], []
+        for when in STATES:
+            image = tifffile.imread(folder / "run" / "images" / f"one_{place}_knife_edge_along_{when}.tiff")
+            edge = measure_edge(image.mean(axis=0))
+            places.append(edge.position + mtf["cameras"]["one"]["places"][place]["columns"][when])
+            sigmas.append(edge.position_sigma)
+        moved, sigma = 1e6 * PITCH * np.diff(places)[0], 1e6 * PITCH * np.hypot(*sigmas)
+        # the window's middle row is up to half a pixel off the chief ray, where the edge at 5 deg stands 0.3 um beside
+        # it; coma moves the edge against the chief ray
+        assert moved == pytest.approx(true["along"], abs=FAR * sigma + 0.7)
+
+
+def test_terminal_and_report(folder, mtf):
+    said = (folder / "said.txt").read_text()
+    truth = mtf["truth"]["cameras"]["one"]["places"]
+    for direction in DIRECTIONS:
+        before, after = (truth["centre"][direction][when]["mtf_nyquist"] for when in STATES)
+        assert f"{before:.3f} -> {after:.3f}" in said
+    page = (folder / "run" / "report.html").read_text()
+    for direction in DIRECTIONS:
+        for when in STATES:
+            value = mtf["cameras"]["one"]["places"]["right"][direction][when]["mtf_nyquist"]
+            cell = page.split(f'data-key="mtf.one.right.{direction}.{when}.edge">')[1]
+            assert cell.startswith(f"{value:.4f}")
+    assert "Test targets and MTF" in page
+
+
+def test_config_repeats_the_run(folder, mtf, backend):
+    again = resolve(folder / "run" / "config.yaml")
+    assert again.job.render.images == ("spots", "knife_edge")
+    assert again.line_detectors["gf7"].name == "gf7_pan"
+    assert again.to_yaml() == (folder / "run" / "config.yaml").read_text()
+    experiment = MonitorExperiment(again, backend)
+    repeated = render_targets(again, experiment.instrument, backend, experiment.state(again.job), 1)
+    images = {stem: frames for stem, _, frames in repeated.images()}
+    for name in IMAGES:
+        np.testing.assert_array_equal(
+            images[name.removeprefix("images/")], tifffile.imread(folder / "run" / f"{name}.tiff")
+        )
+    assert repeated.to_dict() == mtf
+
+
+def test_jobs_without_targets_are_as_before(gf7_pair):
+    resolved = resolve_job(JobSpec(instrument="gf7_pair"))
+    assert resolved.line_detectors is None
+    text = resolved.to_yaml()
+    assert "line_detectors" not in text
+    assert "targets" not in text
+
+
+@pytest.mark.slow  # 8 s
+def test_what_cannot_be_measured_is_said(folder, tmp_path):
+    """White beyond the well's linear range: no MTF, a warning that says why, and the rest of the run is kept."""
+    text = (folder / "job.yaml").read_text().replace("frames: 4", "frames: 4, white: 100 percent")
+    (tmp_path / "single.yaml").write_text((folder / "single.yaml").read_text())
+    (tmp_path / "job.yaml").write_text(text)
+    done = run(tmp_path / "job.yaml", "--out", tmp_path / "run", "--json")
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)["mtf"]
+    centre = found["cameras"]["one"]["places"]["centre"]["along"]["after"]
+    assert centre["mtf_nyquist"] is None
+    assert centre["curve"] is None
+    assert found["truth"]["cameras"]["one"]["places"]["centre"]["along"]["after"]["mtf_nyquist"] > 0.1
+    warnings = json.loads((tmp_path / "run" / "manifest.json").read_text())["warnings"]
+    assert any("knife edge (along) at the centre of one after" in w and "saturation" in w for w in warnings)
+    assert "not measurable" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("render: {images: [spots, knife_edges]}", "render.images"),
+        ("render: {images: [spots], targets: {white: 10 percent}}", "none is rendered"),
+        ("render: {images: [knife_edge], targets: {angle: 45 deg}}", "render.targets.angle"),
+        ("render: {images: [knife_edge], targets: {region: 8}}", "render.targets.region"),
+        ("render: {images: [bars], targets: {frames: 10000, region: 512}}", "do not fit into memory"),
+        ("render: {images: [bars], frames: 9000}", "render.targets.frames"),
+    ],
+)
+def test_bad_input(tmp_path, text, says):
+    (tmp_path / "job.yaml").write_text(f"instrument: gf7_pair\n{text}\n")
+    done = run(tmp_path / "job.yaml", "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    assert says in done.output
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow  # 35 s: bars of both cameras
+def test_the_example(tmp_path):
+    done = run(EXAMPLES / "targets.yaml", "--out", tmp_path / "run", "--json")
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)["mtf"]
+    for name, camera in found["cameras"].items():
+        for place in PLACES:
+            for direction in DIRECTIONS:
+                for when in STATES:
+                    value = camera["places"][place][direction][when]
+                    true = found["truth"]["cameras"][name]["places"][place][direction][when]
+                    assert abs(value["mtf_nyquist"] - true["mtf_nyquist"]) < FAR * value["mtf_nyquist_sigma"] + 5e-4
+                    assert value["bars_mtf"] == pytest.approx(true["bars_mtf"], abs=0.01)
+    assert (tmp_path / "run" / "images" / "backward_right_bars_track_after.tiff").is_file()
