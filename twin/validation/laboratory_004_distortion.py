@@ -135,7 +135,7 @@ def _compensation(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
     low, high = np.percentile(lower, [25.0, 75.0])
     how = (
         f"{len(runs)} tables and tests: RMS error against exact chief rays, compensated over raw. Reductions from "
-        f"{np.min(lower):.0f} to {np.max(lower):.0f} %, half of them between {low:.0f} and {high:.0f} %: it hangs on "
+        f"{np.min(lower):.0f} to {np.max(lower):.0f} %, half of them between {low:.0f} and {high:.0f} %: it depends on "
         "the table. The RMS of the distortion itself, which Table 2 prints, holds the design's distortion of gf7 and "
         f"changes by {-np.median(over_sets):+.1f} % (median; {-np.max(over_sets):+.0f} to {-np.min(over_sets):+.0f} %)."
     )
