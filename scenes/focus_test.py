@@ -39,14 +39,15 @@ class ScanSpec(Spec):
     Attributes:
         reach: the first scan goes from -reach to +reach, metres.
         step: of the first scan, metres.
-        points: of the second scan, about the peak that the first one found.
+        points: of the second scan, about the peak that the first one found; fewer than seven would leave no room for an
+            error of the first.
         depth: half width of the second scan as a share of the defocus at which geometric blur takes all contrast at the
             Nyquist frequency.
     """
 
     reach: PositiveLength
     step: PositiveLength
-    points: Annotated[Whole, Field(ge=5, le=101)] = 9
+    points: Annotated[Whole, Field(ge=7, le=101)] = 9
     depth: Annotated[Number, Field(ge=0.2, le=1.5)] = 0.6
 
 

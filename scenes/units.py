@@ -56,10 +56,13 @@ ANGLE = Kind(
     "an angle", "rad", ("arcsec", "deg", "arcmin", "mas", "mrad", "urad", "rad"), "2 arcsec", ("arcsec", "deg")
 )
 LENGTH = Kind("a length", "m", ("um", "mm", "m", "nm", "pm"), "20 um", ("um", "mm", "m", "nm"))
+DISTANCE = Kind("a length", "m", ("km", "m", "mm"), "500 km", ("km", "m"))
+"""How far away something is, as against the size of a part: kilometres come first."""
 SCALE = Kind("a relative change", "", ("ppm", "percent", "um/m"), "10 ppm", ("ppm", "percent"))
 TIME = Kind("a time", "s", ("ms", "s", "us"), "10 ms", ("ms", "s"))
 MOMENT = Kind("a time", "s", ("min", "h", "s"), "12 min", ("min", "h", "s"))
 """When something is, as against how long it takes: minutes and hours come first."""
+SPEED = Kind("a speed", "m/s", ("m/s", "km/s", "mm/s"), "7.6 km/s", ("m/s", "km/s", "mm/s"))
 POWER = Kind("a power", "W", ("mW", "W", "uW", "nW"), "1 mW", ("mW", "W"))
 TEMPERATURE = Kind("a temperature", "K", ("degC", "K"), "20 degC", ("degC", "K"))
 TEMPERATURE_DIFFERENCE = Kind("a temperature difference", "K", ("K", "mK"), "0.1 K")
@@ -69,7 +72,7 @@ PER_LENGTH5 = Kind("an inverse length to the fifth", "1/m^5", ("1/m^5", "1/mm^5"
 PER_LENGTH7 = Kind("an inverse length to the seventh", "1/m^7", ("1/m^7", "1/mm^7"), "1e-3 1/m^7")
 TEMPERATURE_GRADIENT = Kind("a temperature gradient", "K/m", ("K/m", "mK/m"), "0.1 K/m")
 KINDS = (
-    *(ANGLE, LENGTH, SCALE, TIME, POWER, TEMPERATURE, TEMPERATURE_GRADIENT),
+    *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, TEMPERATURE, TEMPERATURE_GRADIENT),
     *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
 )
 

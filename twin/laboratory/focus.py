@@ -21,7 +21,16 @@ from optics.rotation import about_axis, rotation_matrix
 from twin.detector import FixedPattern
 from twin.laboratory.bench_error import BenchError
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_scan import VERTEX_ERROR, NyquistMtf, Recorder, SiteScan, Standing, in_focus, scan
+from twin.laboratory.focus_scan import (
+    VERTEX_ERROR,
+    VERTEX_TREND,
+    NyquistMtf,
+    Recorder,
+    SiteScan,
+    Standing,
+    in_focus,
+    scan,
+)
 from twin.laboratory.result import Advance, silent
 
 if TYPE_CHECKING:
@@ -71,9 +80,12 @@ class Shimming:
     @property
     def covariance(self) -> np.ndarray:
         """(3, 3) of piston, slope_x and slope_y against the true plane: noise and the vertices' own error."""
-        out = np.array(self.plane.noise_covariance)
-        out[0, 0] += VERTEX_ERROR**2
-        return out
+        return self.plane.noise_covariance + np.diag(self.systematic**2)
+
+    @property
+    def systematic(self) -> np.ndarray:
+        """(3,) part of the sigmas that is the same in every alignment of a camera: the vertices' own error."""
+        return np.array([VERTEX_ERROR, *(VERTEX_TREND / np.max(np.abs(self.plane.place), axis=0))])
 
 
 @dataclass(frozen=True, eq=False)

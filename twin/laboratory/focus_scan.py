@@ -23,7 +23,11 @@ NYQUIST = 0.5
 
 VERTEX_ERROR = 0.5e-6
 """Error that the form of the curve near its peak leaves in all vertices alike, metres, one sigma: wavefronts of 0.2
-waves shift them by so much."""
+waves shift them by so much. Without noise the vertices of the example are up to 0.6 um off."""
+
+VERTEX_TREND = 0.15e-6
+"""By how much this error changes from the middle to the ends of the line and of the bands, metres, one sigma, since the
+wavefront and the wavelength do."""
 
 _OFFSET, _FRAMES, _PATTERN = range(3)
 _COARSE = 4

@@ -196,7 +196,7 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
     for size in (lambda v: np.sqrt(np.mean(v**2, axis=1)), lambda v: np.mean(v, axis=1), lambda v: np.max(v, axis=1)):
         before, after = size(raw), size(compensated)
         values = np.median(before), np.median(after), np.median(100.0 * (1.0 - after / before))
-        out += [round(float(values[0]), 3), round(float(values[1]), 3), round(float(values[2]), 1)]
+        out += [f"{values[0]:.3f}", f"{values[1]:.3f}", f"{values[2]:.1f}"]
     return out
 
 

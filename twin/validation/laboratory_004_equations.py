@@ -138,4 +138,4 @@ def _constant(context: Context, turn: Array, where: Array) -> CheckResult:
     return context.check("004.eq1.constant").judge(UM * error, None, how, None, [reason])
 
 
-GROUP = CheckGroup("004.equations", "Interior orientation and distortion: equations (section 3.1)", 2.0, CHECKS, run)
+GROUP = CheckGroup("004.equations", "Interior orientation and distortion: equations (section 3.1)", 1.0, CHECKS, run)

@@ -185,10 +185,10 @@ def _table(tables: Sequence[FittedTable]) -> Table:
         rows.append(
             [
                 FIT_NAMES[name],
-                round(float(np.mean(ranks[name])), 2),
+                f"{np.mean(ranks[name]):.2f}",
                 int(np.sum(ranks[name] == 1.0)),
-                round(float(np.median(values)), 4),
-                round(float(np.max(values)), 4),
+                f"{np.median(values):.4f}",
+                f"{np.max(values):.4f}",
             ]
         )
     return Table(

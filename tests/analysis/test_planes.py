@@ -1,0 +1,507 @@
+"""Planes and angles of three CCD lines from ground points (paper 000). The geometry is built here from the orbit's
+elements, the WGS84 ellipsoid and rays turned by OpenCV's rotations; no plane is fitted in making it.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.orbit.angles import (
+    AngleError,
+    angles_between,
+    arccos_rounding,
+    central_ray,
+    dihedral_angle,
+    height_error,
+    intersection_angles,
+    look_angle,
+    off_axis_angle,
+)
+from analysis.orbit.planes import METHODS, NearVerticalWarning, PlaneError, Station, Strip, fit_plane
+
+FALSE_ALARM = 1e-6
+ARCSEC = np.pi / 648000
+DEG = np.pi / 180
+LOOK = 25 * DEG
+LINES = {"forward": LOOK, "nadir": 0.0, "aft": -LOOK}
+# WGS84, and the Earth's rate (IERS conventions)
+A, F, RATE, GM = 6378137.0, 1 / 298.257223563, 7.292115e-5, 3.986004418e14
+
+
+def rotation(vector):
+    return cv2.Rodrigues(np.asarray(vector, dtype=np.float64))[0]
+
+
+def enu(lon, lat):
+    """Rows: east, north, up of the ellipsoid in ECEF."""
+    sl, cl, sp, cp = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
+    return np.array([[-sl, cl, 0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One moment of a pass. body: columns X flight, Y, Z down of the body in ECEF; looks: line -> (n,) tangents."""
+
+    station: np.ndarray
+    body: np.ndarray
+    points: dict
+    tangents: dict
+    up: np.ndarray
+
+    def strips(self, noise, turn=None):
+        turn = np.eye(3) if turn is None else turn
+        return [Strip.of(p @ turn.T, noise) for p in self.points.values()]
+
+
+def descending_pass(
+    lon=116 * DEG, lat=40 * DEG, height=500e3, inclination=97.4 * DEG, yaw=True, n=20, relief=1000.0, seed=0,
+    looks=LINES, twist=0.0, offset=0.0, half_width=0.06,
+):  # fmt: skip
+    """Nadir-pointing satellite above (lon, lat) on the way south; X along the ground velocity (yaw) or the inertial.
+
+    twist: turn of the forward line about its own line of sight. offset: tangent of its centre across the track.
+    """
+    east, north, up = axes = enu(lon, lat)
+    radius = A / np.sqrt(1 - F * (2 - F) * np.sin(lat) ** 2)
+    station = radius * np.array([1, 1, (1 - F) ** 2]) * up + height * up
+    r = np.linalg.norm(station)
+    latitude = np.arcsin(station[2] / r)
+    # heading of the orbit plane: cos i = cos(geocentric latitude) sin(azimuth)
+    speed, azimuth = np.sqrt(GM / r), np.pi - np.arcsin(np.cos(inclination) / np.cos(latitude))
+    velocity = speed * (np.sin(azimuth) * east + np.cos(azimuth) * north)
+    if yaw:
+        velocity = velocity - np.cross([0, 0, RATE], station)
+    down = -axes[2]
+    forward = velocity - (velocity @ down) * down
+    forward /= np.linalg.norm(forward)
+    body = np.column_stack([forward, np.cross(down, forward), down])
+    rng = np.random.default_rng(seed)
+    points, tangents = {}, {}
+    for name, look in looks.items():
+        w = np.sort(rng.uniform(-half_width, half_width, n))
+        ray = np.column_stack([np.zeros(n), w, np.ones(n)])
+        if name == "forward":
+            ray = ray @ rotation([0, 0, twist]).T
+            ray[:, 1] += offset * ray[:, 2]
+        ray = ray @ rotation([0, look, 0]).T @ body.T
+        points[name] = station + ray * range_to(station, ray, rng.uniform(0, relief, n))[:, None]
+        tangents[name] = w
+    return Pass(station, body, points, tangents, up)
+
+
+def range_to(origin, ray, relief):
+    """Multiples of `ray` (n, 3) that reach an ellipsoid with axes longer by `relief` (n,)."""
+    scale = 1 / np.column_stack([A + relief, A + relief, A * (1 - F) + relief])
+    o, d = origin * scale, ray * scale
+    a, b, c = np.sum(d * d, 1), np.sum(o * d, 1), np.sum(o * o, 1) - 1
+    return (-b - np.sqrt(b * b - a * c)) / a
+
+
+def fits(scene, method="tls", noise=1.5, sigma_station=0.5, turn=None):
+    turn = np.eye(3) if turn is None else turn
+    station = Station.of(turn @ scene.station, sigma_station)
+    return [fit_plane(station, strip, method) for strip in scene.strips(noise, turn)]
+
+
+def noisy(scene, rng, sigma_point, sigma_station):
+    """A measured copy of the scene."""
+    return Pass(
+        scene.station + sigma_station * rng.standard_normal(3),
+        scene.body,
+        {k: p + sigma_point * rng.standard_normal(p.shape) for k, p in scene.points.items()},
+        scene.tangents,
+        scene.up,
+    )
+
+
+def bounds(statistic, freedom):
+    return FALSE_ALARM / 2 < stats.chi2.sf(statistic, freedom) < 1 - FALSE_ALARM / 2
+
+
+def orbital(scene):
+    """ECEF to X forward, Y, Z down: the nadir plane is exactly vertical."""
+    return scene.body.T
+
+
+SCENE = descending_pass()
+
+
+def test_the_scene_is_what_it_says():
+    """Swath 60 km, descending, heading of a sun-synchronous orbit, look angles by construction."""
+    nadir = SCENE.points["nadir"]
+    assert 45e3 < np.linalg.norm(nadir[-1] - nadir[0]) < 62e3
+    east, north, _ = enu(116 * DEG, 40 * DEG) @ SCENE.body[:, 0]
+    assert north < 0
+    # 9.7 deg west of south in inertial space, some 2.8 deg more over the rotating Earth
+    assert np.degrees(np.arctan2(-east, -north)) == pytest.approx(12.4, abs=0.3)
+    assert SCENE.body[:, 2] @ SCENE.up == pytest.approx(-1, abs=1e-15)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_look_angles_without_errors(method):
+    """1e-4 arcsec asked; ECEF coordinates of 7e6 m are rounded to 1e-9 m, over 20 points and 500 km 1e-9 arcsec."""
+    angles = intersection_angles(*fits(SCENE, method))
+    assert np.abs(angles.values - LOOK).max() < 1e-8 * ARCSEC
+    assert np.abs(angles.printed - LOOK).max() < 1e-8 * ARCSEC
+    assert not angles.folded
+
+
+def test_printed_equation_turns_every_plane_by_half_a_turn_about_z():
+    """Noise or not, the printed normals are the corrected ones turned by pi about z: equal angles, another plane."""
+    scene = noisy(SCENE, np.random.default_rng(3), 2.0, 1.0)
+    printed, corrected = fits(scene, "printed"), fits(scene, "corrected")
+    half = rotation([0, 0, np.pi])
+    for one, other in zip(printed, corrected, strict=True):
+        assert one.normal == pytest.approx(half @ other.normal, abs=1e-14)
+        assert one.covariance == pytest.approx(half @ other.covariance @ half.T, abs=1e-24)
+        # both pass through the station, but only one through the ground points
+        a0, a1, a2 = one.coefficients
+        x, y, z = one.station.position
+        assert a0 * x + a1 * y + a2 == pytest.approx(z, abs=1e-8)
+        assert np.abs(other.residual).max() < 10.0
+        assert np.abs(one.residual).min() > 100e3
+        assert one.p_value < FALSE_ALARM < other.p_value
+    a, b = intersection_angles(*printed), intersection_angles(*corrected)
+    assert a.values == pytest.approx(b.values, abs=1e-14)
+    assert a.covariance == pytest.approx(b.covariance, rel=1e-9)
+    with pytest.raises(AngleError, match="printed and a corrected"):
+        intersection_angles(printed[0], corrected[1], printed[2])
+
+
+def test_coefficients_solve_the_papers_least_squares():
+    """a0, a1 against NumPy's lstsq of eq. 2 in undivided coordinates."""
+    scene = noisy(SCENE, np.random.default_rng(4), 2.0, 1.0)
+    for fit in fits(scene, "corrected"):
+        arm = fit.strip.points - fit.station.position
+        expected = np.linalg.lstsq(arm[:, :2], arm[:, 2], rcond=None)[0]
+        assert fit.coefficients[:2] == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("sigma_station", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_scatter_agrees_with_sigma(method, sigma_station):
+    """400 draws: chi-square of (alpha, beta) with their covariance, and of the residuals; false alarm 1e-6 each."""
+    rng = np.random.default_rng([5, int(10 * sigma_station)])
+    total, residual = 0.0, 0.0
+    for _ in range(400):
+        planes = fits(noisy(SCENE, rng, 1.5, sigma_station), method, 1.5, sigma_station)
+        angles = intersection_angles(*planes)
+        error = angles.values - LOOK
+        total += error @ np.linalg.solve(angles.covariance, error)
+        residual += sum(plane.chi_square for plane in planes)
+    assert bounds(total, 800)
+    if method == "tls":
+        assert bounds(residual, 400 * 3 * 18)
+    # the nadir plane turns both angles oppositely
+    assert angles.covariance[0, 1] < 0
+
+
+def test_sigma_by_hand():
+    """Station exact, n points: the pitch of a plane is known to sigma / (range sqrt n), so alpha to the root of two."""
+    angles = intersection_angles(*fits(SCENE, noise=1.5, sigma_station=0.0))
+    nadir, oblique = (1.5 / (np.linalg.norm(SCENE.points[k] - SCENE.station, axis=1).mean() * np.sqrt(20))
+                      for k in ("nadir", "forward"))  # fmt: skip
+    # points are not quite even about the middle, so their yaw error leaks a little into the pitch of each plane
+    assert angles.sigma[0] == pytest.approx(np.hypot(nadir, oblique), rel=0.1)
+    assert angles.covariance[0, 1] == pytest.approx(-(nadir**2), rel=0.1)
+    # the station alone, with exact points: vectors n_f / R_f - n_n / H, so 1 m gives 1 / H at least across one plane
+    # (not much better than 1 m: exact points on relief would fix the planes without the station)
+    planes = fits(SCENE, noise=0.05, sigma_station=1.0)
+    both = intersection_angles(*planes)
+    slope = [SCENE.body @ rotation([0, look, 0])[:, 0] for look in LINES.values()]
+    reach = [1 / np.linalg.norm(p - SCENE.station, axis=1).mean() for p in SCENE.points.values()]
+    forward, down, aft = (s * r for s, r in zip(slope, reach, strict=True))
+    assert both.sigma[0] == pytest.approx(np.linalg.norm(forward - down), rel=0.02)
+    assert both.covariance[0, 1] == pytest.approx((forward - down) @ (down - aft), rel=0.05)
+
+
+def test_full_covariances():
+    """Errors ten times larger in height than in plan, and different from point to point. 300 draws match the sigmas,
+    and the normal minimises the weighted distances, whose weights turn with it (gradient by differences).
+    """
+    rng = np.random.default_rng(6)
+    local = enu(116 * DEG, 40 * DEG)
+    point = local.T @ np.diag([0.5, 0.5, 5.0]) ** 2 @ local * rng.uniform(0.3, 3, 20)[:, None, None]
+    place = local.T @ np.diag([0.2, 0.4, 1.0]) ** 2 @ local
+    root_point, root_place = np.linalg.cholesky(point), np.linalg.cholesky(place)
+    total, residual = 0.0, 0.0
+    for _ in range(300):
+        station = SCENE.station + root_place @ rng.standard_normal(3)
+        points = [p + np.einsum("nij,nj->ni", root_point, rng.standard_normal((20, 3))) for p in SCENE.points.values()]
+        planes = [fit_plane(Station.of(station, place), Strip.of(p, point)) for p in points]
+        angles = intersection_angles(*planes)
+        error = angles.values - LOOK
+        total += error @ np.linalg.solve(angles.covariance, error)
+        residual += sum(plane.chi_square for plane in planes)
+    assert bounds(total, 600)
+    assert bounds(residual, 300 * 3 * 18)
+
+    def objective(normal, arm):
+        normal = normal / np.linalg.norm(normal)
+        spread = np.diag(np.einsum("i,nij,j->n", normal, point, normal)) + normal @ place @ normal
+        return arm @ normal @ np.linalg.solve(spread, arm @ normal)
+
+    for plane in planes:
+        arm = plane.strip.points - plane.station.position
+        values, axes = np.linalg.eigh(plane.covariance)
+        for variance, axis in zip(values[1:], axes.T[1:], strict=True):
+            step = np.sqrt(variance) * axis
+            ends = [objective(plane.normal + sign * step, arm) for sign in (1, -1)]
+            # a parabola of unit curvature per sigma: its lowest point lies at this many sigmas
+            assert abs(ends[0] - ends[1]) / 4 < 1e-3
+            assert sum(ends) / 2 - plane.chi_square == pytest.approx(1.0, abs=0.01)
+
+
+def test_both_ways_of_total_least_squares_agree():
+    """Isotropic errors by the singular vector; all but isotropic ones by Gauss-Helmert steps."""
+    scene = noisy(SCENE, np.random.default_rng(7), 1.5, 0.5)
+    nearly = np.diag([2.25, 2.25, 2.25 * (1 + 1e-12)])
+    iterated = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["aft"], nearly))
+    direct = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["aft"], 1.5))
+    assert iterated.normal == pytest.approx(direct.normal, abs=1e-13)
+
+
+def test_weights():
+    """A point with a sigma of 100 instead of 1 hardly counts when it is moved, by 1e-4 of the weight."""
+    station = Station.of(SCENE.station)
+    sigma = np.full(20, 1.0)
+    sigma[7] = 100.0
+    points = SCENE.points["forward"].copy()
+    good = fit_plane(station, Strip.of(points, sigma)).normal
+    points[7] += 100.0 * good
+    moved = fit_plane(station, Strip.of(points, sigma)).normal
+    alone = fit_plane(station, Strip.of(points, 1.0)).normal
+    assert np.linalg.norm(moved - good) < 2e-3 * np.linalg.norm(alone - good)
+
+
+def test_frames_agree_for_total_least_squares_only():
+    """One noisy pass in ECEF, in a local frame 5 deg away and in the nearly orbital frame. Explicit forms minimise
+    another distance in each frame: they differ by far more than the 1e-6 arcsec that total least squares keeps.
+    """
+    scene = noisy(SCENE, np.random.default_rng(8), 2.0, 0.5)
+    turns = [np.eye(3), enu(120 * DEG, 44 * DEG), orbital(scene)]
+    tls = [intersection_angles(*fits(scene, "tls", 2.0, turn=turn)) for turn in turns]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NearVerticalWarning)
+        explicit = [intersection_angles(*fits(scene, "corrected", 2.0, turn=turn)) for turn in turns]
+    assert max(np.abs(a.values - tls[0].values).max() for a in tls) < 1e-6 * ARCSEC
+    assert max(np.abs(a.covariance / tls[0].covariance - 1).max() for a in tls) < 1e-9
+    difference = [np.abs(a.values - tls[0].values).max() / ARCSEC for a in explicit]
+    assert 1e-5 < difference[0] < 0.05  # ECEF: harmless beside a sigma of 0.2 arcsec, but not zero
+    assert difference[2] > 1.0
+
+
+def test_nearly_vertical_plane_is_announced():
+    """Orbital frame and local frame of the station: the nadir plane is vertical but for noise. Condition, bias and a
+    warning say so; ECEF at 40 N is safe, and total least squares needs no warning anywhere.
+    """
+    scene = noisy(SCENE, np.random.default_rng(9), 2.0, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        safe = fits(scene, "corrected", 2.0)
+        fits(scene, "tls", 2.0, turn=orbital(scene))
+    assert not any(plane.near_vertical for plane in safe)
+    for turn in (orbital(scene), enu(116 * DEG, 40 * DEG)):
+        station = Station.of(turn @ scene.station, 0.5)
+        for name, strip in zip(LINES, scene.strips(2.0, turn), strict=True):
+            if name == "nadir":
+                with pytest.warns(NearVerticalWarning, match="nearly vertical"):
+                    plane = fit_plane(station, strip, "corrected")
+                assert plane.near_vertical
+                # noise is what the weakest direction of eq. 5 consists of
+                assert plane.attenuation > 0.2
+                assert plane.condition > 1e4 * max(p.condition for p in safe)
+            else:
+                assert not fit_plane(station, strip, "corrected").near_vertical
+    # without noise nothing is left in that direction
+    for method in ("printed", "corrected"):
+        with pytest.raises(PlaneError, match="vertical in this frame"):
+            fits(Pass(*_local(SCENE, orbital(SCENE))), method)
+    assert intersection_angles(*fits(SCENE, "tls", turn=orbital(SCENE))).values == pytest.approx(LOOK, abs=1e-13)
+
+
+def _local(scene, turn):
+    """The scene in coordinates from the station, so that the nadir plane is x = 0 to the last bit."""
+    points = {k: (p - scene.station) @ turn.T for k, p in scene.points.items()}
+    points["nadir"][:, 0] = 0.0
+    return np.zeros(3), np.eye(3), points, scene.tangents, turn @ scene.up
+
+
+def test_bias_estimate_of_a_steep_plane():
+    """A plane 0.02 deg from the vertical of its frame: the mean error of 4000 explicit fits is the bias that they state
+    (known to first order of the attenuation), within 5 of its standard errors and a tenth.
+    """
+    rng = np.random.default_rng(10)
+    tilt = 0.02 * DEG
+    normal = np.array([np.cos(tilt), 0.0, -np.sin(tilt)])
+    side, along = np.array([0.0, 1.0, 0.0]), np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    arm = (
+        np.linspace(-30e3, 30e3, 12)[:, None] * side - np.linspace(480e3, 520e3, 12)[rng.permutation(12), None] * along
+    )
+    errors, stated = [], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NearVerticalWarning)
+        for _ in range(4000):
+            fit = fit_plane(
+                Station.of([0, 0, 0]), Strip.of(arm + 20.0 * rng.standard_normal(arm.shape), 20.0), "corrected"
+            )
+            errors.append(fit.normal[2] - normal[2])
+            stated.append(fit.bias[2])
+    assert fit.near_vertical
+    mean, spread = np.mean(errors), np.std(errors) / np.sqrt(4000)
+    assert abs(mean) > 10 * spread
+    assert np.mean(stated) == pytest.approx(mean, abs=5 * spread + 0.1 * abs(mean))
+
+
+def test_arccos_loses_small_angles():
+    """Normals at a known small angle: arccos is wrong by up to its stated rounding, and mostly by a good part of it;
+    atan2 keeps all digits.
+    """
+    rng = np.random.default_rng(11)
+    for angle in (1e-2, 1e-4, 1e-6, 1e-7, 1e-9):
+        a = rng.standard_normal((500, 3))
+        a /= np.linalg.norm(a, axis=1)[:, None]
+        side = np.cross(a, rng.standard_normal((500, 3)))
+        side /= np.linalg.norm(side, axis=1)[:, None]
+        b = np.cos(angle) * a + np.sin(angle) * side
+        wrong = np.abs(np.arccos(np.minimum(np.abs(np.sum(a * b, 1)), 1.0)) - angle).max()
+        assert wrong < arccos_rounding(angle)
+        assert wrong > 0.05 * min(arccos_rounding(angle), angle)
+        # components of b are rounded to 1e-16
+        assert np.abs(dihedral_angle(a, b) - angle).max() < 4e-16
+    # at the angles of the cameras either form will do: 1e-9 arcsec
+    assert arccos_rounding(LOOK) < 1e-9 * ARCSEC
+    # an off-axis angle of one arcsecond is uncertain by 4e-5 arcsec
+    assert 1e-5 < arccos_rounding(ARCSEC) / ARCSEC < 1e-4
+
+
+def test_off_axis_angle_of_another_line():
+    """The outlook: a high-resolution line 0.3 deg and a multispectral line 2 deg off the nadir line."""
+    looks = {"forward": 0.3 * DEG, "nadir": 0.0, "aft": -2 * DEG}
+    high, nadir, multispectral = fits(descending_pass(looks=looks))
+    assert off_axis_angle(high, nadir).values[0] == pytest.approx(0.3 * DEG, abs=1e-13)
+    assert off_axis_angle(multispectral, nadir).values[0] == pytest.approx(2 * DEG, abs=1e-13)
+    # near to each other the station's error nearly drops out
+    assert fits_sigma(descending_pass(looks=looks)) < 0.02 * fits_sigma(SCENE)
+    # an angle within its own noise is folded at zero
+    close = descending_pass(looks={"forward": 0.1 * ARCSEC, "nadir": 0.0})
+    assert off_axis_angle(*fits(close)).folded
+
+
+def fits_sigma(scene):
+    """Sigma of alpha from a station wrong by 1 m and exact points, planes through the station as in the paper."""
+    return intersection_angles(*fits(scene, "corrected", noise=1e-3, sigma_station=1.0)).sigma[0]
+
+
+@pytest.mark.parametrize("twist", [0.0, 10 / 60 * DEG, 1 * DEG])
+def test_dihedral_and_look_angle_differ_when_lines_are_not_parallel(twist):
+    """cos(dihedral) = cos(twist) cos(look), by spherical trigonometry; the look angle stays."""
+    scene = descending_pass(twist=twist)
+    forward, nadir, _ = fits(scene)
+    dihedral = angles_between((forward, nadir), ((0, 1),)).values[0]
+    assert dihedral == pytest.approx(np.arccos(np.cos(twist) * np.cos(LOOK)), abs=1e-13)
+    rays = [central_ray(plane, scene.tangents[name]) for plane, name in ((forward, "forward"), (nadir, "nadir"))]
+    assert look_angle(*rays) == pytest.approx(LOOK, abs=1e-12)
+    assert np.abs(rays[0] - scene.body @ [np.sin(LOOK), 0, np.cos(LOOK)]).max() < 1e-12
+    # counted from the other end of the line
+    assert central_ray(forward, -scene.tangents["forward"]) == pytest.approx(rays[0], abs=1e-12)
+    if twist == 10 / 60 * DEG:
+        assert (dihedral - LOOK) / ARCSEC == pytest.approx(1.87, abs=0.01)
+
+
+def test_a_line_that_starts_elsewhere_along_itself_changes_the_look_angle_only():
+    scene = descending_pass(offset=0.01)
+    forward, nadir, _ = fits(scene)
+    assert angles_between((forward, nadir), ((0, 1),)).values[0] == pytest.approx(LOOK, abs=1e-13)
+    # central ray at tan(W) = 0.01 to the side: cos(look) = cos(25 deg) cos(W). Tangents from the line's own foot add
+    shifted = scene.tangents["forward"] + 0.01
+    ray = central_ray(forward, shifted)
+    centre = scene.body @ rotation([0, LOOK, 0]) @ [0, 0.01, 1]
+    assert look_angle(ray, scene.body[:, 2]) == pytest.approx(LOOK, abs=1e-12)
+    side = look_angle(centre, scene.body[:, 2])
+    assert side == pytest.approx(np.arccos(np.cos(LOOK) * np.cos(np.arctan(0.01))), abs=1e-12)
+    assert (side - LOOK) / ARCSEC > 20
+
+
+def test_one_arcsecond_of_angle_is_more_than_five_metres_of_height():
+    """Rays of the forward and the nadir line that meet on the ellipsoid; the forward one is then turned by 1 arcsec and
+    intersected again, by least squares of two lines in space.
+    """
+    ground = SCENE.points["nadir"][10]
+    to_nadir = SCENE.station - ground
+    # an earlier station from which the forward line sees the point: at the same height, 25 deg off its own nadir
+    up = to_nadir / np.linalg.norm(to_nadir)
+    back = -SCENE.body[:, 0]
+    incidence = np.arcsin(np.sin(LOOK) * np.linalg.norm(SCENE.station) / np.linalg.norm(ground))
+    ray = np.cos(incidence) * up + np.sin(incidence) * (back - (back @ up) * up) / np.linalg.norm(
+        back - (back @ up) * up
+    )
+    centre = np.linalg.norm(SCENE.station)
+    b = ground @ ray
+    slant = -b + np.sqrt(b * b - ground @ ground + centre**2)
+    axis = np.cross(ray, up) / np.linalg.norm(np.cross(ray, up))
+    turned = rotation(ARCSEC * axis) @ -ray
+    matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for origin, direction in ((SCENE.station, -up), (ground + slant * ray, turned)):
+        square = np.eye(3) - np.outer(direction, direction)
+        matrix, right = matrix + square, right + square @ origin
+    wrong = abs((np.linalg.solve(matrix, right) - ground) @ up)
+    assert 5.0 < wrong < 7.0
+    # the second order is 1 arcsec / tan(angle), 1e-5; rounding of 7e6 m over 6 m is 1e-9
+    assert wrong == pytest.approx(float(height_error(ARCSEC, slant, incidence)), rel=3e-5)
+    # flat ground: H / (sin a cos a), 6.3 m
+    flat = height_error(ARCSEC, 500e3 / np.cos(LOOK), LOOK)
+    assert flat == pytest.approx(500e3 * ARCSEC / (np.sin(LOOK) * np.cos(LOOK)), rel=1e-12)
+    assert 5.0 < flat < 7.0
+
+
+def test_bad_points():
+    station, points = Station.of(SCENE.station, 0.5), SCENE.points["forward"]
+    for method in METHODS:
+        with pytest.raises(PlaneError, match="three or more points on the strip, found 2"):
+            fit_plane(station, Strip.of(points[:2], 1.0), method)
+        ray = points[0] - SCENE.station
+        with pytest.raises(PlaneError, match="on one line through the station"):
+            fit_plane(station, Strip.of(SCENE.station + np.linspace(0.9, 1, 5)[:, None] * ray, 1.0), method)
+        with pytest.raises(PlaneError, match="at one place"):
+            fit_plane(station, Strip.of(np.repeat(points[:1], 5, axis=0), 1.0), method)
+        # noise of 2 m does not make a strip of one place
+        scatter = points[0] + 2.0 * np.random.default_rng(1).standard_normal((30, 3))
+        with pytest.raises(PlaneError, match="at one place"):
+            fit_plane(station, Strip.of(scatter, 2.0), method)
+    with pytest.raises(PlaneError, match="lies at the station"):
+        fit_plane(station, Strip.of(np.vstack([points, SCENE.station]), 1.0))
+    with pytest.raises(PlaneError, match="method must be one of"):
+        fit_plane(station, Strip.of(points, 1.0), "other")
+    lost = points.copy()
+    lost[3, 1] = np.nan
+    for wrong in (lost, points[:, :2], points[0]):
+        with pytest.raises(PlaneError, match="strip"):
+            Strip.of(wrong, 1.0)
+    for noise in (0.0, -1.0, np.nan, np.ones(7), np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.ones((4, 4))):
+        with pytest.raises(PlaneError, match="strip"):
+            Strip.of(points, noise)
+    with pytest.raises(PlaneError, match="symmetric"):
+        Strip.of(points, np.array([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]))
+    for wrong in ([1.0, 2.0], [np.nan, 0, 0]):
+        with pytest.raises(PlaneError, match="station"):
+            Station.of(wrong)
+
+
+def test_bad_pairs():
+    forward, nadir, _ = fits(SCENE)
+    other = fit_plane(Station.of(SCENE.station + 1.0, 0.5), nadir.strip)
+    with pytest.raises(AngleError, match="one and the same station"):
+        off_axis_angle(forward, other)
+    with pytest.raises(AngleError, match="coincide"):
+        off_axis_angle(nadir, nadir)
+    with pytest.raises(AngleError, match="finite tangents"):
+        central_ray(nadir, [0.0])
+    with pytest.raises(AngleError, match="wrong tangents"):
+        central_ray(nadir, 2 * SCENE.tangents["nadir"])
+    with pytest.raises(AngleError, match="printed plane"):
+        central_ray(fits(SCENE, "printed")[1], SCENE.tangents["nadir"])

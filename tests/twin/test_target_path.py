@@ -1,0 +1,119 @@
+"""Chief rays from directions to the focal plane and back, the senses of the axes, and the pupils."""
+
+import numpy as np
+import pytest
+
+from optics.assembly import points_to_world
+from optics.system import assemble
+from optics.trace import make_rays, trace
+from optics.tree import Motion
+from scenes.camera_under_test import ROOT, build_camera_under_test
+from scenes.collimator import CameraUnderTestSpec, CollimatorSpec
+from scenes.load import load_camera
+from twin.target_path import TargetPath
+
+FOCAL_PLANE = f"{ROOT}/focal_plane"
+PLACES = np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.01], [0.05, -0.01], [-0.03, 0.004]])
+"""(along, across), metres."""
+LONG = 20.0
+
+
+@pytest.fixture(scope="module")
+def path(backend) -> TargetPath:
+    test = build_camera_under_test(CameraUnderTestSpec(camera="gf7"), load_camera("gf7"), backend)
+    collimator = CollimatorSpec(focal_length="20 m", aperture="0.8 m").model  # type: ignore[arg-type]
+    return TargetPath(test.assembly, ROOT, ROOT, test.model, backend, collimator)
+
+
+def test_there_and_back(path) -> None:
+    """Both ways are traced to 1e-12 m on the stop; the image is that much nearer."""
+    np.testing.assert_allclose(path.places({}, path.directions(PLACES)), PLACES, rtol=0.0, atol=1e-12)
+
+
+def test_sense_of_the_axes(path) -> None:
+    """An image at +Y' (+X') is made by light that travels toward +Y (+X) of the camera, whose Z looks at the scene: the
+    target stands at -Y (-X). Both by one focal length.
+    """
+    middle, along, across = path.directions(np.array([[0.0, 0.0], [1e-3, 0.0], [0.0, 1e-3]]))
+    axes = path.assembly.nominal_pose(ROOT).rotation
+    np.testing.assert_allclose(middle, -axes[:, 2], rtol=0.0, atol=1e-12)
+    f_along, f_across = np.abs(np.diag(path.model.first_order.scale[0]))
+    assert (along - middle) @ axes[:, 1] == pytest.approx(1e-3 / f_along, rel=1e-3)
+    assert (across - middle) @ axes[:, 0] == pytest.approx(1e-3 / f_across, rel=1e-3)
+    # the focal-plane frame has its Y along the camera's, and X nearly
+    place = path.assembly.nominal_pose(FOCAL_PLANE).rotation
+    assert place[:, 1] @ axes[:, 1] == pytest.approx(1.0, abs=1e-12)
+    assert place[:, 0] @ axes[:, 0] > 0.99
+
+
+def test_first_order_of_the_map(path) -> None:
+    """Derivative of the chief rays' map in the middle against forward-mode derivatives of the trace at the stop's
+    centre; upright in the target's coordinates.
+    """
+    local = path.local_map({}, path.directions(PLACES[:1])[0], 0.5e-3)
+    scale = path.model.first_order.scale[0]
+    np.testing.assert_allclose(np.diag(local.jacobian) * LONG, np.abs(np.diag(scale)), rtol=1e-9)
+    np.testing.assert_allclose(local.jacobian[[0, 1], [1, 0]] * LONG, 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("number", range(len(PLACES)))
+def test_local_map_between_its_points(path, number: int) -> None:
+    """Chief rays of 40 random directions inside the map's reach, in a bent camera."""
+    state = {f"{ROOT}/M3": Motion(rotate=(3e-5, -2e-5, 0.0), figure={7: 50e-9})}
+    direction = path.directions(PLACES)[number]
+    reach = 2e-3
+    local = path.local_map(state, direction, reach)
+    points = np.random.default_rng(number).uniform(-reach, reach, (40, 2))
+    axes = path.assembly.nominal_pose(ROOT).rotation
+    first = axes[:, 1] - direction * (axes[:, 1] @ direction)
+    first = first / np.linalg.norm(first)
+    second = np.cross(direction, first)
+    assert second @ axes[:, 0] > 0.99
+    turned = direction + (points[:, :1] * first + points[:, 1:] * second) / LONG
+    turned = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    places = path.places(state, np.concatenate([direction[None], turned]))
+    np.testing.assert_allclose(local(points), places[1:] - places[0], rtol=0.0, atol=1e-9)
+    assert local.residual < 1e-9
+
+
+def test_pupils_head_where_the_chief_rays_go(path) -> None:
+    """Mean direction of the pupil, (Y', X'), against a chief ray traced through the stop's centre; they differ by the
+    pupil's coma, 1% of its radius.
+    """
+    directions = path.directions(PLACES)
+    pupils = path.pupils({}, directions, PLACES)
+    systems = assemble(path.assembly, [f"{ROOT}/image_to_stop"])
+    placed = path.assembly.place()
+    local = np.stack([PLACES[:, 1], PLACES[:, 0], np.zeros(len(PLACES))], axis=-1)
+    start = points_to_world(placed, FOCAL_PLANE, local).real[0]
+    frame = path.assembly.nominal_pose(FOCAL_PLANE).rotation
+    radius = np.linalg.norm(pupils[0].axes, ord=2)
+    checked = 0
+    for pupil, point in zip(pupils, start.reshape(-1, 3), strict=True):
+        v, u = pupil.centre
+        back = -(frame @ np.array([u, v, np.sqrt(1.0 - u * u - v * v)]))
+        hit, _, _, valid = trace(path.backend, systems, make_rays(path.backend, point[None], back[None])).numpy()
+        assert valid.all()
+        assert np.linalg.norm(hit[0, 0, :2]) < 0.01 * path.stop.radius
+        checked += 1
+    assert checked == len(PLACES)
+    assert 0.05 < radius < 0.06
+
+
+def test_a_focal_plane_that_moves_sideways(path) -> None:
+    """Places are on the focal plane, which has moved: they go the other way, and the pupils do not change."""
+    shift = (0.2e-3, -0.3e-3, 0.0)
+    directions = path.directions(PLACES)
+    moved = path.places({FOCAL_PLANE: Motion(shift=shift)}, directions)
+    np.testing.assert_allclose(moved - PLACES, [[-shift[1], -shift[0]]] * len(PLACES), rtol=0.0, atol=1e-12)
+
+
+def test_a_focal_plane_that_moves_downstream(path) -> None:
+    """Places follow the chief rays' slope, which is below 1e-3 in this nearly telecentric camera."""
+    directions = path.directions(PLACES)
+    moved = path.places({FOCAL_PLANE: Motion(shift=(0.0, 0.0, 1e-3))}, directions)
+    slope = (moved - PLACES) / 1e-3
+    centres = np.array([pupil.centre for pupil in path.pupils({}, directions, PLACES)])
+    # coma moves the pupil's middle off the chief ray, here by 3e-5, which is 0.06% of its radius
+    np.testing.assert_allclose(slope, centres, rtol=0.0, atol=5e-5)
+    assert np.all(np.abs(slope) < 2e-3)
