@@ -263,8 +263,8 @@ def _shim_section(alignment: Alignment) -> Section:
                 f"Shims of round {number + 1}",
                 "Changes of thickness under each hole; their sigma has in it that the sites do not lie on one plane "
                 f"({UM * shimming.plane.extra_sigma:.1f} µm rms: chips, curvature of field). The turn in the mounting "
-                f"surface of {plan.turn / ARCMIN:.2f}′ is set by hand; without it the line would be off level by "
-                f"{plan.level_coupling / ARCMIN:.2f}′, "
+                f"surface of {fixed(plan.turn / ARCMIN, 2)}′ is set by hand; without it the line would be off level by "
+                f"{fixed(plan.level_coupling / ARCMIN, 2)}′, "
                 "since the mounting surface is not parallel to the focal plane.",
                 ("hole", "change, µm", "ground, µm", "new shim, µm", "slide, mm"),
                 rows,

@@ -1,0 +1,6 @@
+"""Estimators of in-orbit geometric calibration: ground points and orbit in, angles of the cameras and sigmas out.
+
+Stands on numpy and scipy alone and never sees the truth of a simulation. `planes` and `angles` are the method of
+paper 000 (Liu and Huang, Infrared and Laser Engineering 43(10), 2014), `resection` is the photogrammetric method that
+the paper compares with, `sensitivity` its error analysis.
+"""

@@ -1,0 +1,180 @@
+"""Intersection angles of line cameras from the planes in which they photograph (paper 000, eqs. 6-7).
+
+alpha is the angle between the forward and the nadir plane, beta between the nadir and the aft plane; both acute and
+positive. The paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and swallows angles below
+1e-8 rad (`arccos_rounding`), so the value used here is atan2(|a x b|, |a . b|), good to rounding at every angle.
+
+The sigmas come from first-order propagation. All planes pass through one station, whose error they share, and alpha
+and beta share the nadir plane, so their errors are correlated: the result is a joint covariance.
+
+Two angles bear the name. The planes give the **dihedral** angle. The **look** angle lies between the lines of sight of
+the lines' centres. They are equal when the CCD lines are parallel and start at the same place across the track; a
+line turned by k about its own line of sight makes cos(dihedral) = cos(k) cos(look), a dihedral angle larger by
+k^2 / (2 tan(look)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.orbit.planes import PlaneFit, Station, Strip
+
+__all__ = [
+    "AngleError",
+    "PlaneAngles",
+    "angles_between",
+    "arccos_rounding",
+    "central_ray",
+    "dihedral_angle",
+    "height_error",
+    "intersection_angles",
+    "look_angle",
+    "off_axis_angle",
+]
+
+Array = NDArray[np.float64]
+# Below so many sigmas an angle, which cannot be negative, is no longer normally distributed.
+_FOLDED = 3.0
+
+
+class AngleError(ValueError):
+    """Planes or rays have no angle that could be told."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneAngles:
+    """Angles between pairs of planes.
+
+    values: (m,) acute angles by atan2, radians. printed: (m,) the same by the paper's arccos.
+    covariance: (m, m) rad^2, points and station.
+    gradient: (m, k, 3) derivative of each angle with respect to the unit normals of the k planes.
+    folded: some angle is below three sigmas; its sigma then says little, for an angle cannot be negative.
+    """
+
+    values: Array
+    printed: Array
+    covariance: Array
+    gradient: Array
+    folded: bool
+
+    @property
+    def sigma(self) -> Array:
+        """(m,) radians."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]]) -> PlaneAngles:
+    """Acute angles between pairs of planes through one station, with their joint covariance.
+
+    pairs: indices into `planes`. Raises AngleError when planes belong to different stations or methods, or coincide.
+    """
+    first = planes[0]
+    for plane in planes[1:]:
+        if plane.method != first.method:
+            raise AngleError(f"angles: a {first.method} and a {plane.method} plane have no angle in common")
+        same = np.array_equal(plane.station.position, first.station.position)
+        if not (same and np.array_equal(plane.station.covariance, first.station.covariance)):
+            raise AngleError("angles: the planes must be fitted through one and the same station")
+    normals = np.array([plane.normal for plane in planes])
+    values, printed = np.empty(len(pairs)), np.empty(len(pairs))
+    gradient = np.zeros((len(pairs), len(planes), 3))
+    for row, (i, j) in enumerate(pairs):
+        a, b = normals[i], normals[j]
+        dot, sine = float(a @ b), float(np.linalg.norm(np.cross(a, b)))
+        if sine < 1e-14:
+            raise AngleError("angles: two planes coincide; their angle has no direction to change in")
+        values[row] = np.arctan2(sine, abs(dot))
+        printed[row] = np.arccos(min(abs(dot), 1.0))
+        # a step of one normal toward the other closes the angle
+        side = np.copysign(1.0, dot)
+        gradient[row, i] = -(side * b - abs(dot) * a) / sine
+        gradient[row, j] = -(side * a - abs(dot) * b) / sine
+    points = np.array([plane.point_covariance for plane in planes])
+    shared = np.einsum("mki,kij->mj", gradient, np.array([plane.station_gain for plane in planes]))
+    covariance = np.einsum("mki,kij,lkj->ml", gradient, points, gradient) + shared @ first.station.covariance @ shared.T
+    folded = bool(np.any(values < _FOLDED * np.sqrt(np.diag(covariance))))
+    return PlaneAngles(values, printed, covariance, gradient, folded)
+
+
+def intersection_angles(forward: PlaneFit, nadir: PlaneFit, aft: PlaneFit) -> PlaneAngles:
+    """Angles alpha (forward, nadir) and beta (nadir, aft), eqs. 6 and 7, in this order. Raises AngleError."""
+    return angles_between((forward, nadir, aft), ((0, 1), (1, 2)))
+
+
+def off_axis_angle(line: PlaneFit, nadir: PlaneFit) -> PlaneAngles:
+    """Off-axis angle of another line (high-resolution, multispectral) against the nadir line, (1,); unsigned.
+
+    The paper's outlook. Both planes must belong to the same moment, hence the same station. Raises AngleError.
+    """
+    return angles_between((line, nadir), ((0, 1),))
+
+
+def arccos_rounding(angle: ArrayLike) -> Array:
+    """Bound of the rounding error of arccos |a . b| at an angle (...), radians, for unit vectors in float64.
+
+    The product carries up to four roundings: two normals whose lengths are 1 within eps each, three products, two
+    sums. d angle = d cos / sin(angle), and no angle below sqrt(2 d cos) can be told from zero.
+    """
+    slip = 4.0 * np.finfo(np.float64).eps
+    sine = np.sin(np.asarray(angle, np.float64))
+    return np.asarray(np.minimum(slip / np.maximum(sine, 1e-300), np.sqrt(2.0 * slip)))
+
+
+def dihedral_angle(normal_a: ArrayLike, normal_b: ArrayLike) -> Array:
+    """Acute angle between planes with normals (..., 3) of any length, radians."""
+    a, b = np.asarray(normal_a, np.float64), np.asarray(normal_b, np.float64)
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.abs(np.sum(a * b, axis=-1))))
+
+
+def look_angle(ray_a: ArrayLike, ray_b: ArrayLike) -> Array:
+    """Angle between two lines of sight (..., 3) of any length, radians, 0 to pi."""
+    a, b = np.asarray(ray_a, np.float64), np.asarray(ray_b, np.float64)
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
+
+
+def central_ray(plane: PlaneFit, tangent: ArrayLike) -> Array:
+    """Unit vector (3,) from the station along the line of sight of the CCD line's centre, within the fitted plane.
+
+    tangent: (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel number
+        and the interior orientation; either sense of counting. Raises AngleError for bad tangents.
+    """
+    if plane.method == "printed":
+        raise AngleError("central ray: the printed plane does not contain its points")
+    station: Station = plane.station
+    strip: Strip = plane.strip
+    w = np.asarray(tangent, np.float64)
+    if w.shape != (len(strip.points),) or not np.all(np.isfinite(w)):
+        raise AngleError(f"central ray: need {len(strip.points)} finite tangents, found {w.shape}")
+    arm = strip.points - station.position
+    middle = arm.mean(axis=0)
+    middle = middle - (middle @ plane.normal) * plane.normal
+    middle = middle / np.linalg.norm(middle)
+    side = np.cross(plane.normal, middle)
+    seen, interior = np.arctan2(arm @ side, arm @ middle), np.arctan(w)
+    spread = interior - interior.mean()
+    slope = float(spread @ (seen - seen.mean()) / (spread @ spread)) if np.any(spread) else 0.0
+    if abs(abs(slope) - 1.0) > 0.1:
+        raise AngleError(
+            f"central ray: the points open {abs(slope):.3g} times the angle that their tangents say; wrong tangents?"
+        )
+    # a point's angle is good to its sigma over its distance
+    weight = np.sum(arm**2, axis=1) / np.trace(strip.covariance, axis1=1, axis2=2)
+    turn = float(np.sum(weight * (seen - np.copysign(1.0, slope) * interior)) / np.sum(weight))
+    return np.asarray(np.cos(turn) * middle + np.sin(turn) * side)
+
+
+def height_error(
+    angle_error: ArrayLike, slant_range: ArrayLike, convergence: ArrayLike, zenith: ArrayLike = 0.0
+) -> Array:
+    """Error of intersected heights when a look angle is taken wrong by `angle_error`, metres, to first order.
+
+    The wrong ray passes the ground point at slant_range * angle_error and so meets the other ray, at the angle
+    `convergence` on the ground, farther along by that over sin(convergence); `zenith`: zenith angle of the other ray.
+    For a camera at height H over flat ground, against nadir: H * angle_error / (sin a cos a). Radians, metres.
+    """
+    along = np.asarray(slant_range) * np.asarray(angle_error) / np.sin(np.asarray(convergence, np.float64))
+    return np.asarray(along * np.cos(np.asarray(zenith, np.float64)))

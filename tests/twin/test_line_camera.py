@@ -1,0 +1,200 @@
+"""Looks of line cameras: ideal projections against the collinearity equation, traced lines against the trace."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from optics.assembly import points_to_world
+from optics.line_of_sight import chief_directions
+from optics.rotation import rotation_matrix
+from optics.system import assemble
+from optics.trace import make_rays, trace
+from optics.tree import Motion
+from scenes.errors import InputError
+from scenes.spec import Spec
+from scenes.three_line_camera import ThreeLineCameraSpec, load_three_line_camera
+from scenes.translate import validate
+from scenes.yaml_file import dump_yaml, parse_yaml
+from twin.orbit.line_camera import dihedral_angle, line_cameras, line_normal, look_angle, traced_line_cameras
+
+ARCSEC = math.radians(1.0 / 3600.0)
+TH1 = load_three_line_camera("th1")
+
+
+def payload(**lines) -> ThreeLineCameraSpec:
+    """Lines of 650 mm, otherwise as given in YAML."""
+    text = {name: {"focal_length": "650 mm", **line} for name, line in lines.items()}
+    return ThreeLineCameraSpec.model_validate({"name": "own", "pixels": 12000, "pitch": "6.5 um", "lines": text})
+
+
+def test_the_file() -> None:
+    assert list(TH1.lines) == ["forward", "nadir", "aft"]
+    assert TH1.pixels == 12000
+    for line, degrees in zip(TH1.lines.values(), (25, 0, -25), strict=True):
+        assert line.focal_length / TH1.pitch == pytest.approx(1e5, rel=1e-12)
+        assert math.degrees(line.look) == pytest.approx(degrees, abs=1e-12)
+        half = 0.5 * TH1.pixels * TH1.pitch
+        assert abs(line.k1) * half**3 < 0.5 * TH1.pitch  # as the file says
+    again: Spec = validate(ThreeLineCameraSpec, parse_yaml(dump_yaml(TH1.plain())))
+    assert again == TH1
+
+
+def test_a_wrong_file_is_told_by_line() -> None:
+    with pytest.raises(InputError, match="th1"):
+        load_three_line_camera("th2")
+    text = dump_yaml({**TH1.plain(), "lines": {}})
+    with pytest.raises(InputError, match="no lines"):
+        validate(ThreeLineCameraSpec, parse_yaml(text))
+    text = dump_yaml(TH1.plain()).replace("650 mm", "650 s", 1)
+    with pytest.raises(InputError, match="length"):
+        validate(ThreeLineCameraSpec, parse_yaml(text))
+
+
+@pytest.mark.parametrize("name", list(TH1.lines))
+def test_ideal_lines_obey_collinearity(name: str) -> None:
+    """The look, projected through the lens onto the real image plane, and the image corrected for distortion agree."""
+    line, camera = TH1.lines[name], line_cameras(TH1)[name]
+    pixel = np.array([-0.5, 0.0, 17.3, 5999.5, 9000.0, 11999.5])
+    mounted = Rotation.from_euler("Y", line.look) * Rotation.from_rotvec(line.rotate)
+    x, y, z = mounted.inv().apply(camera.look(pixel)).T
+    assert np.all(z > 0.99)
+    place = np.stack([np.zeros_like(pixel), (pixel - 5999.5) * 6.5e-6], axis=-1) - np.array(line.principal_point)
+    corrected = place * (1.0 + line.k1 * np.sum(place**2, axis=-1, keepdims=True))
+    # rounding of a length of 0.65 m
+    np.testing.assert_allclose(-line.focal_length * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=1e-15)
+
+
+def test_first_pixel_sees_the_right_and_forward_is_ahead() -> None:
+    cameras = line_cameras(TH1)
+    for camera in cameras.values():
+        ends = camera.look(np.array([0.0, 11999.0]))
+        assert ends[0, 1] > 0.05
+        assert ends[1, 1] < -0.05
+    assert cameras["forward"].look(np.array([6000.0]))[0, 0] > 0.42
+    assert cameras["aft"].look(np.array([6000.0]))[0, 0] < -0.42
+
+
+def test_fifth_order_distortion_and_slope() -> None:
+    camera = line_cameras(payload(nadir={"look": "3 deg", "k1": "0.2 1/m^2", "k2": "40 1/m^4"}))["nadir"]
+    pixel = np.array([0.0, 3000.0, 5999.5, 11500.0])
+    y = (pixel - 5999.5) * 6.5e-6
+    tangent = y * (1 + 0.2 * y**2 + 40 * y**4) / 0.65
+    x, yy, z = Rotation.from_euler("Y", -3, degrees=True).apply(camera.look(pixel)).T
+    np.testing.assert_allclose(-yy / z, tangent, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x, 0.0, atol=1e-15)
+    look, slope = camera.look_and_slope(pixel)
+    difference = (camera.look(pixel + 0.25) - camera.look(pixel - 0.25)) / 0.5
+    np.testing.assert_allclose(slope, difference, rtol=0, atol=1e-14)  # rounding of unit vectors over half a pixel
+    np.testing.assert_allclose(np.sum(look * slope, axis=-1), 0.0, atol=1e-19)
+
+
+@pytest.mark.parametrize("pixel", [-0.51, 11999.51, np.nan])
+def test_no_look_beyond_the_line(pixel: float) -> None:
+    camera = line_cameras(TH1)["nadir"]
+    for function in (camera.look, camera.look_and_slope, camera.origin):
+        with pytest.raises(ValueError, match="outside the line 'nadir'"):
+            function(np.array([5.0, pixel]))
+
+
+PERTURBED = {
+    "base/forward/M1": Motion(rotate=(8 * ARCSEC, -5 * ARCSEC, 0.0), figure={7: 40e-9, 11: 30e-9}),
+    "base/forward/focal_plane": Motion(rotate=(0.0, 0.0, 60 * ARCSEC), shift=(20e-6, -35e-6, 10e-6)),
+    "base/backward/M3": Motion(figure={5: 50e-9, 16: 20e-9}),
+}
+
+
+@pytest.mark.parametrize("state", [{}, PERTURBED], ids=["nominal", "perturbed"])
+def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> None:
+    """Pixels that were not traced: directions below 1e-6 pixel; and light sent in along the ray arrives at the pixel,
+    which tests the ray's origin as well.
+    """
+    cameras = traced_line_cameras(gf7_pair, backend, state)
+    assembly = gf7_pair.assembly
+    placed = assembly.place([state])
+    rng = np.random.default_rng(4)
+    for name, camera in cameras.items():
+        pixel = np.concatenate([[-0.5, 0.0, camera.pixels - 0.5], rng.uniform(-0.5, camera.pixels - 0.5, 120)])
+        y = (pixel - 0.5 * (camera.pixels - 1)) * gf7_pair.cameras[name].spec.line.pitch
+        line = np.stack([0 * y, y, 0 * y], axis=-1)
+        image = points_to_world(placed, f"base/{name}/focal_plane/line", line)
+        batches = [
+            assemble(assembly, [f"{name}/{way}"], [state], placed=placed)
+            for way in ("image_to_stop", "image_to_object")
+        ]
+        guess = gf7_pair.toward_optics(placed, name)[:, None]
+        traced = chief_directions(backend, *batches, image, guess, np.array([0.0, 1.0, 0.0]))[0]
+        look, slope = camera.look_and_slope(pixel)
+        error = np.linalg.norm(look - traced, axis=-1) / np.linalg.norm(slope, axis=-1)
+        assert np.max(error) < 1e-6
+        # back through the camera; 5 m before its origin no mirror is in the way of a sequential trace
+        imaging = assemble(assembly, [f"{name}/imaging"], [state], placed=placed)
+        start = camera.origin(pixel) + 5.0 * look
+        hit = trace(backend, imaging, make_rays(backend, start, -look)).numpy()[0][0]
+        np.testing.assert_allclose(hit[:, 1], y, rtol=0, atol=1e-6 * 7e-6)
+        np.testing.assert_allclose(hit[:, 0], 0.0, rtol=0, atol=1e-6 * 7e-6)
+
+
+def test_traced_looks(gf7_pair, backend) -> None:
+    cameras = traced_line_cameras(gf7_pair, backend)
+    for name, degrees in (("forward", 26.0), ("backward", -5.0)):
+        camera = cameras[name]
+        middle = np.array([0.5 * (camera.pixels - 1)])
+        expected = [math.sin(math.radians(degrees)), 0.0, math.cos(math.radians(degrees))]
+        np.testing.assert_allclose(camera.look(middle)[0], expected, rtol=0, atol=1e-12)
+        # the centre's chief ray goes through the camera's origin by definition
+        np.testing.assert_allclose(camera.origin(middle)[0], gf7_pair.spec.cameras[name].position, rtol=0, atol=1e-9)
+        ends = camera.look(np.array([0.0, camera.pixels - 1.0]))
+        assert ends[0, 1] > 0.02 > -0.02 > ends[1, 1]  # the image is turned round: the -Y' end sees +Y
+    assert look_angle(*cameras.values()) == pytest.approx(math.radians(31.0), abs=1e-12)
+    # both lines are parallel to Y, so their planes make the angle of their looks
+    assert dihedral_angle(*cameras.values()) == pytest.approx(math.radians(31.0), abs=1e-9)
+
+
+def test_a_turned_camera_turns_its_looks(gf7_pair, backend) -> None:
+    vector = np.array([7.0, -11.0, 30.0]) * ARCSEC
+    nominal = traced_line_cameras(gf7_pair, backend)["forward"]
+    turned = traced_line_cameras(gf7_pair, backend, {"base/forward": Motion(rotate=tuple(vector))})["forward"]
+    axes = gf7_pair.camera_axes("forward")
+    pixel = np.linspace(0.0, nominal.pixels - 1.0, 7)
+    expected = nominal.look(pixel) @ (axes @ rotation_matrix(vector) @ axes.T).T
+    np.testing.assert_allclose(turned.look(pixel), expected, rtol=0, atol=1e-12)
+
+
+def test_a_turn_about_the_look_changes_the_planes_but_not_the_looks() -> None:
+    """Normals of ideal lines at looks 0 and a, the second turned by g about its look: cos = cos a cos g exactly."""
+    a, g = math.radians(25.0), math.radians(2.0)
+    cameras = line_cameras(
+        payload(nadir={"look": "0 deg"}, forward={"look": "25 deg", "rotate": ["0 deg", "0 deg", "2 deg"]})
+    )
+    nadir, forward = cameras["nadir"], cameras["forward"]
+    assert look_angle(forward, nadir) == pytest.approx(a, abs=1e-15)
+    expected = math.acos(math.cos(a) * math.cos(g))
+    assert expected - a > 0.07 * math.radians(1.0)  # what is tested is not small
+    assert dihedral_angle(forward, nadir) == pytest.approx(expected, abs=1e-13)
+    assert dihedral_angle(nadir, forward) == pytest.approx(expected, abs=1e-13)
+
+
+def test_a_turn_within_the_plane_changes_the_look_but_not_the_planes() -> None:
+    """A camera rolled by w about its own X keeps its plane; the angle of the looks has cos = cos a cos w exactly."""
+    a, w = math.radians(25.0), math.radians(1.5)
+    cameras = line_cameras(
+        payload(nadir={"look": "0 deg"}, aft={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]})
+    )
+    assert dihedral_angle(*cameras.values()) == pytest.approx(a, abs=1e-13)
+    assert look_angle(*cameras.values()) == pytest.approx(math.acos(math.cos(a) * math.cos(w)), abs=1e-14)
+
+
+def test_normals_point_forward_and_a_bent_line_has_a_best_plane() -> None:
+    """A principal point beside the line bends its cone; the best plane then lies amid the looks."""
+    cameras = line_cameras(payload(nadir={"look": "0 deg", "principal_point": ["0 um", "0 um"]}, bent={"look": "0 deg",
+                           "principal_point": ["2 mm", "0 mm"], "k1": "1 1/m^2"}))  # fmt: skip
+    np.testing.assert_allclose(line_normal(cameras["nadir"]), [1.0, 0.0, 0.0], atol=1e-15)
+    normal, looks = line_normal(cameras["bent"]), cameras["bent"].look(np.linspace(0.0, 11999.0, 1001))
+    residual = looks @ normal
+    assert normal[0] > 0.0
+    assert np.ptp(residual) > 1e-7
+    rng = np.random.default_rng(3)
+    for other in normal + 1e-6 * rng.normal(size=(20, 3)):
+        assert np.sum((looks @ (other / np.linalg.norm(other))) ** 2) > np.sum(residual**2)

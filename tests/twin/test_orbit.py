@@ -1,0 +1,251 @@
+"""Orbits: conservation laws, the known secular rates, other integrators, and the place that is asked for."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from scenes.orbit_spec import OrbitSpec
+from twin.orbit.earth import EQUATORIAL_RADIUS, Earth
+from twin.orbit.earth_rotation import DAY, RATE
+from twin.orbit.orbit import (
+    FIELD_RADIUS,
+    GM,
+    J2,
+    Orbit,
+    acceleration,
+    descending_local_time,
+    node_rate,
+    propagate,
+    sun_synchronous_inclination,
+)
+
+EARTH = Earth(-0.15, (4e-7, -2e-6))
+EPOCH = "2011-03-05T03:05:00Z"
+BEIJING = {"longitude": "116 deg", "latitude": "40 deg"}
+
+
+def orbit(earth: Earth = EARTH, tolerance: float = 1e-12, **given: object) -> Orbit:
+    if not {"passing", "elements", "state"} & set(given):
+        given["passing"] = BEIJING
+    return propagate(OrbitSpec.model_validate({"epoch": EPOCH, **given}), earth, tolerance)
+
+
+def potential(r: np.ndarray) -> np.ndarray:
+    """The field's potential with the Legendre polynomial P2, m^2/s^2."""
+    distance = np.linalg.norm(r, axis=-1)
+    p2 = np.polynomial.legendre.legval(r[..., 2] / distance, [0.0, 0.0, 1.0])
+    return GM / distance * (1.0 - J2 * (FIELD_RADIUS / distance) ** 2 * p2)
+
+
+@pytest.fixture(scope="module")
+def two_days() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    t = np.linspace(0.0, 2 * DAY, 20_001)
+    return t, *orbit(before="0 s", after="48 h").equatorial(t)
+
+
+def angles(r: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Right ascension of the ascending node and inclination, radians."""
+    h = np.cross(r, v)
+    return np.unwrap(np.arctan2(h[:, 0], -h[:, 1])), np.arccos(h[:, 2] / np.linalg.norm(h, axis=-1))
+
+
+def test_acceleration_is_the_gradient_of_the_potential() -> None:
+    generator = np.random.default_rng(4)
+    r = generator.standard_normal((100, 3))
+    r *= 6.9e6 / np.linalg.norm(r, axis=-1, keepdims=True)
+    # central differences over 1 km: truncation (h/r)^2 = 2e-8 of g, rounding 6e7 * 1e-16 / 1e3
+    step = 1e3
+    steps = step * np.eye(3)
+    gradient = np.stack([(potential(r + s) - potential(r - s)) / (2 * step) for s in steps], axis=-1)
+    np.testing.assert_allclose(acceleration(r), gradient, rtol=0, atol=5e-7)
+    # J2 itself is 1e-3 of g and would be missed
+    assert np.min(np.linalg.norm(acceleration(r) + GM * r / 6.9e6**3, axis=-1)) > 5e-3
+
+
+def test_energy_and_the_polar_component_of_angular_momentum_are_conserved(two_days) -> None:
+    _, r, v = two_days
+    energy = 0.5 * np.sum(v * v, axis=-1) - potential(r)
+    assert np.ptp(energy) < 1e-11 * abs(energy[0])
+    polar = np.cross(r, v)[:, 2]
+    assert np.ptp(polar) < 1e-11 * abs(polar[0])
+
+
+def test_the_node_follows_the_mean_sun(two_days) -> None:
+    t, r, v = two_days
+    node, inclination = angles(r, v)
+    rate = np.degrees(np.polyfit(t, node, 1)[0]) * DAY
+    # 360 deg in a year of 365.2422 days; second-order terms of J2 are a few 1e-3
+    assert rate == pytest.approx(0.98565, rel=3e-3)
+    assert 97.3 < np.degrees(np.mean(inclination)) < 97.4
+
+
+def test_nodes_of_other_inclinations_move_at_the_secular_rate() -> None:
+    # -3/2 n J2 (R/p)^2 cos i by mean elements, themselves averaged over whole revolutions
+    for inclination in (30.0, 63.4, 120.0):
+        found = orbit(
+            before="0 s",
+            after="24 h",
+            elements={
+                "altitude": "600 km",
+                "inclination": f"{inclination} deg",
+                "node": "20 deg",
+                "argument": "10 deg",
+            },
+        )
+        t = np.linspace(0.0, DAY, 8001)
+        r, v = found.equatorial(t)
+        node, tilt = angles(r, v)
+        axis = 1.0 / (2.0 / np.linalg.norm(r, axis=-1) - np.sum(v * v, axis=-1) / GM)
+        known = node_rate(float(np.mean(axis)), 0.0, float(np.mean(tilt)))
+        # the mean over samples leaves short periods to 1e-3, terms of J2^2 are of that size too
+        assert np.polyfit(t, node, 1)[0] == pytest.approx(known, rel=5e-3)
+        assert np.sign(known) == -np.sign(math.cos(math.radians(inclination)))
+
+
+def test_published_sun_synchronous_inclinations() -> None:
+    # TH-1: 500 km, 97.3 deg; Landsat 7 (705 km): 98.2 deg; SPOT (822 km): 98.7 deg
+    for altitude, known in ((500e3, 97.4), (705e3, 98.2), (822e3, 98.7)):
+        found = math.degrees(sun_synchronous_inclination(EQUATORIAL_RADIUS + altitude))
+        assert found == pytest.approx(known, abs=0.1)
+    with pytest.raises(ValueError, match="no sun-synchronous orbit"):
+        sun_synchronous_inclination(20e6)
+
+
+def test_dense_output_is_the_orbit() -> None:
+    """Against classical Runge-Kutta steps of half a second, read only where it stands."""
+    found = orbit(before="0 s", after="10 min")
+    t = np.linspace(0.0, 600.0, 1201)
+    start = np.concatenate(found.equatorial(0.0))
+    state = [start]
+    for _ in t[1:]:
+        # error of a step (n h)^5 / 120 of the orbit's radius: 3e-12 m; 1e-8 m of rounding in all
+        state.append(runge_kutta(state[-1], 0.5))
+    r, v = found.equatorial(t)
+    np.testing.assert_allclose(r, np.array(state)[:, :3], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(v, np.array(state)[:, 3:], rtol=0, atol=1e-9)
+
+
+def runge_kutta(y: np.ndarray, h: float) -> np.ndarray:
+    def slope(y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[3:], acceleration(y[:3])])
+
+    a = slope(y)
+    b = slope(y + 0.5 * h * a)
+    c = slope(y + 0.5 * h * b)
+    return y + h / 6 * (a + 2 * b + 2 * c + slope(y + h * c))
+
+
+def test_tolerance_does_not_matter() -> None:
+    t = np.linspace(-600.0, 600.0, 5001)
+    coarse, fine = (orbit(tolerance=tolerance).equatorial(t) for tolerance in (1e-10, 1e-13))
+    np.testing.assert_allclose(coarse[0], fine[0], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(coarse[1], fine[1], rtol=0, atol=1e-7)
+
+
+def test_without_flattening_it_is_an_ellipse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kepler's equation, solved here, with all elements at work."""
+    monkeypatch.setattr("twin.orbit.orbit.J2", 0.0)
+    e, i, node, perigee, argument = 0.05, 1.1, 2.0, 0.7, 1.5
+    degrees = {
+        key: f"{math.degrees(value)!r} deg"
+        for key, value in {"inclination": i, "node": node, "perigee": perigee, "argument": argument}.items()
+    }
+    found = orbit(before="1 h", after="2 h", elements={"altitude": "900 km", "eccentricity": e, **degrees})
+    a = EQUATORIAL_RADIUS + 900e3
+    t = np.linspace(-3600.0, 7200.0, 101)
+    true = argument - perigee
+    eccentric = 2 * math.atan(math.sqrt((1 - e) / (1 + e)) * math.tan(true / 2))
+    mean = eccentric - e * math.sin(eccentric) + math.sqrt(GM / a**3) * t
+    anomaly = mean.copy()
+    for _ in range(50):
+        anomaly = mean + e * np.sin(anomaly)
+    plane = np.stack([a * (np.cos(anomaly) - e), a * math.sqrt(1 - e * e) * np.sin(anomaly), 0 * t], axis=-1)
+    from scipy.spatial.transform import Rotation
+
+    known = Rotation.from_euler("ZXZ", [node, i, perigee]).apply(plane)
+    np.testing.assert_allclose(found.equatorial(t)[0], known, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("direction", ["descending", "ascending"])
+@pytest.mark.parametrize(("longitude", "latitude"), [(116.0, 40.0), (-70.0, -33.0), (10.0, 0.0), (20.0, 80.0)])
+def test_it_passes_where_it_is_asked_to(direction: str, longitude: float, latitude: float) -> None:
+    place = {"longitude": f"{longitude} deg", "latitude": f"{latitude} deg", "altitude": "505 km"}
+    found = orbit(passing={**place, "direction": direction})
+    position, velocity, _ = found.itrs([-1.0, 0.0, 1.0])
+    lon, lat, height = EARTH.geodetic(position)
+    assert np.degrees([lon[1], lat[1]]) == pytest.approx([longitude, latitude], abs=1e-12)
+    assert height[1] == pytest.approx(505e3, abs=1e-6)
+    assert (lat[2] < lat[0]) == (direction == "descending")
+    assert np.linalg.norm(velocity[1]) == pytest.approx(7600.0, abs=600.0)
+    # retrograde: the track runs to the west
+    assert lon[2] < lon[0]
+
+
+def test_altitude_stays_within_a_pass() -> None:
+    height = EARTH.geodetic(orbit(before="2 min", after="2 min").itrs(np.linspace(-120, 120, 49))[0])[2]
+    # 20 km of the ellipsoid over 90 deg of latitude, and the eccentricity 1e-3 of an osculating circle
+    assert np.ptp(height) < 10e3
+
+
+def test_velocities_are_derivatives() -> None:
+    found = orbit()
+    t = np.linspace(-590.0, 590.0, 200)
+    position, velocity, inertial = found.itrs(t)
+    around = {k: found.itrs(t + k)[0] for k in (-2, -1, 1, 2)}
+    # fourth order over 1 s: n^5 h^4 a / 30 = 4e-10 m/s, rounding 1e-9 m / 1 s
+    derivative = ((around[1] - around[-1]) * 8.0 - (around[2] - around[-2])) / 12.0
+    np.testing.assert_allclose(velocity, derivative, rtol=0, atol=3e-8)
+    # the two velocities differ by the turning Earth; polar motion tilts the axis by 2e-6
+    turning = RATE * np.cross([0.0, 0.0, 1.0], position)
+    np.testing.assert_allclose(inertial - velocity, turning, rtol=0, atol=2e-3)
+    # the stars' view: the GCRS velocity, turned
+    matrix = EARTH.to_itrs(t, EPOCH)
+    np.testing.assert_allclose(inertial, np.einsum("nij,nj->ni", matrix, found.gcrs(t)[1]), rtol=0, atol=1e-8)
+
+
+def test_the_state_vector_goes_through() -> None:
+    """An orbit begun anew from its own state is the same orbit."""
+    first = orbit(before="0 s")
+    r, v = first.gcrs(0.0)
+    state = {"position": [f"{x!r} m" for x in r.tolist()], "velocity": [f"{x!r} m/s" for x in v.tolist()]}
+    second = orbit(before="0 s", state=state)
+    np.testing.assert_allclose(second.gcrs(600.0)[0], first.gcrs(600.0)[0], rtol=0, atol=1e-6)
+
+
+def test_local_time_of_the_node() -> None:
+    for hour in (10.5, 13.5, 22.0):
+        elements = {"altitude": "500 km", "node_local_time": f"{hour} h", "argument": "150 deg"}
+        found = orbit(before="3 h", after="3 h", elements=elements)
+        assert descending_local_time(found) == pytest.approx(3600 * hour, abs=1e-6)
+        # at the southward crossing of the equator: UT1 plus longitude over 15 deg/h
+        t = np.linspace(-6000.0, 6000.0, 12_001)
+        lon, lat, _ = EARTH.geodetic(found.itrs(t)[0])
+        k = int(np.flatnonzero((lat[:-1] > 0) & (lat[1:] <= 0))[0])
+        clock = 3 * 3600 + 5 * 60 - 0.15 + t[k] + lon[k] / (2 * np.pi) * DAY
+        # the osculating node at the epoch against the crossing: J2's short periods, 2e-4 rad or 3 s; sampling 1 s
+        assert (clock - 3600 * hour + DAY / 2) % DAY - DAY / 2 == pytest.approx(0.0, abs=5.0)
+
+
+def test_bad_orbits() -> None:
+    with pytest.raises(ValueError, match=r"never passes latitude 85\.000 deg"):
+        orbit(passing={"longitude": "0 deg", "latitude": "85 deg"})
+    with pytest.raises(ValueError, match=r"never passes latitude 40\.000 deg"):
+        orbit(passing={**BEIJING, "inclination": "30 deg"})
+    found = orbit()
+    for outside in (600.1, -601.0, math.nan):
+        with pytest.raises(ValueError, match="time outside the orbit, which is known from -600 s to 600 s"):
+            found.itrs([0.0, outside])
+
+
+def test_another_solver_agrees_over_a_revolution() -> None:
+    """Adams' multistep methods; a centimetre is what they keep over 5700 s."""
+    found = orbit(before="0 s", after="95 min")
+    start = np.concatenate(found.equatorial(0.0))
+
+    def slope(_: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[3:], acceleration(y[:3])])
+
+    other = solve_ivp(slope, (0.0, 5700.0), start, method="LSODA", rtol=1e-13, atol=1e-7)
+    np.testing.assert_allclose(found.equatorial(5700.0)[0], other.y[:3, -1], rtol=0, atol=1e-2)
