@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from optics.diffraction import Grid
-from optics.test_target import Target
+from optics.targets import Target
 from optics.threads import one_blas_thread
 from optics.vector_shape import FiniteShape, HalfPlane
 

@@ -19,7 +19,7 @@ from optics.aperture import Rectangle
 from optics.diffraction import Grid
 from optics.pupil_function import PupilFunction
 from optics.target_image import target_image
-from optics.test_target import BarLayout, Target, bar_target, pinhole, siemens_star, slanted_edge
+from optics.targets import BarLayout, Target, bar_target, pinhole, siemens_star, slanted_edge
 from optics.trace import BeamMissedError
 from optics.transfer import TransferTable, polychromatic_transfer
 from optics.tree import State

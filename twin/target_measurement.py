@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from analysis.bar_contrast import BarError, BarMtf, measure_bars
-from analysis.slanted_edge import EdgeError, EdgeMtf, measure_edge
+from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
+from analysis.mtf.slanted_edge import EdgeError, EdgeMtf, measure_edge
 from optics.backend import Backend
 from optics.tree import State
 from scenes.channel import BASE

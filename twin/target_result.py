@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.bar_contrast import BarMtf
-from analysis.edge_mtf import EdgeMtf
+from analysis.mtf.bar_contrast import BarMtf
+from analysis.mtf.edge_mtf import EdgeMtf
 
 NYQUIST = 0.5
 """Of any pixel, cycles/pixel."""

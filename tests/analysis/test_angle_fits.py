@@ -12,10 +12,10 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from analysis import angle_network
-from analysis.angle_fits import FITS, GAP_ORDER, angles_left, cross_validate, fewest, fit
-from analysis.angle_network import NotConvergedError
-from analysis.dividing_error import CalibrationSeries, choose
+from analysis.turntable import angle_network
+from analysis.turntable.angle_fits import FITS, GAP_ORDER, angles_left, cross_validate, fewest, fit
+from analysis.turntable.angle_network import NotConvergedError
+from analysis.turntable.dividing_error import CalibrationSeries, choose
 
 LINEAR = tuple(name for name in FITS if name != "network")
 FALSE_ALARM = 1e-4

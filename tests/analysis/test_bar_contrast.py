@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.bar_contrast import BarError, measure_bars
+from analysis.mtf.bar_contrast import BarError, measure_bars
 from analysis.noise import NoiseModel
 
 FALSE_ALARM = 1e-6

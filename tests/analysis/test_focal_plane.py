@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.focal_plane import ObservabilityError, fit_focal_plane, line_level
+from analysis.focal_plane.plane_fit import ObservabilityError, fit_focal_plane, line_level
 
 FALSE_ALARM = 1e-6
 ARCMIN = np.pi / 10800

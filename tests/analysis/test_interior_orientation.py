@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.distortion_model import (
+from analysis.model_fit import RankError
+from analysis.orientation.distortion_model import (
     InseparableTermsError,
     OrientationError,
     distortion,
@@ -15,9 +16,8 @@ from analysis.distortion_model import (
     principal_point,
     slope,
 )
-from analysis.distortion_sets import combine_sets
-from analysis.interior_orientation import fit_interior_orientation
-from analysis.model_fit import RankError
+from analysis.orientation.interior import fit_interior_orientation
+from analysis.orientation.sets import combine_sets
 
 FALSE_ALARM = 1e-6
 ARCSEC = np.pi / 180 / 3600

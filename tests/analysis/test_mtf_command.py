@@ -13,7 +13,7 @@ import tifffile
 from scipy.special import ndtr
 from typer.testing import CliRunner
 
-from analysis.mtf import app
+from analysis.mtf.__main__ import app
 
 ROI = "10,20,64,64"
 BLUR = 0.7
@@ -223,5 +223,5 @@ def test_help_teaches():
 
 
 def test_the_module_is_a_command():
-    spec = importlib.util.find_spec("analysis.mtf")
+    spec = importlib.util.find_spec("analysis.mtf.__main__")
     assert 'if __name__ == "__main__":\n    app()' in Path(spec.origin).read_text("utf-8")

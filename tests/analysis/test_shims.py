@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.focal_plane import fit_focal_plane, line_level
-from analysis.rigid_motion import RigidMotion
-from analysis.shims import Mount, ShimError, shim_plan
+from analysis.focal_plane.plane_fit import fit_focal_plane, line_level
+from analysis.focal_plane.rigid_motion import RigidMotion
+from analysis.focal_plane.shims import Mount, ShimError, shim_plan
 
 FALSE_ALARM = 1e-6
 ARCMIN, DEG = np.pi / 10800, np.pi / 180

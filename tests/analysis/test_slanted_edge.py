@@ -16,9 +16,9 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
+from analysis.mtf.rice import rice_bias
+from analysis.mtf.slanted_edge import EdgeError, measure_edge
 from analysis.noise import NoiseModel
-from analysis.rice import rice_bias
-from analysis.slanted_edge import EdgeError, measure_edge
 
 FALSE_ALARM = 1e-6
 WAVELENGTH, F_NUMBER = 650e-9, 9.2

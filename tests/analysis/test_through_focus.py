@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from analysis.through_focus import FocusError, focus_vertex, focus_vertices
+from analysis.focal_plane.through_focus import FocusError, focus_vertex, focus_vertices
 
 FALSE_ALARM = 1e-6
 WAVELENGTH, F_NUMBER = 650e-9, 9.2

@@ -8,7 +8,7 @@ from optics import quadrature
 from optics.aperture import Rectangle
 from optics.diffraction import Grid, airy
 from optics.target_image import EdgeProfile, target_image
-from optics.test_target import Target, bar_group, bar_target, pinhole, siemens_star, slanted_edge
+from optics.targets import Target, bar_group, bar_target, pinhole, siemens_star, slanted_edge
 from optics.vector_shape import HalfPlane, Polygon
 
 WAVELENGTH, F_NUMBER, PITCH = 650e-9, 9.2, 7e-6

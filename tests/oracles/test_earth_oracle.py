@@ -53,8 +53,8 @@ def test_astropy(epoch: str, polar_motion: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("epoch", EPOCHS)
 def test_skyfield(epoch: str) -> None:
-    """Independent code and another way (equinox, not celestial origin). 1 mm is 30 microarcsec: Skyfield lacks the small
-    corrections that fit the nutation of 2000 to the precession of 2006 (some 15 microarcsec in these years).
+    """Independent code and another way (equinox, not celestial origin). 1 mm is 30 microarcsec: Skyfield lacks the
+    small corrections that fit the nutation of 2000 to the precession of 2006 (some 15 microarcsec in these years).
     """
     pytest.importorskip("skyfield")
     from datetime import datetime, timedelta

@@ -1,5 +1,5 @@
-"""Orbital frame, yaw steering, and the errors of measured orbits and attitudes. Statistical tests have a false-alarm rate
-of 1e-6 each.
+"""Orbital frame, yaw steering, and the errors of measured orbits and attitudes. Statistical tests have a false-alarm
+rate of 1e-6 each.
 """
 
 import math
@@ -79,7 +79,8 @@ def test_axes(nadir: str, steering: str) -> None:
     if steering == "none":
         np.testing.assert_allclose(across, 0.0, atol=1e-8)
     else:
-        assert np.min(np.abs(across)) > 100.0
+        # the Earth turns below at 500 m/s x cos(latitude), here at most 79 degrees
+        assert np.min(np.abs(across)) > 80.0
     # Y is to the right, on the descending pass the west
     assert np.all(np.sum(axes[..., 1] * np.cross(position, inertial), axis=-1) < 0.0)
     west = np.stack([np.sin(lon), -np.cos(lon), 0 * lon], axis=-1)
@@ -107,7 +108,8 @@ def test_yaw_steering_stops_the_drift_along_the_line(nadir: str, latitude: float
         # rounding of the points, 2e-9 m / 500 km / 0.02 s = 2e-13 per second, and second differences
         assert abs(across) < 1e-9 * abs(along)
         along, across = nadir_drift(trajectory(nadir, "none", latitude), t)
-        assert abs(across / along) > 0.02
+        # up to 4 degrees at the equator, with cos(latitude); these are below 80 degrees
+        assert abs(across / along) > 0.01
 
 
 def test_yaw_angle_at_the_equator() -> None:

@@ -8,12 +8,12 @@ import pytest
 from scipy import stats
 
 from analysis.centroid import energy_centroid
-from analysis.distortion_measurement import locate_spots
 from analysis.monitoring import ARCSEC
+from analysis.orientation.measurement import locate_spots
 from optics.backend import load_backend
 from optics.diffraction import Grid
 from optics.target_image import target_image
-from optics.test_target import pinhole
+from optics.targets import pinhole
 from optics.transfer import TransferTable
 from scenes.lab_setup import resolve_distortion
 from twin.laboratory import printed_004

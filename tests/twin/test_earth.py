@@ -152,7 +152,7 @@ def test_rate_is_the_derivative_of_the_matrix() -> None:
     rotation = EARTH.rotation(EPOCH, -600.0, 600.0)
     t = np.linspace(-600.0, 600.0, 41)
     rate = rotation.rate(t)
-    # fourth-order differences over 60 s: truncation (RATE h)^4 / 30 of RATE = 1e-15 rad/s, rounding 3e-16 / 60 s = 5e-18
+    # fourth-order differences over 60 s: truncation (RATE h)^4 / 30 of RATE = 1e-15 rad/s, rounding 5e-18 rad/s
     h = 60.0
     m = {k: rotation.matrix(t + k * h) for k in (-2, -1, 1, 2)}
     derivative = ((m[1] - m[-1]) * 8.0 - (m[2] - m[-2])) / (12.0 * h)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.rigid_motion import RigidMotion
+from analysis.focal_plane.rigid_motion import RigidMotion
 from optics.backend import load_backend
 from optics.frozen_map import FrozenMap
 from optics.pose import Pose

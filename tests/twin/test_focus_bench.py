@@ -7,7 +7,7 @@ traced anew, with the focal plane or the target really moved.
 import numpy as np
 import pytest
 
-from analysis.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import measure_edge
 from optics.frozen_map import FrozenMap
 from optics.pose import Pose
 from optics.pupil_function import PupilFunction

@@ -256,14 +256,14 @@ def test_the_standard_atmosphere() -> None:
     # near the vertical the whole column counts, which the pressure holds up: 701.08 hPa at 3000 m, 226.32 at 11 km
     z, radius = np.full(4, 1e-3), np.full(4, 6371e3)
     shift = refractive_shift(z, np.array([0.0, 3000.0, 11000.0, 15000.0]), radius, 650e-9)
-    # 2.7631e-4 at 15 degC times 8434.5 m; higher layers lie on larger spheres; terms of the order (n - 1)/2 are left out
+    # 2.7631e-4 at 15 degC times 8434.5 m; higher layers lie on larger spheres; (n - 1)/2 is left out
     assert shift[0] == pytest.approx(1e-3 * 2.7631e-4 * 8434.5 * (1 - 2 * 8434.5 / 6371e3), rel=2e-4)
     np.testing.assert_allclose(shift[1:] / shift[0], np.array([701.08, 226.32, 120.45]) / 1013.25, rtol=2e-3)
 
 
 @pytest.mark.parametrize("name", list(TH1))
 def test_refraction_on_the_ground(name: str) -> None:
-    """The ray comes in steeper: the point is nearer to the satellite's nadir by 1.4 m at 25 degrees, no higher."""
+    """The ray comes in steeper: the point is nearer to the satellite's nadir by 1.5 m at 25 degrees, no higher."""
     model = sensor(TH1[name], LightEffects(False, False, True))
     off, on = (sensor(TH1[name], e).ground(5000.0, 5999.5, 300.0)[0] for e in (NO_EFFECTS, model.effects))
     nadir = EARTH.ecef(*EARTH.geodetic(CIRCLE.position(0.5))[:2], 300.0)

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.signal import fftconvolve
 
-from analysis.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import measure_edge
 from optics import quadrature
 from optics.diffraction import Grid, image
 from optics.imaging import imaging_field

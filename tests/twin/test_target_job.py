@@ -9,7 +9,7 @@ import tifffile
 import yaml
 
 import twin.render as command
-from analysis.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import measure_edge
 from scenes.job import JobSpec
 from scenes.load import EXAMPLES, LIBRARY
 from scenes.resolved import resolve, resolve_job

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.angle_fits import FITS
-from analysis.dividing_error import choose, compensate
+from analysis.turntable.angle_fits import FITS
+from analysis.turntable.dividing_error import choose, compensate
 from scenes.dividing_error import DividingErrorSpec, TurntableTestSpec
 from scenes.errors import InputError
 from scenes.load import EXAMPLES, load_turntable_test

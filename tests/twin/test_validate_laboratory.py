@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from analysis.angle_fits import FITS
+from analysis.turntable.angle_fits import FITS
 from optics.backend import load_backend
 from twin.validation import (
     laboratory_004,

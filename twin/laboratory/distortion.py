@@ -14,13 +14,21 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.angle_fits import FITS
-from analysis.distortion_measurement import CALIBRATED, SMOOTH, Distortion, PointMeans, Spots, locate_spots, reduce_sets
-from analysis.distortion_model import OrientationError, distortion, principal_distance, principal_point
-from analysis.distortion_model import principal_distance_and_point as distance_and_point
-from analysis.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
-from analysis.interior_orientation import InteriorOrientation, fit_interior_orientation
+from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
+from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
+from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
+from analysis.orientation.measurement import (
+    CALIBRATED,
+    SMOOTH,
+    Distortion,
+    PointMeans,
+    Spots,
+    locate_spots,
+    reduce_sets,
+)
 from analysis.spot_positions import SpotError
+from analysis.turntable.angle_fits import FITS
+from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
 from optics.backend import Backend
 from scenes.lab_setup import DistortionSetup
 from twin.laboratory.bench_error import BenchError

@@ -17,7 +17,7 @@ import numpy as np
 from analysis.noise import NoiseModel
 from optics.backend import Backend
 from optics.rotation import rotation_matrix
-from optics.test_target import pinhole
+from optics.targets import pinhole
 from optics.tree import State
 from scenes.camera_under_test import ROOT, build_camera_under_test
 from scenes.lab_setup import DistortionSetup

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries
 from optics.frozen_map import FrozenMap
 from scenes.dividing_error import DividingErrorSpec, TurntableTestSpec
 

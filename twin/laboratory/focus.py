@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.focal_plane import FocalPlaneFit, LineLevel, fit_focal_plane
-from analysis.rigid_motion import RigidMotion
-from analysis.shims import Mount, ShimError, ShimPlan, shim_plan
+from analysis.focal_plane.plane_fit import FocalPlaneFit, LineLevel, fit_focal_plane
+from analysis.focal_plane.rigid_motion import RigidMotion
+from analysis.focal_plane.shims import Mount, ShimError, ShimPlan, shim_plan
 from optics.pose import Pose
 from optics.rotation import about_axis, rotation_matrix
 from twin.detector import FixedPattern

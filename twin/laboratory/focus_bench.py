@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 from optics.backend import Backend
 from optics.pose import Pose
 from optics.pupil_function import PupilFunction
-from optics.test_target import slanted_edge
+from optics.targets import slanted_edge
 from optics.vector_shape import HalfPlane
 from scenes.camera_under_test import ROOT, CameraUnderTest, build_camera_under_test
 from twin.edge_images import EdgeImager, EdgeOptics

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import measure_edge
 from twin.laboratory.focus import Alignment, State
 from twin.laboratory.focus_bench import ALONG, EDGES, TRACK
 from twin.laboratory.printed_004 import CONFOCAL_UM

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.edge_location import EdgeError
-from analysis.slanted_edge import measure_edge
-from analysis.through_focus import FocusError, FocusVertex, focus_vertex
+from analysis.focal_plane.through_focus import FocusError, FocusVertex, focus_vertex
+from analysis.mtf.edge_location import EdgeError
+from analysis.mtf.slanted_edge import measure_edge
 from optics.pose import Pose
 from optics.threads import cores, one_blas_thread
 from twin.detector import FixedPattern

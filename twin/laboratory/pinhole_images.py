@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.pupil_function import PupilFunction
-from optics.test_target import Target
+from optics.targets import Target
 from optics.threads import one_blas_thread
 from optics.transfer import TransferTable, transfer
 from optics.tree import State

@@ -7,9 +7,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.distortion_model import distortion, principal_distance, principal_distance_and_point, principal_point
-from analysis.interior_orientation import fit_interior_orientation
 from analysis.monitoring import ARCSEC
+from analysis.orientation.distortion_model import (
+    distortion,
+    principal_distance,
+    principal_distance_and_point,
+    principal_point,
+)
+from analysis.orientation.interior import fit_interior_orientation
 from optics.backend import Backend
 from optics.rotation import rotation_matrix
 from scenes.camera_under_test import ROOT, build_camera_under_test

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.angle_fits import FITS, NotConvergedError, fit
-from analysis.chauvenet import rejection_rate
-from analysis.dividing_error import CalibrationSeries
 from analysis.monitoring import ARCSEC
+from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
+from analysis.turntable.chauvenet import rejection_rate
+from analysis.turntable.dividing_error import CalibrationSeries
 from optics.threads import one_blas_thread
 from scenes.dividing_error import TurntableTestSpec
 from scenes.lab_setup import resolve_turntable

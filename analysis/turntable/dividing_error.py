@@ -7,7 +7,7 @@ angle, so that every comparison reads e(R) + the error of the reference at that 
 repeated.
 
 1. `CalibrationSeries`: gross errors out by Chauvenet's criterion; mean, RMS of the repeats before and after, sigma.
-2. `choose`: five fits (analysis.angle_fits), the one with the smallest cross-validation error.
+2. `choose`: five fits (analysis.turntable.angle_fits), the one with the smallest cross-validation error.
 3. `DividingCompensation`: corrects readings and states the covariance of what it corrected.
 
 The paper gives a largest RMS of ten repeats of 0.081 arcsec, and after Chauvenet's criterion 0.037 arcsec. The second
@@ -27,8 +27,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from analysis.angle_fits import FITS, GAP_ORDER, AngleFit, CrossValidation, NotConvergedError, cross_validate, fit
-from analysis.chauvenet import chauvenet, normal_reduction
+from analysis.turntable.angle_fits import (
+    FITS,
+    GAP_ORDER,
+    AngleFit,
+    CrossValidation,
+    NotConvergedError,
+    cross_validate,
+    fit,
+)
+from analysis.turntable.chauvenet import chauvenet, normal_reduction
 
 __all__ = ["CalibrationSeries", "Choice", "DividingCompensation", "Trial", "choose", "compensate", "step_kernel"]
 

@@ -123,7 +123,7 @@ def pixel_noise(residual: Array) -> float:
 def locate_edge(grey: Array) -> EdgeLine:
     """First line through the one edge in grey values (H, W) as from `checked_region`.
 
-    Good to some hundredths of a pixel; `analysis.slanted_edge` refines it on all pixels together.
+    Good to some hundredths of a pixel; `analysis.mtf.slanted_edge` refines it on all pixels together.
 
     Raises:
         EdgeError: no edge, more than one, too weak, near 45 degrees, or not inside the region.

@@ -22,9 +22,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from analysis.bar_contrast import BarError, BarMtf, measure_bars
-from analysis.edge_mtf import EdgeMtf
-from analysis.slanted_edge import EdgeError, measure_edge
+from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
+from analysis.mtf.edge_mtf import EdgeMtf
+from analysis.mtf.slanted_edge import EdgeError, measure_edge
 
 Array = NDArray[np.float64]
 BAD_INPUT = 2

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.focus_lobe import LEAST_POINTS, WIDEST_FRACTION, Lobe, main_peak
+from analysis.focal_plane.focus_lobe import LEAST_POINTS, WIDEST_FRACTION, Lobe, main_peak
 
 __all__ = ["FocusError", "FocusVertex", "FocusVertices", "focus_vertex", "focus_vertices"]
 

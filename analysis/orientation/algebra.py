@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.distortion_model import InseparableTermsError, OrientationError
+from analysis.orientation.distortion_model import InseparableTermsError, OrientationError
 
 __all__ = ["condition_number", "gain", "noise_matrix", "noise_root"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.distortion_model import (
+from analysis.orientation.distortion_model import (
     OrientationError,
     distortion,
     principal_distance,

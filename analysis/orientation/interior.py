@@ -1,6 +1,6 @@
 """Interior orientation of a line camera from (angle, spot position) pairs, with all that is known of their noise.
 
-`fit_interior_orientation` fits the model of `analysis.distortion_model` (paper 004, eqs. 1-4, with a constant and
+`fit_interior_orientation` fits the model of `distortion_model` (paper 004, eqs. 1-4, with a constant and
 radial terms). Errors of a turntable are common to many points (eccentricity, graduation, the zero), so the noise is a
 full covariance. The paper weights all points alike; its estimates stay unbiased under such noise, but sigmas from the
 scatter of the residuals are wrong, for a common error hides in the parameters. Here every sigma comes from the given
@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from analysis.distortion_algebra import condition_number, gain, noise_matrix, noise_root
-from analysis.distortion_model import OrientationError, design, readings, slope
-from analysis.principal_point import PointReport, point_report
+from analysis.orientation.algebra import condition_number, gain, noise_matrix, noise_root
+from analysis.orientation.distortion_model import OrientationError, design, readings, slope
+from analysis.orientation.principal_point import PointReport, point_report
 
 __all__ = ["InteriorOrientation", "PrintedDistortion", "fit_interior_orientation"]
 
@@ -55,7 +55,7 @@ class PrintedDistortion:
 class InteriorOrientation:
     """Result of a fit over N points with P terms.
 
-    terms: names as in `analysis.distortion_model.TERMS`. values: (P,) m. covariance: (P, P) m^2.
+    terms: names as in `analysis.orientation.distortion_model.TERMS`. values: (P,) m. covariance: (P, P) m^2.
     weighted: generalised least squares; else all points alike, with the sandwich covariance.
     angle, position: (N,) rad, m, as measured. noise: (N, N) m^2, of positions and angles together.
     residual: (N,) m, position - model. residual_covariance: (N, N) m^2, of rank N - P.

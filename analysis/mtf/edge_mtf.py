@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from analysis.edge_location import Axis
+from analysis.mtf.edge_location import Axis
 
 __all__ = ["EdgeMtf"]
 

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.edge_location import saturation_fault
+from analysis.mtf.edge_location import saturation_fault
+from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
 from analysis.noise import NoiseModel
-from analysis.rice import rice_bias, rice_sigma, signal_modulus
 
 __all__ = ["BarError", "BarMtf", "measure_bars"]
 
@@ -99,7 +99,7 @@ def measure_bars(
     frequency: about what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row),
         or one number, its length, or None for the strongest below Nyquist.
     noise, frames: the detector's model and the number of averaged frames; without a model the variance is that of the
-        residuals and of the patches. saturation: as in `analysis.slanted_edge.measure_edge`. offset: grey value without
+        residuals and of the patches. saturation: as in `slanted_edge.measure_edge`. offset: grey value without
         light, for the contrast only.
 
     Raises:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.distortion_algebra import condition_number, gain, noise_root
-from analysis.distortion_model import OrientationError, design
+from analysis.orientation.algebra import condition_number, gain, noise_root
+from analysis.orientation.distortion_model import OrientationError, design
 
 __all__ = ["PointReport", "point_report"]
 

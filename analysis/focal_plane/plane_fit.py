@@ -22,7 +22,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from analysis.rigid_motion import RigidMotion
+from analysis.focal_plane.rigid_motion import RigidMotion
 
 __all__ = ["FocalPlaneFit", "LineLevel", "ObservabilityError", "fit_focal_plane", "line_level"]
 

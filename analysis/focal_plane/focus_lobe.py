@@ -1,6 +1,6 @@
 """The main peak of an MTF through focus, and the fit of a lobe to it, for many curves at once.
 
-The formula and why it is used: analysis.through_focus.
+The formula and why it is used: analysis.focal_plane.through_focus.
 """
 
 from __future__ import annotations

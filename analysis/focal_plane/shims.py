@@ -12,7 +12,7 @@ is left out, the shims alone give a tilt of w cos^2 i, and the line loses its le
 the whole tilt without a turn (another w / cos^2 i) would lose w tan i. A tilt about the axis of the inclination itself
 does not mix. All this comes out of `ShimPlan.shims_only`.
 
-Frame O'-X'Y'Z' of the assembly, metres and radians; see analysis.focal_plane.
+Frame O'-X'Y'Z' of the assembly, metres and radians; see analysis.focal_plane.plane_fit.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from analysis.rigid_motion import RigidMotion
+from analysis.focal_plane.rigid_motion import RigidMotion
 
 __all__ = ["Mount", "ShimError", "ShimPlan", "shim_plan"]
 

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from analysis.centroid import energy_centroid, mean_frames
-from analysis.dividing_error import CalibrationSeries
-from analysis.interior_orientation import InteriorOrientation, fit_interior_orientation
 from analysis.noise import NoiseModel
+from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
+from analysis.turntable.dividing_error import CalibrationSeries
 
 __all__ = ["CALIBRATED", "SMOOTH", "Distortion", "PointMeans", "Spots", "locate_spots", "reduce_sets"]
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from analysis.angle_network import NotConvergedError, network
+from analysis.turntable.angle_network import NotConvergedError, network
 
 __all__ = [
     "FITS",
@@ -92,7 +92,7 @@ class AngleFit:
     def covariance(self, angle: ArrayLike, other: ArrayLike | None = None) -> Array:
         """Covariance (M, L) of the predictions at angles (M,) and (L,), or (M, M), from the points' independent sigmas.
 
-        It holds the noise alone: not what the fit misses of the curve (see `analysis.dividing_error`).
+        It holds the noise alone: not what the fit misses of the curve (see `analysis.turntable.dividing_error`).
         """
         first = self.weights(angle)
         second = first if other is None else self.weights(other)

@@ -1,7 +1,7 @@
 """Modulation transfer function (MTF) from one slanted edge, after ISO 12233, with the standard deviation by theory.
 
-Steps: the edge's line from row centroids (`analysis.edge_location`); all pixels projected on the edge's *normal* and a
-least-squares edge-spread function through them (`analysis.edge_spread`); angle, position and a test for curvature by
+Steps: the edge's line from row centroids (`edge_location`); all pixels projected on the edge's *normal* and a
+least-squares edge-spread function through them (`edge_spread`); angle, position and a test for curvature by
 one Gauss-Newton step on all pixels, twice; the transform of the line-spread function in closed form over the contrast.
 
 ISO 12233 projects along the rows, and its frequencies are counted along the row. Here they are counted along the
@@ -24,11 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.edge_location import EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
-from analysis.edge_mtf import EdgeMtf
-from analysis.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
+from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
+from analysis.mtf.edge_mtf import EdgeMtf
+from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
+from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
 from analysis.noise import NoiseModel
-from analysis.rice import rice_bias, rice_sigma, signal_modulus
 
 __all__ = ["EdgeError", "EdgeMtf", "measure_edge"]
 

@@ -1,0 +1,1 @@
+"""Interior orientation and distortion from angles and spot positions (paper 004)."""

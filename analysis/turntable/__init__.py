@@ -1,0 +1,1 @@
+"""Dividing error of a turntable: repeats, outliers, fits, compensation (paper 004)."""

@@ -1,0 +1,103 @@
+"""A three-line camera of refractive lenses: one ideal projection with distortion for each line, as a file in
+scenes/orbit gives it.
+
+No prescription is needed: a line is known by its interior orientation (principal point, principal distance, radial
+distortion) and by how it is mounted on the base.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from scenes.errors import InputError, Issue, Problem, names_text, nearest, shown
+from scenes.instrument import LookAngle
+from scenes.load import LIBRARY, library_names
+from scenes.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
+from scenes.spec import Name, Named, Spec, Text, Whole
+from scenes.translate import validate
+from scenes.units import ANGLE, Kind
+from scenes.yaml_file import read_yaml
+
+ORBIT = "orbit"
+"""Folder of the library for what flies and how."""
+
+_PER_LENGTH2 = Kind("an inverse length squared", "1/m^2", ("1/m^2", "1/mm^2"), "0.02 1/m^2")
+_PER_LENGTH4 = Kind("an inverse length to the fourth", "1/m^4", ("1/m^4", "1/mm^4"), "1 1/m^4")
+Distortion3 = Annotated[float, Quantity(_PER_LENGTH2, largest="100 1/m^2")]
+Distortion5 = Annotated[float, Quantity(_PER_LENGTH4, largest="1e5 1/m^4")]
+Misalignment = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
+LongestLine = Annotated[Whole, Field(ge=2, le=1_000_000)]
+
+
+class LineCameraSpec(Spec):
+    """One line camera: its interior orientation and how it stands on the base.
+
+    The image is the real one, behind the lens: a point of the line at +y sees the scene at -Y. Its look in the camera's
+    axes is along (-(x - x0)(1 + d), -(y - y0)(1 + d), f) with d = k1 r^2 + k2 r^4, r from the principal point. Positive
+    d means that the point looks further out than an ideal projection (Brown, Photogramm. Eng. 37(8), 1971: the term is
+    added to the measured coordinates).
+
+    Attributes:
+        look: angle of the camera's Z from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+        rotate: misalignment, a rotation vector in the camera's own axes after the look, radians.
+        position: of the projection centre in the base frame, metres.
+        focal_length: principal distance f, metres.
+        principal_point: where the camera's Z meets the focal plane, x (flight) and y (along the line) from the line's
+            centre, metres.
+        k1: radial distortion of third order, 1/m^2.
+        k2: radial distortion of fifth order, 1/m^4.
+    """
+
+    look: LookAngle
+    rotate: Misalignment = (0.0, 0.0, 0.0)
+    position: Vector3 = (0.0, 0.0, 0.0)
+    focal_length: PositiveLength
+    principal_point: Vector2 = (0.0, 0.0)
+    k1: Distortion3 = 0.0
+    k2: Distortion5 = 0.0
+
+
+def _some_lines(lines: Named[LineCameraSpec]) -> Named[LineCameraSpec]:
+    if not lines:
+        raise Problem("no lines", "an empty mapping", "at least one line camera")
+    return lines
+
+
+class ThreeLineCameraSpec(Spec):
+    """The payload of a three-line mapping satellite.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        pixels: of each line; pixel 0 is at its -y end.
+        pitch: of the pixels, metres.
+        lines: by name, in the order in which they see a point on the ground; normally forward, nadir and aft.
+    """
+
+    name: Name
+    description: Text = ""
+    pixels: LongestLine
+    pitch: PositiveLength
+    lines: Annotated[Named[LineCameraSpec], AfterValidator(_some_lines)]
+
+
+def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
+    """Read a payload.
+
+    Args:
+        name_or_path: a name in scenes/orbit, or a path (anything with a slash or ending in .yaml or .yml).
+
+    Raises:
+        InputError: no such name, or the file cannot be read or is not valid; one issue for each fault.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
+        return validate(ThreeLineCameraSpec, read_yaml(text))
+    names = library_names(ORBIT)
+    if text not in names:
+        allowed = f"{names_text(names)}, or the path of a .yaml file"
+        raise InputError(
+            Issue(f"no such name in {ORBIT}", found=shown(text), allowed=allowed, suggestion=nearest(text, names))
+        )
+    return validate(ThreeLineCameraSpec, read_yaml(LIBRARY / ORBIT / f"{text}.yaml"))
