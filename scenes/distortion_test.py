@@ -43,7 +43,7 @@ class DistortionTestSpec(CameraUnderTestSpec):
     pinhole: PositiveLength
     band: Name
     points: Annotated[Whole, Field(ge=3, le=1001)]
-    reach: Annotated[Number, Field(gt=0.0, lt=1.0)]
+    reach: Annotated[Number, Field(ge=0.05, lt=1.0)]
     sets: Annotated[Whole, Field(ge=1, le=1000)]
     light: Light
     frames: Frames = 4

@@ -22,7 +22,9 @@ from scenes.error_budget import ErrorBudgetSpec
 from scenes.focus_test import FocusTestSpec
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
+from scenes.orbit_angle import OrbitAngleSpec
 from scenes.spec import Spec
+from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.turntable import PrincipleExperimentSpec
 
 MODELS: dict[str, type[Spec]] = {
@@ -35,6 +37,8 @@ MODELS: dict[str, type[Spec]] = {
     "focus_test": FocusTestSpec,
     "distortion_test": DistortionTestSpec,
     "turntable_test": TurntableTestSpec,
+    "orbit_angle": OrbitAngleSpec,
+    "three_line_camera": ThreeLineCameraSpec,
 }
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")

@@ -186,14 +186,10 @@ class TargetPath:
     def _target_axes(self, direction: np.ndarray) -> np.ndarray:
         """Directions in which light turns when its image moves along +Y' and +X', (2, 3).
 
-        With the camera's Z toward the scene, light that travels along -Z + t has its image at +f t.
+        With the camera's Z toward the scene, light that travels along -Z + t has its image at +f t; the second axis,
+        direction x Y, is then near the camera's X.
         """
-        return transverse_axes(direction, self._axes[:, 1])[:, :] * self._senses(direction)[:, None]
-
-    def _senses(self, direction: np.ndarray) -> np.ndarray:
-        """Signs that make the second transverse axis point along the camera's X."""
-        _, second = transverse_axes(direction, self._axes[:, 1])
-        return np.array([1.0, float(np.sign(second @ self._axes[:, 0]))])
+        return transverse_axes(direction, self._axes[:, 1])
 
     def _launch(self, directions: np.ndarray) -> np.ndarray:
         """Points of the beams before the first mirror, world, (F, 3)."""

@@ -35,7 +35,7 @@ _LEAST_SPREAD = 1e-3
 class ShimError(ValueError):
     """The motion cannot be made with this mount and these shims.
 
-    holes: numbers of the holes at fault, from 0, empty when it is the mount as a whole.
+    holes: indices of the holes at fault, empty when it is the mount as a whole. The message counts them from 1.
     """
 
     def __init__(self, message: str, holes: tuple[int, ...] = ()) -> None:
@@ -223,7 +223,7 @@ def _check_clearance(slide: Array, clearance: float) -> None:
     over = np.flatnonzero(size > clearance)
     if not over.size:
         return
-    text = ", ".join(f"hole {h} by {1e3 * size[h]:.4g} mm" for h in over)
+    text = ", ".join(f"hole {h + 1} by {1e3 * size[h]:.4g} mm" for h in over)
     raise ShimError(
         f"shims: the motion slides {text}; the screws allow {1e3 * clearance:.4g} mm, which is"
         f" {1e3 * (size.max() - clearance):.4g} mm too little; widen the holes by as much",
@@ -236,7 +236,7 @@ def _check_thickness(thickness: Array, now: Array, least: float, step: float) ->
     thin = np.flatnonzero(thickness < least - 1e-9 * step)
     if not thin.size:
         return
-    text = ", ".join(f"hole {h} would get {1e3 * thickness[h]:.4g} mm" for h in thin)
+    text = ", ".join(f"hole {h + 1} would get {1e3 * thickness[h]:.4g} mm" for h in thin)
     short = step * float(np.ceil(np.max(least - thickness) / step - 1e-9))
     raise ShimError(
         f"shims: {text}, the least is {1e3 * least:.4g} mm; move the seat back and start from shims that are"

@@ -229,10 +229,10 @@ def test_present_shims():
 
 def test_errors_say_what_to_change():
     mount = make_mount(count=4, clearance=0.05 * MM)
-    with pytest.raises(ShimError, match=r"hole 0 by 0\.\d+ mm.*allow 0\.05 mm.*mm too little") as caught:
+    with pytest.raises(ShimError, match=r"hole 1 by 0\.\d+ mm.*allow 0\.05 mm.*mm too little") as caught:
         shim_plan(RigidMotion.of([0, 0, 5 * ARCMIN], [0, 0, 0]), mount)
     assert caught.value.holes == (0, 1, 2, 3)
-    with pytest.raises(ShimError, match=r"hole 2 would get -0\.1 mm, .* 0\.1 mm thicker.* 1\.1 mm at") as caught:
+    with pytest.raises(ShimError, match=r"hole 3 would get -0\.1 mm, .* 0\.1 mm thicker.* 1\.1 mm at") as caught:
         shim_plan(
             RigidMotion.of([5 * ARCMIN, 0, 0], [0, 0, 0]), make_mount(count=4), [0.5 * MM, 0.5 * MM, 0.05 * MM, MM]
         )

@@ -1,4 +1,4 @@
-"""Files of a laboratory test's run folder."""
+"""Files of a test's run folder."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ class RunFacts:
         seed: of everything that is drawn.
         started: seconds since the epoch.
         seconds: that it took.
+        program: that ran it, as the user calls it.
     """
 
     config: str
@@ -33,6 +34,7 @@ class RunFacts:
     seed: int
     started: float
     seconds: float
+    program: str = "twin.lab"
 
 
 def place(artefact: Artefact) -> str:
@@ -42,7 +44,7 @@ def place(artefact: Artefact) -> str:
 
 def render_report(result: LabResult, facts: RunFacts) -> str:
     """``report.html`` as text."""
-    again = f"python -m twin.lab {result.kind} config.yaml --seed {facts.seed} --backend {facts.backend} --out again"
+    options = f"--seed {facts.seed} --backend {facts.backend} --out again"
     return (
         environment(__package__)
         .get_template(TEMPLATE)
@@ -58,7 +60,7 @@ def render_report(result: LabResult, facts: RunFacts) -> str:
                 for section in result.sections
             ],
             facts=facts,
-            command=again,
+            command=f"python -m {facts.program} {result.kind} config.yaml {options}",
             versions=versions(),
         )
     )
@@ -75,7 +77,7 @@ def write_lab(result: LabResult, facts: RunFacts, folder: RunFolder) -> None:
         folder.write_bytes(f"images/{name}.png", preview_png(frames, stretch=None))
     folder.write_text("report.html", render_report(result, facts))
     manifest = {
-        "program": "twin.lab",
+        "program": facts.program,
         "test": result.kind,
         "versions": versions(),
         "backend": facts.backend,

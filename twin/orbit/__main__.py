@@ -1,0 +1,49 @@
+"""``python -m twin.orbit``: the camera in orbit (papers 000 and 003)."""
+
+from __future__ import annotations
+
+import typer
+
+from scenes.orbit_angle import resolve_angle
+from twin.laboratory.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
+from twin.orbit.angle_result import run_angle
+
+PROGRAM = "twin.orbit"
+
+app = typer.Typer(
+    add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
+)
+
+
+@app.callback()
+def main() -> None:
+    """Calibrate a line camera in orbit from points on the ground.
+
+    Examples are in scenes/orbit. The run folder gets config.yaml, the numbers as JSON, a self-contained report.html,
+    figures and tables in artefacts/.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+
+
+@app.command()
+def angle(
+    file: File,
+    out: Out = None,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
+    space resection as the second method.
+
+    angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
+    station and of the points, with the paper's sentences on it judged.
+    """
+    run_test(PROGRAM, file, resolve_angle, run_angle, Options(out, seed, backend, force, as_json, quiet))
+
+
+if __name__ == "__main__":
+    app()
