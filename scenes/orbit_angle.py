@@ -50,7 +50,8 @@ class StripsSpec(Spec):
         if self.points < LEAST_POINTS:
             found = f"{self.points} on each strip"
             allowed = f"{LEAST_POINTS} or more; paper 000 asks for n >= {LEAST_POINTS}"
-            raise Problem("too few points for a plane that its own residuals can check", found, allowed, ("points",))
+            problem = "too few points to fit a plane"
+            raise Problem(problem, found, allowed, within=("points",))
         if not self.first < self.last:
             found = f"first {self.first:g}, last {self.last:g}"
             raise Problem("the strip has no length", found, "a last pixel after the first", within=("last",))

@@ -1,5 +1,5 @@
-"""The intersection angle test's procedure: estimates by planes and by resection, in other frames, over many passes, with
-each effect on the light. Truth enters only where an estimate is compared with it.
+"""The intersection angle test's procedure: estimates by planes and by resection, in other frames, over many passes,
+with each effect on the light. Truth enters only where an estimate is compared with it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 ARCSEC = np.pi / 648000.0
 """Radians."""
 ANGLES = tuple(PAIRS)
-FRAMES = ("Earth-fixed", "local level", "orbital")
+FRAMES = ("Earth-fixed", "local level", "orbital", "nadir line")
 EFFECTS = ("light_time", "aberration", "refraction")
 
 
@@ -241,6 +241,7 @@ def frame_rows(flight: AnglePass, measurement: Measurement) -> tuple[FrameRow, .
         FRAMES[0]: (np.eye(3), np.zeros(3)),
         FRAMES[1]: (flight.local, flight.nadir_point),
         FRAMES[2]: (flight.orbital, flight.station),
+        FRAMES[3]: (flight.nadir_line, flight.station),
     }
     rows = []
     for frame, (axes, origin) in places.items():

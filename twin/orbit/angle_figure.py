@@ -74,7 +74,7 @@ def sensitivity_figure(run: AngleRun, name: str) -> Figure:
 
 
 def scatter_figure(run: AngleRun) -> Figure:
-    """alpha and beta of all passes about the truth, with the 95% ellipse of the claimed covariance."""
+    """Angles of all passes about the truth, with the 95% ellipse of the claimed covariance."""
     figure = new_figure(4.4)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     cases = (("Planes, total least squares", run.planes), ("Resection", run.resection))

@@ -10,6 +10,7 @@ from twin.laboratory.section import Section
 from twin.orbit.angle_analysis import ARCSEC, FRAMES, AngleRun, Scatter
 from twin.orbit.angle_figure import drawn
 from twin.orbit.angle_json import PRINTED_DIFFERENCE_ARCSEC
+from twin.report.numbers import fixed
 
 
 def sections(run: AngleRun) -> tuple[Section, ...]:
@@ -24,9 +25,9 @@ def _geometry(run: AngleRun) -> Section:
     text = [
         "At one moment the station O and the ground points that one line sees lie in a plane. α is the angle between "
         "the forward and the nadir plane, β between the nadir and the aft plane (paper 000, Fig. 2, eqs. 6 and 7).",
-        f"The planes give dihedral angles. The angles between the lines of sight of the lines' centres, which make "
-        f"heights, differ from them by {-apart[0]:+.4f}″ and {-apart[1]:+.4f}″ for this camera, because its lines are "
-        "not quite parallel and do not begin at one place across the track.",
+        "The planes give dihedral angles. The angles between the lines of sight of the lines' centres, which make "
+        f"heights, differ from them by {fixed(-apart[0], 4)}″ and {fixed(-apart[1], 4)}″ for this camera, because its "
+        "lines are not quite parallel and do not begin at one place across the track.",
     ]
     heights = [f"{v:.2f} m for {n}" for n, v in run.height.items() if v is not None]
     if heights:
@@ -68,7 +69,8 @@ def _scatter(run: AngleRun) -> Section:
         "Both methods use the same station and points. The resection also uses where on its line a point lies and one "
         "attitude for all lines, which the laboratory's interior orientation must then be right for; the planes "
         "use neither. Most of the error of an angle is common to both, so that their difference scatters less than "
-        "either: a difference as large as the paper's comes from what the two methods assume, not from the points.",
+        "either. Errors of the points and of the station as they are drawn here do not make a difference as large as "
+        "the paper's; what the two methods assume can, and so can eq. 5 in an unfit frame (below).",
     )
     figure = SvgFigure(
         "scatter-passes",
@@ -92,7 +94,8 @@ def _frames(run: AngleRun) -> Section:
     for row in run.frames:
         off = (row.values - reference) / ARCSEC
         cells = [float(v) if np.isfinite(v) else None for v in off]
-        rows.append((row.frame, row.method, *cells, row.steepest, "biased, and says so" if row.warned else ""))
+        said = "biased, and says so" if row.warned else ""
+        rows.append((row.frame, row.method, *cells, row.steepest, said if np.all(np.isfinite(off)) else "singular"))
     worst = max(
         (float(np.max(np.abs(r.values - reference))) for r in run.frames if r.warned and np.all(np.isfinite(r.values))),
         default=0.0,
@@ -100,9 +103,10 @@ def _frames(run: AngleRun) -> Section:
     spread = max(float(np.max(np.abs(r.values - reference))) for r in run.frames if r.method == "tls")
     text = [
         "z = a0 x + a1 y + a2 has no vertical planes. In a level or an orbital frame the nadir plane is nearly "
-        "vertical: x and y of its points lie on one line, eq. 5 is nearly singular, and noise decides the slopes. "
-        f"There the printed form misses by up to {worst / ARCSEC:.4g}″. Total least squares does not depend on the "
-        f"frame: its angles agree to {spread / ARCSEC:.1g}″.",
+        "vertical: x and y of its points lie on one line, eq. 5 is nearly singular, and noise flattens the slopes the "
+        "more, the smaller the normal's z. In the frame of the nadir line itself the plane is vertical and noise alone "
+        f"decides: the printed form {_failure(worst)}. Total least squares does not depend on the frame: "
+        f"its angles agree to {spread / ARCSEC:.1g}″.",
         "Eq. 5 is printed with the wrong sign on its right side. Both slopes of every plane then come out negated, "
         "which is one half turn of all planes about the frame's z axis: the angles are right, the planes are not.",
     ]
@@ -116,6 +120,13 @@ def _frames(run: AngleRun) -> Section:
         (None, None, 6, 6, 6, None),
     )
     return Section("Forms of the plane and frames", tuple(text), (table,))
+
+
+def _failure(worst: float) -> str:
+    if worst == 0.0:
+        return "finds no plane at all"
+    size = f"{np.degrees(worst):.3g}°" if worst > np.radians(0.1) else f"{worst / ARCSEC:.3g}″"
+    return f"misses by up to {size}"
 
 
 def _effects(run: AngleRun) -> Section:
@@ -185,8 +196,8 @@ def _sensitivity(run: AngleRun) -> Section:
     text = (
         "The station, or all points of one strip, is moved by 0 to 10 m along one axis of the Earth-fixed frame. The "
         "ordinate is the paper's: resection, which stays, minus planes.",
-        f"{held} of {len(found)} sentences hold on this pass. The answer to 10 m is a straight line: second-order terms "
-        "are of the size 10 m over 500 km.",
+        f"{held} of {len(found)} sentences hold on this pass. The answer to 10 m is a straight line: second-order "
+        "terms are of the size 10 m over 500 km.",
     )
     return Section("Errors of the station and of the points", text, (*figures, table, sentences))
 

@@ -29,7 +29,7 @@ from twin.orbit.light_effects import (
     turned_with_earth,
     unrefracted,
 )
-from twin.orbit.line_camera import LineCamera, dihedral_angle, line_cameras, look_angle
+from twin.orbit.line_camera import LineCamera, dihedral_angle, line_cameras, line_normal, look_angle
 from twin.orbit.orbit import propagate
 from twin.orbit.sensor import Sensor
 from twin.orbit.trajectory import Trajectory
@@ -124,7 +124,7 @@ class AnglePass:
     def nadir_point(self) -> np.ndarray:
         """What the nadir line's centre sees, (3,); origin of the local level frame."""
         middle = np.array([0.5 * (self.cameras["nadir"].pixels - 1)])
-        return self._sensor("nadir", NO_EFFECTS).ground(0.0, middle, self.spec.terrain.height)[0]
+        return self._sensor("nadir", NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
 
     @property
     def local(self) -> np.ndarray:
@@ -137,13 +137,25 @@ class AnglePass:
         """Axes of the orbital frame as rows: forward, right, down, (3, 3)."""
         return np.asarray(self.trajectory.orbital_to_itrs(self.spec.time).T)
 
+    @property
+    def nadir_line(self) -> np.ndarray:
+        """Axes of the nadir line as rows: normal of its plane, along the line, line of sight of its middle, (3, 3)."""
+        camera = self.cameras["nadir"]
+        x = line_normal(camera)
+        z = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
+        z = z - (z @ x) * x
+        z = z / np.linalg.norm(z)
+        return np.stack([x, np.cross(z, x), z]) @ self.trajectory.body_to_itrs(self.spec.time).T
+
     def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
         """Line -> true ground points, (n, 3), when these effects act on the light.
 
         Raises:
             BenchError: a look misses the Earth, or the time is too near the end of the orbit.
         """
-        points = {name: self._sensor(name, effects).ground(0.0, self.pixel, self.height[name]) for name in LINES}
+        points = {
+            name: self._sensor(name, effects).ground(np.zeros(1), self.pixel, self.height[name]) for name in LINES
+        }
         if not all(np.all(np.isfinite(p)) for p in points.values()):
             raise BenchError("a look misses the Earth", ("attitude",), "an attitude in which all lines see the ground")
         return points
