@@ -1,7 +1,6 @@
 """A laboratory test together with everything it refers to, so that one file says all that went into a run."""
 
 from pathlib import Path
-from typing import Generic, Self, TypeVar
 
 from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
@@ -9,6 +8,7 @@ from scenes.detector import DetectorSpec
 from scenes.distortion_test import DistortionTestSpec
 from scenes.dividing_error import TurntableTestSpec
 from scenes.errors import names_text, nearest
+from scenes.experiment import ExperimentSetup, read_setup
 from scenes.focus_test import FocusTestSpec
 from scenes.load import (
     find_camera,
@@ -18,32 +18,10 @@ from scenes.load import (
     load_lab_test,
     load_turntable_test,
 )
-from scenes.spec import Paths, Source, Spec
-from scenes.translate import validate
-from scenes.yaml_file import dump_yaml, read_yaml
-
-TestType = TypeVar("TestType", FocusTestSpec, DistortionTestSpec, TurntableTestSpec)
+from scenes.spec import Paths, Spec
 
 
-class LabSetup(Spec, Generic[TestType]):
-    """What all laboratory tests have.
-
-    Attributes:
-        test: what the test's file says.
-    """
-
-    test: TestType
-
-    def with_seed(self, seed: int) -> Self:
-        """The same with another seed, for one that a command overrides."""
-        return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
-
-    def to_yaml(self) -> str:
-        """Text of a config.yaml; the function that read the test reads it back to the same values."""
-        return dump_yaml(self.plain())
-
-
-class FocusSetup(LabSetup[FocusTestSpec]):
+class FocusSetup(ExperimentSetup[FocusTestSpec]):
     """A focal-plane alignment with its camera and detectors.
 
     Attributes:
@@ -55,7 +33,7 @@ class FocusSetup(LabSetup[FocusTestSpec]):
     detectors: Paths[DetectorSpec]
 
 
-class DistortionSetup(LabSetup[DistortionTestSpec]):
+class DistortionSetup(ExperimentSetup[DistortionTestSpec]):
     """A distortion test with its camera, detectors and turntable.
 
     Attributes:
@@ -69,7 +47,7 @@ class DistortionSetup(LabSetup[DistortionTestSpec]):
     detectors: Paths[DetectorSpec]
 
 
-class TurntableSetup(LabSetup[TurntableTestSpec]):
+class TurntableSetup(ExperimentSetup[TurntableTestSpec]):
     """A turntable test, which refers to nothing else."""
 
 
@@ -79,11 +57,9 @@ def resolve_focus(path: str | Path) -> FocusSetup:
     Raises:
         InputError: any of the files cannot be read or is not valid.
     """
-    if _is_resolved(path):
-        setup = validate(FocusSetup, read_yaml(path))
-        test = _told(setup, setup.test)
-        _require_plane(test, setup.camera)
-        return setup.model_copy(update={"test": test})
+    if (again := read_setup(FocusSetup, path)) is not None:
+        _require_plane(again.test, again.camera)
+        return again
     test = load_lab_test(FocusTestSpec, path)
     camera = load_camera(find_camera(test))
     _require_plane(test, camera)
@@ -96,11 +72,9 @@ def resolve_distortion(path: str | Path) -> DistortionSetup:
     Raises:
         InputError: any of the files cannot be read or is not valid.
     """
-    if _is_resolved(path):
-        setup = validate(DistortionSetup, read_yaml(path))
-        test = _told(setup, setup.test)
-        _require_bands(test, setup.camera, setup.test.band)
-        return setup.model_copy(update={"test": test})
+    if (again := read_setup(DistortionSetup, path)) is not None:
+        _require_bands(again.test, again.camera, again.test.band)
+        return again
     test = load_lab_test(DistortionTestSpec, path)
     camera = load_camera(find_camera(test))
     _require_bands(test, camera, test.band)
@@ -116,24 +90,9 @@ def resolve_turntable(path: str | Path) -> TurntableSetup:
     Raises:
         InputError: the file cannot be read or is not valid.
     """
-    if _is_resolved(path):
-        setup = validate(TurntableSetup, read_yaml(path))
-        return setup.model_copy(update={"test": _told(setup, setup.test)})
+    if (again := read_setup(TurntableSetup, path)) is not None:
+        return again
     return TurntableSetup.model_construct(test=load_turntable_test(path))
-
-
-def _is_resolved(path: str | Path) -> bool:
-    data = read_yaml(path).data if _is_file(path) else None
-    return isinstance(data, dict) and "test" in data
-
-
-def _is_file(path: str | Path) -> bool:
-    return isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))
-
-
-def _told(setup: Spec, test: Spec) -> Spec:
-    """The test, knowing where it was read."""
-    return test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
 
 
 def _require_plane(test: Spec, camera: CameraSpec) -> None:

@@ -1,7 +1,7 @@
 """Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
 
-The library's folders are scenes/cameras, scenes/instruments, scenes/detectors and scenes/lab (experiments on the
-ground); a file's name without .yaml is its name there.
+The library's folders are scenes/cameras, scenes/instruments, scenes/detectors, scenes/payloads, scenes/lab (experiments
+on the ground) and scenes/orbit (in flight); a file's name without .yaml is its name there.
 """
 
 from pathlib import Path
@@ -16,7 +16,9 @@ from scenes.error_budget import ErrorBudgetSpec
 from scenes.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
+from scenes.orbit_angle import OrbitAngleSpec
 from scenes.spec import Spec
+from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.translate import validate
 from scenes.turntable import PrincipleExperimentSpec, PrincipleSetup
 from scenes.yaml_file import read_yaml
@@ -26,7 +28,7 @@ SpecType = TypeVar("SpecType", bound=Spec)
 LIBRARY = Path(__file__).resolve().parent
 EXAMPLES = LIBRARY / "examples"
 CAMERAS, INSTRUMENTS, DETECTORS = "cameras", "instruments", "detectors"
-LAB, BUDGETS = "lab", "budgets"
+LAB, BUDGETS, ORBIT, PAYLOADS = "lab", "budgets", "orbit", "payloads"
 
 
 def library_names(folder: str) -> tuple[str, ...]:
@@ -121,6 +123,11 @@ def load_lab_test(model: type[SpecType], name_or_path: str | Path, relative_to: 
     return _load(model, LAB, name_or_path, relative_to)
 
 
+def load_orbit_test(model: type[SpecType], name_or_path: str | Path) -> SpecType:
+    """Read a test in orbit of that sort; arguments and errors as `load_instrument`."""
+    return _load(model, ORBIT, name_or_path, None)
+
+
 def find_camera(test: CameraUnderTestSpec) -> Path:
     """The file of the camera under test. Raises InputError if there is none."""
     return _find(CAMERAS, test.camera, test, ("camera",))
@@ -129,6 +136,16 @@ def find_camera(test: CameraUnderTestSpec) -> Path:
 def find_turntable_test(test: DistortionTestSpec) -> Path:
     """The file of the distortion test's turntable. Raises InputError if there is none."""
     return _find(LAB, test.turntable, test, ("turntable",))
+
+
+def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> ThreeLineCameraSpec:
+    """Read a three-line payload; arguments and errors as `load_instrument`."""
+    return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
+
+
+def find_payload(test: OrbitAngleSpec) -> Path:
+    """The file of the payload of a test in orbit. Raises InputError if there is none."""
+    return _find(PAYLOADS, test.camera, test, ("camera",))
 
 
 def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:

@@ -2,20 +2,16 @@
 camera that it refers to.
 """
 
-from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from scenes.errors import Problem, names_text, nearest
-from scenes.load import LIBRARY, library_names
+from scenes.errors import Problem
 from scenes.orbit_spec import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.quantity import Quantity, Vector, Wavelength
-from scenes.spec import Name, Named, Number, Reference, Seed, Source, Spec, Text, Whole
-from scenes.three_line_camera import ORBIT, Misalignment, ThreeLineCameraSpec
-from scenes.translate import validate
+from scenes.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
+from scenes.three_line_camera import Misalignment
 from scenes.units import DISTANCE, LENGTH, MOMENT, format_quantity
-from scenes.yaml_file import dump_yaml, read_yaml
 
 LINES = ("forward", "nadir", "aft")
 """Lines that a camera must have: alpha lies between the first two, beta between the last two."""
@@ -149,78 +145,3 @@ class OrbitAngleSpec(Spec):
             found = format_quantity(self.time, MOMENT)
             raise Problem("outside the orbit data", found, allowed, within=("time",))
         return self
-
-
-class AngleSetup(Spec):
-    """The test together with its camera, so that one file says all that went into a run.
-
-    Attributes:
-        test: what the test's file says.
-        camera: the payload.
-    """
-
-    test: OrbitAngleSpec
-    camera: ThreeLineCameraSpec
-
-    def with_seed(self, seed: int) -> Self:
-        """The same with another seed, for one that a command overrides."""
-        return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
-
-    def to_yaml(self) -> str:
-        """Text of a config.yaml; `resolve_angle` reads it back to the same values."""
-        return dump_yaml(self.plain())
-
-
-def resolve_angle(path: str | Path) -> AngleSetup:
-    """Read a test and the camera it refers to; a run's config.yaml can be given in its place.
-
-    Raises:
-        InputError: a file cannot be read or is not valid, or test and camera do not fit.
-    """
-    yaml = read_yaml(path)
-    if isinstance(yaml.data, dict) and "test" in yaml.data:
-        setup = validate(AngleSetup, yaml)
-        test = setup.test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
-        setup = setup.model_copy(update={"test": test})
-    else:
-        test = validate(OrbitAngleSpec, yaml)
-        camera = validate(ThreeLineCameraSpec, read_yaml(_camera_file(test)))
-        setup = AngleSetup.model_construct(test=test, camera=camera)
-    _require_fit(setup.test, setup.camera)
-    return setup
-
-
-def _camera_file(test: OrbitAngleSpec) -> Path:
-    text = test.camera
-    if "/" in text or text.endswith((".yaml", ".yml")):
-        path = Path(test.source.file).parent / text
-        if not path.is_file():
-            raise test.error(f"no such file: {path}", ("camera",))
-        return path
-    if text not in library_names(ORBIT):
-        # the folder holds tests as well
-        every = {name: read_yaml(LIBRARY / ORBIT / f"{name}.yaml").data for name in library_names(ORBIT)}
-        names = tuple(name for name, data in every.items() if isinstance(data, dict) and "lines" in data)
-        allowed = f"{names_text(names)}, or the path of a .yaml file"
-        suggestion = nearest(text, names)
-        raise test.error("no such camera", ("camera",), found=text, allowed=allowed, suggestion=suggestion)
-    return LIBRARY / ORBIT / f"{text}.yaml"
-
-
-def _require_fit(test: OrbitAngleSpec, camera: ThreeLineCameraSpec) -> None:
-    """InputError unless the camera has the three lines, and the strips and changes lie on them."""
-    if missing := [name for name in LINES if name not in camera.lines]:
-        found = f"{names_text(tuple(camera.lines))} in {camera.name}"
-        problem = f"the camera has no {' and no '.join(missing)} line"
-        raise test.error(problem, ("camera",), found=found, allowed="a camera with lines forward, nadir and aft")
-    for name in test.changes:
-        if name not in LINES:
-            raise test.error(
-                "no such line", ("changes", name), allowed=names_text(LINES), suggestion=nearest(name, LINES)
-            )
-    last = camera.pixels - 0.5
-    for key in ("first", "last"):
-        pixel = getattr(test.strips, key)
-        if not -0.5 <= pixel <= last:
-            allowed = f"-0.5 to {last:g}, the ends of the lines of {camera.name}"
-            raise test.error("outside the line", ("strips", key), found=f"pixel {pixel:g}", allowed=allowed)

@@ -1,26 +1,19 @@
 """A three-line camera of refractive lenses: one ideal projection with distortion for each line, as a file in
-scenes/orbit gives it.
+scenes/payloads gives it.
 
 No prescription is needed: a line is known by its interior orientation (principal point, principal distance, radial
 distortion) and by how it is mounted on the base.
 """
 
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from scenes.errors import InputError, Issue, Problem, names_text, nearest, shown
+from scenes.errors import Problem
 from scenes.instrument import LookAngle
-from scenes.load import LIBRARY, library_names
 from scenes.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.spec import Name, Named, Spec, Text, Whole
-from scenes.translate import validate
 from scenes.units import ANGLE, Kind
-from scenes.yaml_file import read_yaml
-
-ORBIT = "orbit"
-"""Folder of the library for what flies and how."""
 
 _PER_LENGTH2 = Kind("an inverse length squared", "1/m^2", ("1/m^2", "1/mm^2"), "0.02 1/m^2")
 _PER_LENGTH4 = Kind("an inverse length to the fourth", "1/m^4", ("1/m^4", "1/mm^4"), "1 1/m^4")
@@ -80,24 +73,3 @@ class ThreeLineCameraSpec(Spec):
     pixels: LongestLine
     pitch: PositiveLength
     lines: Annotated[Named[LineCameraSpec], AfterValidator(_some_lines)]
-
-
-def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
-    """Read a payload.
-
-    Args:
-        name_or_path: a name in scenes/orbit, or a path (anything with a slash or ending in .yaml or .yml).
-
-    Raises:
-        InputError: no such name, or the file cannot be read or is not valid; one issue for each fault.
-    """
-    text = str(name_or_path)
-    if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
-        return validate(ThreeLineCameraSpec, read_yaml(text))
-    names = library_names(ORBIT)
-    if text not in names:
-        allowed = f"{names_text(names)}, or the path of a .yaml file"
-        raise InputError(
-            Issue(f"no such name in {ORBIT}", found=shown(text), allowed=allowed, suggestion=nearest(text, names))
-        )
-    return validate(ThreeLineCameraSpec, read_yaml(LIBRARY / ORBIT / f"{text}.yaml"))

@@ -5,8 +5,8 @@ import tracemalloc
 
 import numpy as np
 
+from scenes.load import load_three_line_camera
 from scenes.orbit_spec import OrbitSpec
-from scenes.three_line_camera import load_three_line_camera
 from twin.orbit.earth import Earth
 from twin.orbit.geolocation import GeolocationGrid
 from twin.orbit.line_camera import line_cameras

@@ -218,7 +218,7 @@ def test_what_cannot_be_done_names_the_key(bench, backend) -> None:
         plan_shims(far, mount, present)
     assert caught.value.key == ("mount", "clearance")
     low = RigidMotion.of(np.zeros(3), [0.0, 0.0, -1e-3])
-    with pytest.raises(BenchError, match=r"hole 0 would get -0\.5") as caught:
+    with pytest.raises(BenchError, match=r"hole 1 would get -0\.5") as caught:
         plan_shims(low, mount, np.full(4, 0.45e-3))
     assert caught.value.key == ("mount", "thickness")
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from scenes.three_line_camera import ThreeLineCameraSpec, load_three_line_camera
+from scenes.load import load_three_line_camera
+from scenes.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.earth import Earth
 from twin.orbit.geolocation import GeolocationGrid

@@ -13,8 +13,9 @@ from optics.system import assemble
 from optics.trace import make_rays, trace
 from optics.tree import Motion
 from scenes.errors import InputError
+from scenes.load import load_three_line_camera
 from scenes.spec import Spec
-from scenes.three_line_camera import ThreeLineCameraSpec, load_three_line_camera
+from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.translate import validate
 from scenes.yaml_file import dump_yaml, parse_yaml
 from twin.orbit.line_camera import dihedral_angle, line_cameras, line_normal, look_angle, traced_line_cameras

@@ -10,8 +10,9 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from optics.tree import Motion
+from scenes.load import load_three_line_camera
 from scenes.orbit_spec import OrbitSpec
-from scenes.three_line_camera import ThreeLineCameraSpec, load_three_line_camera
+from scenes.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import RATE, CirclePlatform, turn
 from twin.orbit.earth import Earth
 from twin.orbit.light_effects import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from scenes.orbit_angle import resolve_angle
+from scenes.orbit_setup import resolve_angle
 from twin.laboratory.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 from twin.orbit.angle_result import run_angle
 

@@ -22,7 +22,7 @@ from twin.orbit.angle_test import PAIRS, AnglePass, Measurement, fly
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 
 if TYPE_CHECKING:
-    from scenes.orbit_angle import AngleSetup
+    from scenes.orbit_setup import AngleSetup
 
 ARCSEC = np.pi / 648000.0
 """Radians."""

@@ -16,7 +16,7 @@ from twin.orbit.angle_sections import sections
 from twin.report.numbers import fixed
 
 if TYPE_CHECKING:
-    from scenes.orbit_angle import AngleSetup
+    from scenes.orbit_setup import AngleSetup
 
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",

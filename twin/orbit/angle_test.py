@@ -35,7 +35,8 @@ from twin.orbit.sensor import Sensor
 from twin.orbit.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from scenes.orbit_angle import AngleSetup, OrbitAngleSpec
+    from scenes.orbit_angle import OrbitAngleSpec
+    from scenes.orbit_setup import AngleSetup
 
 PAIRS = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
 """Angle -> the two lines that it lies between."""

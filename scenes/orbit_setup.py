@@ -1,0 +1,52 @@
+"""A test in orbit together with everything it refers to."""
+
+from pathlib import Path
+
+from scenes.errors import names_text, nearest
+from scenes.experiment import ExperimentSetup, read_setup
+from scenes.load import find_payload, load_orbit_test, load_three_line_camera
+from scenes.orbit_angle import LINES, OrbitAngleSpec
+from scenes.three_line_camera import ThreeLineCameraSpec
+
+
+class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
+    """An intersection-angle test with its camera.
+
+    Attributes:
+        camera: the payload.
+    """
+
+    camera: ThreeLineCameraSpec
+
+
+def resolve_angle(path: str | Path) -> AngleSetup:
+    """Read a test and the camera it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or test and camera do not fit.
+    """
+    setup = read_setup(AngleSetup, path)
+    if setup is None:
+        test = load_orbit_test(OrbitAngleSpec, path)
+        setup = AngleSetup.model_construct(test=test, camera=load_three_line_camera(find_payload(test)))
+    _require_fit(setup.test, setup.camera)
+    return setup
+
+
+def _require_fit(test: OrbitAngleSpec, camera: ThreeLineCameraSpec) -> None:
+    """InputError unless the camera has the three lines, and the strips and changes lie on them."""
+    if missing := [name for name in LINES if name not in camera.lines]:
+        found = f"{names_text(tuple(camera.lines))} in {camera.name}"
+        problem = f"the camera has no {' and no '.join(missing)} line"
+        raise test.error(problem, ("camera",), found=found, allowed="a camera with lines forward, nadir and aft")
+    for name in test.changes:
+        if name not in LINES:
+            raise test.error(
+                "no such line", ("changes", name), allowed=names_text(LINES), suggestion=nearest(name, LINES)
+            )
+    last = camera.pixels - 0.5
+    for key in ("first", "last"):
+        pixel = getattr(test.strips, key)
+        if not -0.5 <= pixel <= last:
+            allowed = f"-0.5 to {last:g}, the ends of the lines of {camera.name}"
+            raise test.error("outside the line", ("strips", key), found=f"pixel {pixel:g}", allowed=allowed)

@@ -1,0 +1,367 @@
+"""Intersection angles from ground points, end to end: against hand calculations, statistics, and as a user runs it."""
+
+import hashlib
+import json
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import twin.orbit.__main__ as command
+from analysis.orbit.sensitivity import STATEMENTS, judge
+from scenes.load import LIBRARY, ORBIT
+from scenes.orbit_angle import LINES
+from scenes.orbit_setup import AngleSetup, resolve_angle
+from tests.analysis.test_sensitivity import REFUTED
+from tests.twin.commands import files, invoke
+from twin.laboratory.result import silent
+from twin.orbit.angle_analysis import ARCSEC, estimated, frame_rows, resected, run_passes, tls_angles
+from twin.orbit.angle_test import PAIRS, AnglePass, fly
+from twin.orbit.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.line_camera import look_angle
+
+run = partial(invoke, command.app)
+EXAMPLE = LIBRARY / ORBIT / "angle.yaml"
+SETUP = resolve_angle(EXAMPLE)
+LOOK = np.radians(25.0)
+RADIUS, ABOVE = 6.37e6, 499.7e3
+"""Of the Earth near 40 N, and of the satellite above the terrain, metres."""
+
+
+def setup_with(**changes) -> AngleSetup:
+    """The example with other values; nested ones as dictionaries."""
+    test = SETUP.test
+    update = {k: getattr(test, k).model_copy(update=v) if isinstance(v, dict) else v for k, v in changes.items()}
+    return SETUP.model_copy(update={"test": test.model_copy(update=update)})
+
+
+def flown(**changes) -> AnglePass:
+    return fly(setup_with(**changes), np.random.SeedSequence(5))
+
+
+@pytest.fixture(scope="module")
+def flight() -> AnglePass:
+    return flown()
+
+
+@pytest.fixture(scope="module")
+def full():
+    """The example as it is."""
+    return run_passes(SETUP, 1, silent)
+
+
+def directions(name: str, pixel: np.ndarray) -> np.ndarray:
+    """Looks of a line of th1 in orbit, by collinearity from the file's numbers, body frame, (N, 3)."""
+    line, camera = SETUP.camera.lines[name], SETUP.camera
+    y = (pixel - 0.5 * (camera.pixels - 1)) * camera.pitch - line.principal_point[1]
+    x = np.full_like(y, -line.principal_point[0])
+    grow = 1.0 + line.k1 * (x**2 + y**2)
+    vectors = np.stack([-x * grow, -y * grow, np.full_like(y, line.focal_length)], axis=-1)
+    turned = Rotation.from_rotvec(SETUP.test.changes.get(name, (0.0, 0.0, 0.0)))
+    vectors = (turned * Rotation.from_euler("Y", line.look) * Rotation.from_rotvec(line.rotate)).apply(vectors)
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def true_angles() -> tuple[np.ndarray, np.ndarray]:
+    """Look and dihedral angles (alpha, beta) of the turned camera, from the file's numbers alone."""
+    centre = {name: directions(name, np.array([5999.5]))[0] for name in LINES}
+    normal = {name: np.linalg.svd(directions(name, np.linspace(100.0, 11899.0, 60)))[2][2] for name in LINES}
+    pairs = (("forward", "nadir"), ("nadir", "aft"))
+    dihedral = [angle(normal[a], normal[b]) for a, b in pairs]
+    return (
+        np.array([angle(centre[a], centre[b]) for a, b in pairs]),
+        np.array([min(v, np.pi - v) for v in dihedral]),
+    )
+
+
+@pytest.mark.parametrize("effects", [NO_EFFECTS, LightEffects()], ids=["no effects", "effects corrected"])
+def test_without_errors_the_angles_come_back(effects: LightEffects) -> None:
+    """To 1e-4 arcsec. The largest miss, 9e-5 arcsec of the forward line's look, is the file's camera: distortion moves
+    the middle of a line whose principal point lies 8 um off it by 4e-10 rad out of the plane through the rest.
+    """
+    errors = {"station": 0.0, "points": 0.0}
+    flight = flown(errors=errors)
+    look, dihedral = true_angles()
+    found = estimated(flight.measure(flight.ground(effects), None, effects))
+    for method in ("tls", "corrected", "printed"):
+        assert np.abs(found.angles[method].values - dihedral).max() < 1e-4 * ARCSEC
+    assert np.abs(found.look - look).max() < 1e-4 * ARCSEC
+    # the lines have turned by 4 and 3 arcsec since the laboratory, from which the angles differ by as much
+    nominal = np.array([look_angle(*(flight.laboratory[k] for k in pair)) for pair in PAIRS.values()])
+    assert found.look - nominal == pytest.approx([4.0 * ARCSEC, -3.0 * ARCSEC], rel=0.01)
+    # The resection's angle is one of pitch. Lines of sight that begin e across the track, here up to 1e-4 rad (20
+    # arcsec of roll), have look angles that differ from it by at most e^2 (1 + cos 25 deg)/sin 25 deg, 0.0093 arcsec.
+    assert np.abs(resected(found.resection) - look).max() < 0.01 * ARCSEC
+
+
+def triangle() -> tuple[float, float]:
+    """Zenith angle of the forward look at its ground point, and its length, on a sphere of the mean curvature."""
+    zenith = float(np.arcsin((RADIUS + ABOVE) / RADIUS * np.sin(LOOK)))
+    return zenith, RADIUS * np.sin(zenith - LOOK) / np.sin(LOOK)
+
+
+def bias(flight: AnglePass, effects: LightEffects) -> np.ndarray:
+    measured = tls_angles(flight.measure(flight.ground(effects), None))
+    return (measured.values - true_angles()[1]) / ARCSEC
+
+
+def test_aberration_by_hand(flight: AnglePass) -> None:
+    """The look tilts by v/c times the sine of its angle from the velocity: 1 at nadir, cos 25 deg at the others. A
+    forward point thus lies farther from the nadir point than it seems, an aft point nearer. 3%: at 40 N the normal of
+    the ellipsoid leaves the radius by d = 0.19 deg, and the velocity leaves X by as much; d sin 25 deg over
+    1 - cos 25 deg is 1.5%.
+    """
+    expected = np.linalg.norm(flight.velocity) / 299_792_458.0 * (1.0 - np.cos(LOOK)) / ARCSEC
+    found = bias(flight, replace(NO_EFFECTS, aberration=True))
+    assert found == pytest.approx([expected, -expected], rel=0.03)
+    assert 0.45 < expected < 0.52
+
+
+def test_refraction_by_hand(flight: AnglePass) -> None:
+    """The point moves toward nadir by tan z sec^2 z times the integral of n - 1, 2.77e-4 at sea level over a scale
+    height of 8.4 km, less what lies below 300 m (flat layers; Earth's curvature and the relief change 3%)."""
+    zenith, slant = triangle()
+    shift = np.tan(zenith) / np.cos(zenith) ** 2 * 2.77e-4 * 8.4e3 * np.exp(-300.0 / 8.4e3)
+    expected = shift * np.cos(zenith) / slant / ARCSEC
+    found = bias(flight, replace(NO_EFFECTS, refraction=True))
+    assert found == pytest.approx([-expected, -expected], rel=0.05)
+
+
+def test_light_time_is_small_and_odd(flight: AnglePass) -> None:
+    """A strip at distance d moves by d/c times the Earth's speed along the track, v = 465 m/s cos 40 deg sin(heading)
+    with a heading some 10 deg from south; as an angle v/c for every line, but along a direction that turns by the angle
+    on the ground. What is left is v/c (1 - cos 25 deg) as for aberration."""
+    found = bias(flight, replace(NO_EFFECTS, light_time=True))
+    most = 465.0 * np.cos(np.radians(40.0)) * np.sin(np.radians(15.0)) / 299_792_458.0 * (1.0 - np.cos(LOOK)) / ARCSEC
+    assert 0.0 < found[0] < most
+    assert found[1] == pytest.approx(-found[0], rel=0.1)
+
+
+def test_scatter_of_200_passes_matches_sigma(full) -> None:
+    """Chi-square of the spread, of both angles together with their covariance, and of the mean; each at 0.1% to either
+    side: 10 statements, false alarm 1% over seeds. A sigma wrong by a
+    factor of 0.7 or 1.4 is found: the spread of 200 passes is good to 5%.
+    """
+    for scatter in (full.planes, full.resection):
+        count = len(scatter.values)
+        assert count == 200
+        assert np.all(scatter.tail > 1e-3)
+        for wrong in (0.7, 1.4):
+            assert np.all(replace(scatter, covariance=scatter.covariance * wrong**2).tail < 1e-3)
+        off = scatter.values - scatter.values.mean(axis=0)
+        square = np.einsum("ni,ij,nj->", off, np.linalg.inv(scatter.covariance), off)
+        assert chi2.ppf(5e-4, 2 * count - 2) < square < chi2.ppf(1 - 5e-4, 2 * count - 2)
+        assert np.abs(scatter.bias).max() < 3.3 * scatter.sigma.max() / np.sqrt(count)
+
+
+def test_sigma_by_hand(full) -> None:
+    """The station's 0.5 m moves both planes of an angle: 0.5 m times the length of the difference of 1/range square to
+    each plane (a triangle of 25 deg); the mean of 60 points of 1.5 m adds twice. 5% for relief and the ends of strips.
+    """
+    h, slant = ABOVE, triangle()[1]
+    station = 0.5**2 * (1 / h**2 + 1 / slant**2 - 2 * np.cos(LOOK) / (h * slant))
+    points = 1.5**2 / 60 * (1 / h**2 + 1 / slant**2)
+    assert full.planes.sigma == pytest.approx(np.sqrt(station + points), rel=0.05)
+
+
+def test_frames(full) -> None:
+    """Rounding: 6e6 m times eps is 1e-9 m, over 5e5 m some 1e-15 rad; 1e-7 arcsec is 500 times that."""
+    reference = full.estimate.angles["tls"].values
+    rows = {(row.frame, row.method): row for row in full.frames}
+    for frame in ("Earth-fixed", "local level", "orbital", "nadir line"):
+        tls = rows[frame, "tls"]
+        assert np.abs(tls.values - reference).max() < 1e-7 * ARCSEC
+        assert np.abs(tls.sigma - full.estimate.angles["tls"].sigma).max() < 1e-6 * ARCSEC
+        assert not tls.warned
+        # eq. 5 as printed is the right one after half a turn about z
+        assert rows[frame, "printed"].values == pytest.approx(rows[frame, "corrected"].values, abs=1e-9 * ARCSEC)
+    steep = rows["nadir line", "printed"]
+    assert steep.warned
+    assert np.abs(steep.values - reference).max() > 5.0 * steep.sigma.max()
+    good = rows["Earth-fixed", "printed"]
+    assert not good.warned
+    assert np.abs(good.values - reference).max() < 0.01 * good.sigma.min()
+
+
+def test_a_vertical_plane_without_noise_has_no_form() -> None:
+    flight = flown(errors={"station": 0.0, "points": 0.0})
+    rows = frame_rows(flight, flight.measure(flight.ground(NO_EFFECTS), None))
+    for row in rows:
+        singular = row.frame == "nadir line" and row.method != "tls"
+        assert bool(np.all(np.isnan(row.values))) == singular
+        assert bool(np.all(np.isfinite(row.values))) != singular
+
+
+def test_one_arcsecond_is_more_than_five_metres(flight: AnglePass) -> None:
+    """By the triangle of the satellite, the Earth's centre and the point: slant range times the angle over the sine of
+    the convergence, which is the zenith angle there. 1.5%: the orbit is 2 km higher or lower at the other end, and the
+    Earth turns."""
+    heights = flight.height_per_arcsec()
+    zenith, slant = triangle()
+    for name in ("alpha", "beta"):
+        assert heights[name] > 5.0
+        assert heights[name] == pytest.approx(slant * ARCSEC / np.sin(zenith), rel=0.015)
+
+
+def test_a_short_orbit_has_no_intersection() -> None:
+    short = flown(orbit={"before": 5.0, "after": 60.0})
+    heights = short.height_per_arcsec()
+    assert heights["alpha"] is None
+    assert heights["beta"] > 5.0
+
+
+def test_a_datum_shift_is_the_stations_shift_reversed() -> None:
+    """Moving all points by s is moving the station by -s, with the linear slopes; second order is 1e-5 of it."""
+    shift = (10.0, -4.0, 7.0)
+    run_ = run_passes(setup_with(errors={"datum": shift}, passes=2), 3, silent)
+    (datum,) = (row for row in run_.effects if row.what == "datum")
+    slopes = np.array([row.slope for row in run_.table if row.what == "station"])
+    expected = -(np.array(shift) @ run_.flight.local) @ slopes
+    assert datum.bias == pytest.approx(expected, rel=2e-3, abs=1e-4 * ARCSEC)
+    assert np.abs(datum.bias).max() > ARCSEC
+
+
+def test_sentences_of_the_paper(full) -> None:
+    judged = [judge(statement, full.table) for statement in STATEMENTS]
+    assert {j.statement.text for j in judged if not j.holds} == REFUTED
+
+
+def test_planes_and_resection_agree(full) -> None:
+    """They share station and points, so that they differ by less than the sigma of either, and far less than in the
+    paper's table."""
+    assert np.abs(full.difference).max() < 5.0 * full.difference_sigma.max()
+    assert full.difference_sigma.max() < 0.25 * full.planes.sigma.min()
+
+
+# The command
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A run of few passes: its folder and what it printed."""
+    folder = tmp_path_factory.mktemp("orbit")
+    path = write(folder, "passes: 200", "passes: 20")
+    result = run("angle", path, "--out", folder / "run", "--seed", 5, "--json")
+    assert result.exit_code == 0, result.stderr
+    return folder / "run", result
+
+
+def write(folder: Path, old: str, new: str) -> Path:
+    text = EXAMPLE.read_text("utf-8")
+    assert text.count(old) == 1, old
+    path = folder / "small.yaml"
+    path.write_text(text.replace(old, new), "utf-8")
+    return path
+
+
+def test_contract(done) -> None:
+    folder, result = done
+    data = json.loads(result.stdout)
+    assert result.stderr == ""
+    assert data == json.loads((folder / "angle.json").read_text("utf-8"))
+    values = {"alpha_deg", "beta_deg", "alpha_sigma_arcsec", "beta_sigma_arcsec"}
+    assert set(data["planes"]) == {"printed", "corrected", "tls"}
+    for method in (*data["planes"].values(), data["resection"]):
+        assert values <= set(method)
+        assert abs(method["alpha_deg"] - 25.0) < 0.02
+        assert 0.1 < method["alpha_sigma_arcsec"] < 0.2
+    assert set(data["truth"]) == {"look", "dihedral"}
+    assert set(data["difference_arcsec"]) == {"alpha", "beta"}
+    planes, resection = data["planes"]["tls"], data["resection"]
+    for name in ("alpha", "beta"):
+        expected = 3600.0 * (planes[f"{name}_deg"] - resection[f"{name}_deg"])
+        assert data["difference_arcsec"][name] == pytest.approx(expected, abs=1e-7)
+    assert [(row["what"], row["axis"]) for row in data["sensitivity"]] == [
+        (what, axis) for what in ("station", *LINES) for axis in "xyz"
+    ]
+    assert {"what", "axis", "alpha_arcsec_per_10m", "beta_arcsec_per_10m"} == set(data["sensitivity"][0])
+    assert len(data["statements"]) == len(STATEMENTS)
+    assert [row["what"] for row in data["effects"]] == ["light_time", "aberration", "refraction", "all"]
+    assert data["height_m_per_arcsec"]["alpha"] > 5.0
+
+
+def test_run_folder(done) -> None:
+    folder, _ = done
+    tables = {"methods", "scatter", "difference", "frames", "effects", "sensitivity", "statements"}
+    drawings = {
+        "geometry",
+        "scatter-passes",
+        "sensitivity-station",
+        "sensitivity-alpha-points",
+        "sensitivity-beta-points",
+    }
+    expected = {"manifest.json", "config.yaml", "angle.json", "report.html"}
+    expected |= {f"artefacts/{name}.csv" for name in tables} | {f"artefacts/{name}.svg" for name in drawings}
+    assert files(folder) == expected
+    manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
+    assert (manifest["program"], manifest["test"], manifest["seed"]) == ("twin.orbit", "angle", 5)
+    for name, digest in manifest["sha256"].items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+    text = (folder / "report.html").read_text("utf-8")
+    assert "python -m twin.orbit angle config.yaml" in text
+    links = set(re.findall(r'(?:href|src)="([^"]*)"', text))
+    assert {link for link in links if not link.startswith(("#", "data:"))} <= files(folder)
+
+
+def test_config_repeats_the_run(done, tmp_path: Path) -> None:
+    folder, _ = done
+    target = tmp_path / "again"
+    result = run("angle", folder / "config.yaml", "--out", target)
+    assert result.exit_code == 0, result.stderr
+    assert (target / "angle.json").read_bytes() == (folder / "angle.json").read_bytes()
+    assert "total least squares" in result.stdout
+    other = run("angle", folder / "config.yaml", "--out", tmp_path / "other", "--seed", 6, "--quiet")
+    assert (other.exit_code, other.stdout) == (0, "")
+    assert (tmp_path / "other" / "angle.json").read_bytes() != (folder / "angle.json").read_bytes()
+
+
+# what is wrong, key, what to do about it
+BAD = {
+    "few points": ("points: 60,", "points: 2,", "strips.points", ["too few points", "3 or more"]),
+    "late": ("time: 0 s", "time: 61 s", "time", ["outside the orbit data", "longer orbit"]),
+    "outside the line": ("last: 11899", "last: 12000", "strips.last", ["outside the line", "11999.5"]),
+    "camera": ("camera: th1", "camera: th2", "camera", ["no such name in payloads", "did you mean 'th1'"]),
+    "one place": ("last: 11899", "last: 101", "strips", ["all points lie at one place", "a longer strip"]),
+    "orbit": ("altitude: 500 km", "altitude: 500 km, inclination: 30 deg", "orbit", ["never passes latitude 40"]),
+    "looks away": (
+        "[20 arcsec, -35 arcsec,",
+        "[20 arcsec, 45 deg,",
+        "attitude",
+        ["misses the Earth", "see the ground"],
+    ),
+    "at the end": ("time: 0 s", "time: 59.9999 s", "time", ["time outside the orbit", "a longer orbit"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(case: str, tmp_path: Path) -> None:
+    old, new, key, words = BAD[case]
+    path = write(tmp_path, old, new)
+    before = files(tmp_path)
+    result = run("angle", path, "--out", tmp_path / "run", "--json")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert files(tmp_path) == before
+    assert not (tmp_path / "run").exists()
+    found = re.search(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}", result.stderr)
+    assert found, result.stderr
+    assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[int(found[1]) - 1]
+    for word in words:
+        assert word in result.stderr, result.stderr
+
+
+def test_help() -> None:
+    for arguments in ((), ("angle",)):
+        result = run(*arguments, "--help")
+        assert result.exit_code == 0
+        assert "Usage" in result.stdout
+    assert "Exit codes" in run("--help").stdout
