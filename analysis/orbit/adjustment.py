@@ -1,0 +1,282 @@
+"""Simultaneous adjustment of a three-line in-orbit calibration (paper 003): interior orientation and attitude biases.
+
+Gauss-Newton on all image points of all fields, control coordinates and pseudo-observations; robust weights and variance
+components are iterated around it. No solution is returned from a singular system: combinations that the points leave
+open are named, and must be closed by a gauge or by priors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from analysis.orbit.calibration_parameters import (
+    CalibrationError,
+    CalibrationField,
+    Noise,
+    Parameters,
+    Prior,
+    Unknowns,
+    index,
+)
+from analysis.orbit.normal_equations import Equations, Weights, assemble
+from analysis.orbit.null_space import Combination, Gauge, combinations, free_basis, null_vectors, solved
+from analysis.orbit.residual_weights import Robust, robust_weights, standardised
+from analysis.orbit.residual_weights import variance_components as components
+from analysis.orbit.three_line_model import LineModel
+
+__all__ = ["Adjustment", "Robust", "adjust"]
+
+Array = NDArray[np.float64]
+# A step of this many sigmas ends the iteration, and so does one that rounding keeps from falling further.
+_CONVERGED = 1e-6
+_ROUNDS = 30
+_HUBER_ROUNDS = 6
+_SETTLED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """Solution of a calibration.
+
+    Attributes:
+        names: of the unknowns. values: (P,) metres and radians. covariance: (P, P) in the stated gauge, from the sigmas
+            as given times `factors`; zero rows for held unknowns.
+        gauge: what was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were
+            solved for all the same.
+        cameras: with the adjusted interior.
+        ground: field -> (m, 3) adjusted points. ground_covariance: field -> (m, 3, 3).
+        residual: field -> line -> (n, 2) standardised residuals of image points. weight: field -> line -> (n,) robust.
+        chi_square, degrees_of_freedom: weighted, points left out do not count.
+        factors: variance group -> estimated factor (1 where not estimated). redundancy: of each group.
+        iterations: Gauss-Newton steps in all.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    gauge: Gauge
+    open: tuple[Combination, ...]
+    weak: tuple[Combination, ...]
+    cameras: Mapping[str, LineModel]
+    ground: Mapping[str, Array]
+    ground_covariance: Mapping[str, Array]
+    residual: Mapping[str, Mapping[str, Array]]
+    weight: Mapping[str, Mapping[str, Array]]
+    chi_square: float
+    degrees_of_freedom: int
+    factors: Mapping[str, float]
+    redundancy: Mapping[str, float]
+    iterations: int
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """Standard deviation of each unknown; 0 where held."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def correlation(self) -> Array:
+        """(P, P); rows of held unknowns are NaN."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.covariance / sigma / sigma[:, None])
+
+    @property
+    def p_value(self) -> float:
+        """Chance of such a chi-square or a larger one, if the sigmas are right and no robust weights are on."""
+        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+
+    def value(self, name: str) -> float:
+        """One unknown. Raises CalibrationError when there is none of that name."""
+        return float(self.values[index(self.names, name)])
+
+    def bias(self, field: str) -> Array:
+        """(3,) roll, pitch, yaw of a field, radians; zero where not solved for."""
+        found = [n if n in self.names else f"{field} {n}" for n in ("roll", "pitch", "yaw")]
+        return np.array([self.value(n) if n in self.names else 0.0 for n in found])
+
+
+def adjust(
+    fields: Sequence[CalibrationField],
+    cameras: Mapping[str, LineModel],
+    noise: Noise,
+    *,
+    unknowns: Unknowns | None = None,
+    start: Mapping[str, float] | None = None,
+    priors: Sequence[Prior] = (),
+    gauge: Gauge | None = None,
+    robust: Robust | None = None,
+    variance_components: bool = False,
+    iterations: int = 20,
+) -> Adjustment:
+    """Adjust everything at once.
+
+    Args:
+        fields: passes over fields of points.
+        cameras: line -> mounting, distortion and start values of the interior.
+        noise: of image, attitude and station.
+        unknowns: what is solved for; interior and one bias for each field.
+        start: values by name where not the cameras' interior and zero.
+        priors: pseudo-observations, for example of an on-board monitor of the cameras.
+        gauge: how open combinations are closed.
+        robust: "huber" takes weight from image points with large residuals, "igg" leaves the worst out.
+        variance_components: estimate a factor on the variances of "image", "control" and each group of priors.
+        iterations: most Gauss-Newton steps of one round.
+
+    Raises:
+        RankError: open combinations that nothing closes.
+        CalibrationError: other input that cannot be used, fewer observations than unknowns, no convergence.
+    """
+    if not (np.isfinite([noise.image, noise.attitude, noise.station]).all() and noise.image > 0):
+        raise CalibrationError(f"calibration: sigmas must be finite and that of the image positive, found {noise}")
+    if robust not in (None, "huber", "igg"):
+        raise CalibrationError(f"calibration: robust must be huber or igg, found {robust!r}")
+    parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
+    gauge = gauge or Gauge()
+    problem = _Problem(fields, cameras, parameters, noise, tuple(priors), gauge, iterations)
+    groups = ("image", "control", *dict.fromkeys(p.group for p in priors))
+    count = sum(len(r.point) for f in fields for r in f.rays.values())
+    state = _State(parameters.start, [f.ground for f in fields], Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
+    if 2 * count < len(parameters.names) - len(gauge.held) - len(priors):
+        raise CalibrationError(
+            f"calibration: {count} image points are too few for {len(parameters.names) - len(gauge.held)} unknowns"
+        )
+    for turn in range(_ROUNDS):
+        state, equations, covariance = problem.solve(state)
+        old = state.weights
+        cofactors = equations.image_cofactors(covariance)
+        if robust:
+            kind: Robust = "huber" if turn < _HUBER_ROUNDS else robust
+            image = robust_weights(standardised(equations, cofactors, old), kind)
+            state = replace(state, weights=replace(state.weights, image=image))
+        if variance_components:
+            factor, _ = components(equations, covariance, cofactors, old, priors)
+            state = replace(state, weights=replace(state.weights, factor=factor))
+        change = float(np.abs(state.weights.image - old.image).max())
+        change = max(change, *(abs(state.weights.factor[g] / old.factor[g] - 1.0) for g in groups))
+        if change < _SETTLED and not (robust == "igg" and turn < _HUBER_ROUNDS):
+            state = replace(state, weights=old)
+            break
+    else:
+        raise CalibrationError(
+            f"calibration: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}"
+        )
+    return problem.result(state, equations, covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where the iteration stands: unknowns (P,), ground points of each field, weights, Gauss-Newton steps so far."""
+
+    values: Array
+    grounds: list[Array]
+    weights: Weights
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What does not change while the iteration goes on."""
+
+    fields: Sequence[CalibrationField]
+    cameras: Mapping[str, LineModel]
+    parameters: Parameters
+    noise: Noise
+    priors: tuple[Prior, ...]
+    gauge: Gauge
+    iterations: int
+
+    def equations(self, state: _State) -> Equations:
+        return assemble(
+            self.fields,
+            self.cameras,
+            self.parameters,
+            state.values,
+            state.grounds,
+            self.noise,
+            self.priors,
+            state.weights,
+        )
+
+    def solve(self, state: _State) -> tuple[_State, Equations, Array]:
+        """Gauss-Newton with the weights of the state: state, equations there and covariance (P, P)."""
+        scale = self.parameters.scale
+        equations = self.equations(state)
+        basis, _ = free_basis(equations.reduced, equations.length, scale, self.parameters.names, self.gauge)
+        last = np.inf
+        for _ in range(self.iterations):
+            normal = basis.T @ (scale[:, None] * equations.reduced * scale) @ basis
+            step = scale * (basis @ solved(normal, -basis.T @ (scale * equations.right)))
+            size = float(np.sqrt(max(float(step @ equations.reduced @ step), 0.0)))
+            moved = np.split(equations.point_step(step), np.cumsum([len(g) for g in state.grounds])[:-1])
+            state = _State(
+                state.values + step,
+                [g + m for g, m in zip(state.grounds, moved, strict=True)],
+                state.weights,
+                state.steps + 1,
+            )
+            equations = self.equations(state)
+            if size < _CONVERGED or (size < 1e3 * _CONVERGED and size > 0.5 * last):
+                break
+            last = size
+        else:
+            raise CalibrationError(
+                f"calibration: no convergence in {self.iterations} steps, the last of {size:.3g} sigmas"
+            )
+        normal = basis.T @ (scale[:, None] * equations.reduced * scale) @ basis
+        spread = scale[:, None] * (basis @ solved(normal, np.eye(len(normal))) @ basis.T) * scale
+        return state, equations, 0.5 * (spread + spread.T)
+
+    def result(self, state: _State, equations: Equations, covariance: Array) -> Adjustment:
+        names, scale = self.parameters.names, self.parameters.scale
+        basis, opened = free_basis(equations.reduced, equations.length, scale, names, self.gauge)
+        kept = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in self.gauge.held]).tolist()
+        within = equations.reduced[np.ix_(kept, kept)]
+        vectors = null_vectors(within, equations.length[kept], scale[kept], weak=True)
+        weak = combinations([names[i] for i in kept], scale[kept], vectors, within, equations.length[kept])
+        cofactors = equations.image_cofactors(covariance)
+        _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
+        standard = standardised(equations, cofactors, state.weights)
+        sides = [len(f.ground) for f in self.fields]
+        spreads = np.split(equations.point_covariance(covariance), np.cumsum(sides)[:-1])
+        used = int(np.sum(state.weights.image > 0))
+        controls = sum(int(np.sum(f.control & np.any(f.covariance, axis=(1, 2)))) for f in self.fields)
+        known = 2 * used + 3 * controls + len(self.priors)
+        r = equations.residuals
+        square = float(
+            np.sum(state.weights.image * np.sum(r.image**2, axis=1)) / state.weights.factor["image"]
+            + np.sum(r.control**2) / state.weights.factor["control"]
+            + np.sum(equations.prior_weight * r.prior**2)
+        )
+        return Adjustment(
+            names=names,
+            values=state.values,
+            covariance=covariance,
+            gauge=self.gauge,
+            open=opened,
+            weak=weak,
+            cameras={
+                k: self.parameters.parts(state.values, f.name, k, c)[0]
+                for f in self.fields
+                for k, c in self.cameras.items()
+                if k in f.rays
+            },
+            ground={f.name: g for f, g in zip(self.fields, state.grounds, strict=True)},
+            ground_covariance={f.name: s for f, s in zip(self.fields, spreads, strict=True)},
+            residual=self._by_line(standard),
+            weight=self._by_line(state.weights.image),
+            chi_square=square,
+            degrees_of_freedom=known - 3 * int(equations.movable.sum()) - basis.shape[1],
+            factors=state.weights.factor,
+            redundancy=redundancy,
+            iterations=state.steps,
+        )
+
+    def _by_line(self, rows: Array) -> dict[str, dict[str, Array]]:
+        sizes = [len(r.point) for f in self.fields for r in f.rays.values()]
+        pieces = iter(np.split(rows, np.cumsum(sizes)[:-1]))
+        return {f.name: {line: next(pieces) for line in f.rays} for f in self.fields}

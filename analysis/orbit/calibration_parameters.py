@@ -1,0 +1,243 @@
+"""What an in-orbit geometric calibration has: fields of points, unknowns by name, and what is known of them before.
+
+Names of the unknowns: "forward f", "forward x", "forward y" and so on for each line camera; "Beijing roll", "Beijing
+pitch", "Beijing yaw" for each field, or "roll", "pitch", "yaw" where all fields share one bias; "Beijing offset along",
+"... across", "... down" for a constant error of the orbit during one field, in the field's mean body axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.orbit.three_line_model import BIAS, INTERIOR, LineModel, Rays
+
+__all__ = ["CalibrationError", "CalibrationField", "Noise", "Parameters", "Prior", "Unknowns"]
+
+Array = NDArray[np.float64]
+OFFSET = ("along", "across", "down")
+_SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.314245])  # WGS84
+_FARTHEST = 12e3  # metres: no land is higher, and geodetic coordinates or kilometres are far beyond
+
+
+class CalibrationError(ValueError):
+    """Input of a calibration that cannot be used."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the measurements that are independent from one exposure to the next.
+
+    Attributes:
+        image: of an image point in x and in y, metres; x is the image line times the pixel pitch.
+        attitude: of the measured attitude about each body axis, radians.
+        station: of the measured station along each axis, metres.
+
+    Attitude and station enter through the model, so each image point gets its own (2, 2) covariance. Points of one line
+    that are exposed at the same time share these errors in truth; here they count as independent.
+    """
+
+    image: float
+    attitude: float = 0.0
+    station: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationField:
+    """One pass over one field of points.
+
+    Attributes:
+        name: of the field.
+        rays: line camera -> its image points.
+        ground: (m, 3) coordinates of the control points, start values of the others, ITRS, metres.
+        covariance: (m, 3, 3) of the control points; zero where they are exact, not used for others.
+        control: (m,) which of the points are control; the others are tie points.
+    """
+
+    name: str
+    rays: Mapping[str, Rays]
+    ground: Array
+    covariance: Array
+    control: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        rays: Mapping[str, Rays],
+        ground: ArrayLike,
+        sigma: float | tuple[float, float],
+        control: ArrayLike | None = None,
+    ) -> CalibrationField:
+        """sigma: of control points, one for all axes or (each axis in plan, height), metres, 0 for exact.
+
+        Raises:
+            CalibrationError: shapes, values that are not finite, points far from the ellipsoid, rays of points that do
+                not exist, tie points that fewer than two lines see.
+        """
+        points = np.array(ground, np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
+            raise CalibrationError(f"field {name!r}: ground must be (m, 3) and finite, found {points.shape}")
+        plan, tall = sigma if isinstance(sigma, tuple) else (sigma, sigma)
+        if not (np.isfinite([plan, tall]).all() and min(plan, tall) >= 0 and (plan > 0) == (tall > 0)):
+            raise CalibrationError(f"field {name!r}: sigma must be finite, and positive or zero for all axes")
+        is_control = np.ones(len(points), bool) if control is None else np.array(control, bool)
+        if is_control.shape != (len(points),):
+            raise CalibrationError(f"field {name!r}: control must be ({len(points)},), found {is_control.shape}")
+        height = _rough_height(points)
+        far = np.flatnonzero(np.abs(height) > _FARTHEST)
+        if len(far):
+            raise CalibrationError(
+                f"field {name!r}: point {far[0]} lies {height[far[0]] / 1e3:.4g} km above the ellipsoid; are its"
+                " coordinates geocentric (ITRS) and in metres?"
+            )
+        counts = np.zeros(len(points), int)
+        for line, row in rays.items():
+            if row.point.size and not (row.point.min() >= 0 and row.point.max() < len(points)):
+                raise CalibrationError(f"field {name!r}: a ray of line {line!r} shows a point that does not exist")
+            counts[row.point] += 1
+        lonely = np.flatnonzero(~is_control & (counts < 2))
+        if len(lonely):
+            raise CalibrationError(
+                f"field {name!r}: tie point {lonely[0]} is seen by {counts[lonely[0]]} lines, not two"
+            )
+        up = vertical(points)
+        spread = plan**2 * np.eye(3) + (tall**2 - plan**2) * up[:, :, None] * up[:, None, :]
+        return cls(name, dict(rays), points, spread, is_control)
+
+    @property
+    def axes(self) -> Array:
+        """(3, 3) mean body axes (along, across, down) as columns, ITRS: the rotation nearest to the mean attitude."""
+        u, _, vt = np.linalg.svd(np.concatenate([r.attitude for r in self.rays.values()]).mean(axis=0))
+        return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
+
+
+def _rough_height(points: Array) -> Array:
+    """(m,) distance above the ellipsoid along the radius, metres."""
+    radius = np.linalg.norm(points, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(radius - radius / np.linalg.norm(points / _SEMI_AXES, axis=1))
+
+
+def vertical(points: Array) -> Array:
+    """Unit normals of the ellipsoid at points (m, 3), ITRS, m: good to h/a of the deflection, 1e-6 rad below 2 km."""
+    normal = points / _SEMI_AXES**2
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What is solved for.
+
+    Attributes:
+        interior: f, x and y of every line camera.
+        bias: attitude bias, one for each field, one common to all, or none.
+        offset: constant error of the orbit of each field, or none.
+    """
+
+    interior: bool = True
+    bias: Literal["field", "common", "none"] = "field"
+    offset: Literal["field", "none"] = "none"
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Pseudo-observation of a linear combination of unknowns: sum of weight * unknown = value, with sigma.
+
+    A laboratory's principal distance is `Prior({"nadir f": 1.0}, 0.65, 20e-6)`; an orbit known to 0.3 m is
+    `Prior({"Beijing offset along": 1.0}, 0.0, 0.3)`. `group` names the variance component that it belongs to.
+    """
+
+    weights: Mapping[str, float]
+    value: float
+    sigma: float
+    group: str = "prior"
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """The unknowns in order, with start values.
+
+    Attributes:
+        names: of the unknowns.
+        start: (P,) start values, metres and radians.
+        scale: (P,) the change of each that moves the image by about one metre: 1 for the interior, 1/f rad, range/f m.
+        columns: (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), -1 if fixed.
+    """
+
+    names: tuple[str, ...]
+    start: Array
+    scale: Array
+    columns: Mapping[tuple[str, str], tuple[Array, Array, Array]] = field(repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        fields: Sequence[CalibrationField],
+        cameras: Mapping[str, LineModel],
+        unknowns: Unknowns,
+        start: Mapping[str, float] | None = None,
+    ) -> Parameters:
+        """start: by name, where not the cameras' interior and zero.
+
+        Raises:
+            CalibrationError: no fields, two of one name, a line without a camera, an unknown name in start, nothing to
+                solve for.
+        """
+        if not fields:
+            raise CalibrationError("calibration: no fields")
+        if len({f.name for f in fields}) != len(fields):
+            raise CalibrationError("calibration: two fields have one name")
+        focal = float(np.mean([c.interior[0] for c in cameras.values()]))
+        entries: dict[str, tuple[float, float]] = {}
+        if unknowns.interior:
+            for line, camera in cameras.items():
+                entries |= {f"{line} {n}": (float(v), 1.0) for n, v in zip(INTERIOR, camera.interior, strict=True)}
+        if unknowns.bias == "common":
+            entries |= dict.fromkeys(BIAS, (0.0, 1.0 / focal))
+        for one in fields:
+            reach = [np.linalg.norm(one.ground[r.point] - r.station, axis=1) for r in one.rays.values() if r.point.size]
+            if not reach:
+                raise CalibrationError(f"field {one.name!r}: no image points")
+            if unknowns.bias == "field":
+                entries |= {f"{one.name} {n}": (0.0, 1.0 / focal) for n in BIAS}
+            if unknowns.offset == "field":
+                metres = float(np.mean(np.concatenate(reach))) / focal
+                entries |= {f"{one.name} offset {n}": (0.0, metres) for n in OFFSET}
+        if not entries:
+            raise CalibrationError("calibration: nothing to solve for")
+        names = tuple(entries)
+        where = {n: i for i, n in enumerate(names)}
+        values = np.array([entries[n][0] for n in names])
+        for n, v in (start or {}).items():
+            values[index(names, n)] = v
+        columns = {}
+        for one in fields:
+            for line in one.rays:
+                if line not in cameras:
+                    raise CalibrationError(f"field {one.name!r}: no camera is called {line!r}")
+                groups = (
+                    [f"{line} {n}" for n in INTERIOR],
+                    [n if unknowns.bias == "common" else f"{one.name} {n}" for n in BIAS],
+                    [f"{one.name} offset {n}" for n in OFFSET],
+                )
+                inner, turn, shift = (np.array([where.get(n, -1) for n in g]) for g in groups)
+                columns[one.name, line] = (inner, turn, shift)
+        return cls(names, values, np.array([entries[n][1] for n in names]), columns)
+
+    def parts(self, values: Array, name: str, line: str, camera: LineModel) -> tuple[LineModel, Array, Array]:
+        """Camera with its interior, bias (3,) and offset (3,) (field axes) of one line of one field."""
+        inner, turn, shift = self.columns[name, line]
+        bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
+        return (camera.with_interior(values[inner]) if inner[0] >= 0 else camera), bias, offset
+
+
+def index(names: Sequence[str], name: str) -> int:
+    """Place of a name. Raises CalibrationError that lists the names."""
+    if name not in names:
+        raise CalibrationError(f"calibration: no unknown is called {name!r}; there are {', '.join(names)}")
+    return list(names).index(name)

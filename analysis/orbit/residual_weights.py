@@ -1,0 +1,82 @@
+"""Standardised residuals of an adjustment, and the weights they ask for: robust weights, variance components."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from analysis.orbit.calibration_parameters import Prior
+from analysis.orbit.normal_equations import Equations, Weights
+
+__all__ = ["HUBER", "REJECT", "Robust", "robust_weights", "standardised", "variance_components"]
+
+Array = NDArray[np.float64]
+Robust = Literal["huber", "igg"]
+# Lengths of standardised residuals of image points, Rayleigh for good ones. Beyond HUBER lie 5 in 100 good points, they
+# lose weight; beyond REJECT 1 in 10 000, they are left out (IGG III: Yang, Song and Xu, J. Geodesy 76 (2002) 353).
+HUBER = float(np.sqrt(chi2.isf(0.05, 2)))
+REJECT = float(np.sqrt(chi2.isf(1e-4, 2)))
+# Fewer redundant observations give a variance to 45 per cent or worse (sqrt(2 / 10)): the group keeps its factor.
+_LEAST_REDUNDANCY = 10.0
+# A part of an image point that no other observation checks has no residual to standardise.
+_UNCHECKED = 1e-6
+
+
+def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Array:
+    """(M, 2) residuals of the image points over their own standard deviation.
+
+    The residual of an observation with weight w has the covariance C + (1 - 2w) G, C that of the observation and G that
+    of the adjusted one: less than C when it took part, more when it did not (exact for weights 0 and 1).
+    """
+    spread = weights.factor["image"] * np.eye(2) + (1.0 - 2.0 * weights.image)[:, None, None] * cofactors
+    values, axes = np.linalg.eigh(spread)
+    along = np.einsum("nji,nj->ni", axes, equations.residuals.image)
+    checked = values > _UNCHECKED
+    along = np.where(checked, along / np.sqrt(np.where(checked, values, 1.0)), 0.0)
+    return np.einsum("nij,nj->ni", axes, along)
+
+
+def robust_weights(standard: Array, kind: Robust) -> Array:
+    """(M,) weights of image points from their standardised residuals (M, 2): Huber's, or IGG III that ends in zero."""
+    size = np.linalg.norm(standard, axis=1)
+    weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
+    if kind == "huber":
+        return np.asarray(weight)
+    fall = np.clip((REJECT - size) / (REJECT - HUBER), 0.0, 1.0)
+    return np.asarray(np.where(size <= HUBER, 1.0, weight * fall**2))
+
+
+def variance_components(
+    equations: Equations, covariance: Array, cofactors: Array, weights: Weights, priors: Sequence[Prior]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """One step of Foerstner's estimate: group -> new factor on its variances, group -> redundancy.
+
+    factor' = factor v'Pv / r with r the redundancy of the group. With robust weights the factor of the image comes out
+    some per cent low, because the tails of good points are cut, too.
+    """
+    residuals, factor = equations.residuals, weights.factor
+    adjusted = np.trace(cofactors, axis1=1, axis2=2) / factor["image"]
+    square = {"image": float(np.sum(weights.image * np.sum(residuals.image**2, axis=1)) / factor["image"])}
+    redundancy = {"image": float(2.0 * np.sum(weights.image > 0) - np.sum(weights.image * adjusted))}
+    points = equations.point_covariance(covariance)
+    # control_weight is block diagonal: the sum of products is the trace with the points' own blocks
+    coordinates = equations.control_weight.tocoo()
+    same = coordinates.row // 3 == coordinates.col // 3
+    row, column = coordinates.row[same], coordinates.col[same]
+    taken = float(np.sum(coordinates.data[same] * points[row // 3, row % 3, column % 3]))
+    square["control"] = float(np.sum(residuals.control**2) / factor["control"])
+    redundancy["control"] = float(np.sum(equations.control_weight.diagonal() > 0)) - taken
+    own = equations.prior_weight * np.einsum("kp,pq,kq->k", equations.design_prior, covariance, equations.design_prior)
+    for group in dict.fromkeys(p.group for p in priors):
+        member = np.array([p.group == group for p in priors])
+        square[group] = float(np.sum((equations.prior_weight * residuals.prior**2)[member]))
+        redundancy[group] = float(np.sum(1.0 - own[member]))
+    new = {
+        g: float(factor[g] * square[g] / redundancy[g]) if redundancy[g] >= _LEAST_REDUNDANCY else float(factor[g])
+        for g in square
+    }
+    return new, redundancy

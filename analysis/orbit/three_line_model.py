@@ -1,0 +1,211 @@
+"""Rigorous model of a three-line camera in orbit (paper 003): collinearity of an image point at its exposure time.
+
+    ground = station + offset + R_body R_bias (position + scale R_camera l),
+    l = [-(x - x0)(1 + d), -(y - y0)(1 + d), f],    d = k1 r^2 + k2 r^4,  r from the principal point.
+
+R_body (measured attitude, body to ITRS) and station belong to the exposure time of the image line, R_bias to a field,
+R_camera and `position` to a line camera. Solved for the image, the condition of one image point is
+
+    x: (x - x0)(1 + d) + f a / c = 0        y: (y - y0)(1 + d) + f b / c = 0
+
+with (a, b, c) the ground point in the camera's axes (X along the track, Y along the line, Z toward the scene). The
+image is the real one: a point at +y sees the scene at -Y. x is the place of the CCD line in the focal plane, normally
+0: the measurement of the image line is in the exposure time. An error of one line acts as an error of one pixel in x at
+nadir, where lines are spaced as pixels are, and of cos^2 of the look angle (0.82) in the outer lines.
+
+R_bias = Rx(roll) Ry(pitch) Rz(yaw) about the body's axes. `misclosure` is analytic in all arguments, so that a complex
+step through it gives derivatives to rounding; `partials` has them in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "BIAS",
+    "INTERIOR",
+    "LineModel",
+    "Partials",
+    "Rays",
+    "bias_rotation",
+    "look_rotation",
+    "misclosure",
+    "partials",
+]
+
+Array = NDArray[np.float64]
+INTERIOR = ("f", "x", "y")
+BIAS = ("roll", "pitch", "yaw")
+_NEXT = ((1, 2), (2, 0), (0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class LineModel:
+    """One line camera: how it is mounted (known) and its interior orientation (to be calibrated).
+
+    Attributes:
+        to_body: (3, 3) rotation from the camera's axes to the body's.
+        interior: (3,) principal distance f and principal point x0, y0, metres.
+        position: (3,) projection centre in the body frame, metres.
+        k1, k2: radial distortion, 1/m^2 and 1/m^4.
+    """
+
+    to_body: Array
+    interior: Array
+    position: Array
+    k1: float = 0.0
+    k2: float = 0.0
+
+    @classmethod
+    def of(
+        cls, to_body: ArrayLike, interior: ArrayLike, position: ArrayLike = (0, 0, 0), k1: float = 0.0, k2: float = 0.0
+    ) -> LineModel:
+        """Raises ValueError for shapes, values that are not finite, f <= 0 and a to_body that is no rotation."""
+        turn, inner, place = (np.array(v, np.float64) for v in (to_body, interior, position))
+        if turn.shape != (3, 3) or inner.shape != (3,) or place.shape != (3,):
+            raise ValueError("line model: to_body must be (3, 3), interior and position (3,)")
+        if not np.all(np.isfinite(np.concatenate([turn.ravel(), inner, place, [k1, k2]]))) or inner[0] <= 0:
+            raise ValueError("line model: all numbers must be finite and f positive")
+        if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0):
+            raise ValueError("line model: to_body must be a rotation")
+        return cls(turn, inner, place, float(k1), float(k2))
+
+    def with_interior(self, interior: ArrayLike) -> LineModel:
+        """The same camera with another f, x0, y0."""
+        return replace(self, interior=np.array(interior, np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Image points of one line camera with the measured station and attitude of their exposure times.
+
+    Attributes:
+        point: (n,) which ground point each of them shows.
+        image: (n, 2) x and y in the focal plane, metres, counted from the line's centre.
+        station: (n, 3) of the body's origin, ITRS, metres.
+        attitude: (n, 3, 3) body to ITRS.
+    """
+
+    point: NDArray[np.intp]
+    image: Array
+    station: Array
+    attitude: Array
+
+    @classmethod
+    def of(cls, point: ArrayLike, image: ArrayLike, station: ArrayLike, attitude: ArrayLike) -> Rays:
+        """Raises ValueError for shapes that do not match, values that are not finite, points shown twice."""
+        which = np.array(point)
+        if which.ndim != 1 or (which.size and not np.issubdtype(which.dtype, np.integer)):
+            raise ValueError("rays: point must be a row of whole numbers")
+        n = len(which)
+        rows = [np.array(v, np.float64) for v in (image, station, attitude)]
+        shapes = [(n, 2), (n, 3), (n, 3, 3)]
+        for what, row, shape in zip(("image", "station", "attitude"), rows, shapes, strict=True):
+            if row.shape != shape:
+                raise ValueError(f"rays: {what} must be {shape} for {n} points, found {row.shape}")
+            bad = np.flatnonzero(~np.isfinite(row.reshape(n, -1)).all(axis=1))
+            if len(bad):
+                raise ValueError(f"rays: {what} of ray {bad[0]} is not finite; leave out what was not measured")
+        if len(np.unique(which)) != n:
+            raise ValueError("rays: a point appears twice in one line")
+        return cls(which.astype(np.intp), *rows)
+
+    def taken(self, keep: ArrayLike) -> Rays:
+        """Some of the rays, by mask or index."""
+        where = np.asarray(keep)
+        return Rays(self.point[where], self.image[where], self.station[where], self.attitude[where])
+
+
+@dataclass(frozen=True, eq=False)
+class Partials:
+    """Derivatives of `misclosure`, (n, 2, 3): interior by f, x0, y0; bias by roll, pitch, yaw; ground by the point
+    (by the station: its negative); attitude by a small turn of the measured attitude about the body's axes.
+    """
+
+    interior: Array
+    bias: Array
+    ground: Array
+    attitude: Array
+
+
+def look_rotation(look: float) -> Array:
+    """Rotation from a camera that looks forward by `look` (radians, about the body's Y) to the body."""
+    return np.asarray(_turn(1, look))
+
+
+def bias_rotation(bias: ArrayLike) -> Array:
+    """(3, 3) Rx(roll) Ry(pitch) Rz(yaw) from (3,) radians."""
+    roll, pitch, yaw = np.asarray(bias)
+    return np.asarray(_turn(0, roll) @ _turn(1, pitch) @ _turn(2, yaw))
+
+
+def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Array:
+    """Left sides of the two conditions, metres in the image: (n, 2), zero for perfect data.
+
+    ground: (n, 3) of each ray's point, ITRS. bias: (3,) radians. offset: (3,) of the station, ITRS, metres.
+    """
+    f, x0, y0 = camera.interior
+    q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
+    seen = (q @ bias_rotation(bias) - camera.position) @ camera.to_body
+    x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
+    square = x * x + y * y
+    grown = 1.0 + square * (camera.k1 + camera.k2 * square)
+    return np.stack([x * grown + f * seen[:, 0] / seen[:, 2], y * grown + f * seen[:, 1] / seen[:, 2]], axis=-1)
+
+
+def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Partials:
+    """Derivatives of `misclosure` in closed form.
+
+    Raises:
+        ValueError: a ground point behind a camera.
+    """
+    f, x0, y0 = camera.interior
+    q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
+    turn = bias_rotation(bias)
+    a, b, c = ((q @ turn - camera.position) @ camera.to_body).T
+    if np.any(c <= 0):
+        raise ValueError("three-line model: a ground point lies behind a camera")
+    x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
+    square = x * x + y * y
+    grown = 1.0 + square * (camera.k1 + camera.k2 * square)
+    slope = 2.0 * (camera.k1 + 2.0 * camera.k2 * square)
+    by_x = -np.stack([grown + slope * x * x, slope * x * y], axis=-1)
+    by_y = -np.stack([slope * x * y, grown + slope * y * y], axis=-1)
+    interior = np.stack([np.stack([a / c, b / c], axis=-1), by_x, by_y], axis=-1)
+    zero = np.zeros_like(c)
+    image = f * np.stack([np.stack([1 / c, zero, -a / c**2], -1), np.stack([zero, 1 / c, -b / c**2], -1)], axis=1)
+    to_body = image @ camera.to_body.T  # by the point in the body frame of the true attitude
+    roll, pitch, yaw = bias
+    turned = []
+    for axis in range(3):
+        chain = [_turn(0, roll), _turn(1, pitch), _turn(2, yaw)]
+        chain[axis] = _turn_slope(axis, bias[axis])
+        turned.append(q @ (chain[0] @ chain[1] @ chain[2]))
+    to_measured = to_body @ turn.T  # by the point in the body frame of the measured attitude
+    spun = np.stack([np.cross(q, axis) for axis in np.eye(3)], axis=-1)
+    return Partials(
+        interior=interior,
+        bias=to_body @ np.stack(turned, axis=-1),
+        ground=to_measured @ np.swapaxes(rays.attitude, 1, 2),
+        attitude=to_measured @ spun,
+    )
+
+
+def _turn(axis: int, angle: float | complex) -> np.ndarray:
+    """Right-handed rotation about a coordinate axis; the angle may be complex."""
+    i, j = _NEXT[axis]
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.eye(3, dtype=np.result_type(cos, np.float64))
+    turn[i, i] = turn[j, j] = cos
+    turn[i, j], turn[j, i] = -sin, sin
+    return turn
+
+
+def _turn_slope(axis: int, angle: float) -> Array:
+    """Derivative of `_turn` by the angle."""
+    slope = _turn(axis, angle + 0.5 * np.pi)
+    slope[axis, axis] = 0.0
+    return slope

@@ -1,0 +1,384 @@
+"""In-orbit calibration of the synthetic pass of test_three_line_model: recovery, statistics, gauge, wrong matches."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.orbit.adjustment import adjust
+from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
+from analysis.orbit.forward_intersection import check_errors, intersect
+from analysis.orbit.normal_equations import Weights, assemble
+from analysis.orbit.null_space import Gauge, RankError
+from analysis.orbit.residual_weights import REJECT
+from analysis.orbit.stepwise import stepwise
+from tests.analysis.test_three_line_model import (
+    ARCSEC,
+    INTERIOR,
+    PITCH,
+    cameras,
+    field_points,
+    make_rays,
+    observe,
+    orbit,
+)
+
+NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC)
+CONTROL, ORBIT = 1.0, 0.3
+BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC
+CHANGED = {"forward": (90e-6, -40e-6, 60e-6), "nadir": (-70e-6, 0.0, 0.0), "aft": (50e-6, 30e-6, -50e-6)}
+LABORATORY = cameras(CHANGED)
+HOLD_X = Gauge(held=("nadir x",))
+HOLD_XY = Gauge(held=("nadir x", "nadir y"))
+OFFSETS = Unknowns(offset="field")
+INNER = [f"{line} {n}" for line in INTERIOR for n in ("f", "x", "y")]
+TRUTH = dict(zip(INNER, np.ravel(list(INTERIOR.values())), strict=True))
+
+
+def seen(seed, count=60, node=2.4, bias=BIAS, **terrain):
+    return observe(field_points(np.random.default_rng(seed), count, node, **terrain), node, cameras(), bias)
+
+
+def measured(view, rng=None, noise=NOISE, offset=(0.0, 0.0, 0.0), name="Beijing", sigma=CONTROL, control=None):
+    """A field; rng for measurements with noise. offset: true minus measured station, ITRS."""
+    rays = {k: replace(r, station=r.station - offset) for k, r in make_rays(view, rng, noise).items()}
+    ground = view.points if rng is None else view.points + sigma * rng.standard_normal(view.points.shape)
+    return CalibrationField.of(name, rays, ground, sigma, control)
+
+
+def priors(*names, sigma=ORBIT):
+    return [Prior({f"{n} offset {a}": 1.0}, 0.0, sigma, "orbit") for n in names for a in ("along", "across", "down")]
+
+
+def truth(names, bias=BIAS):
+    known = TRUTH | {f"Beijing {n}": v for n, v in zip(("roll", "pitch", "yaw"), bias, strict=True)}
+    return np.array([known.get(n, 0.0) for n in names])
+
+
+VIEW = seen(1)
+SEVEN_NODES = 2.2 + 0.1 * np.arange(7)
+
+
+def seven(rng):
+    fields = []
+    for i, node in enumerate(SEVEN_NODES):
+        offset = orbit(node, np.zeros(1))[1][0] @ (ORBIT * rng.standard_normal(3))
+        view = seen(10 + i, node=node, bias=BIAS + ARCSEC * rng.standard_normal(3))
+        fields.append(measured(view, rng, offset=offset, name=f"F{i}"))
+    return fields
+
+
+def test_exact_data_return_everything_that_is_observable():
+    """nadir x starts at its true value: the gauge then is the truth's own. Left is rounding of 1e-15 m over a strength
+    of 7e-3 and, for the principal points, distances of 1e-5 m: 1e-9."""
+    found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_X)
+    assert found.values == pytest.approx(truth(found.names), rel=1e-6)
+    assert found.chi_square < 1e-12
+    assert found.iterations <= 4
+    assert found.cameras["aft"].interior == pytest.approx(INTERIOR["aft"], rel=1e-6)
+    assert found.bias("Beijing") == pytest.approx(BIAS, rel=1e-6)
+    assert str(found.gauge) == "held at the start values: nadir x"
+    # tie points: a quarter is control, the rest must come from the images alone
+    field = measured(VIEW, control=np.arange(60) % 4 == 0)
+    moved = replace(field, ground=field.ground + np.where(field.control[:, None], 0.0, 200.0))
+    tied = adjust([moved], LABORATORY, NOISE, gauge=HOLD_X)
+    assert tied.values == pytest.approx(truth(tied.names), rel=1e-6)
+    assert np.abs(tied.ground["Beijing"] - VIEW.points).max() < 1e-6
+
+
+@pytest.mark.parametrize("gauge", [HOLD_X, Gauge(minimum_norm=True)])
+def test_a_wrong_gauge_keeps_the_observable_combinations(gauge):
+    """nadir x starts 0.2 mm off, 63 arcsec of pitch. Differences of x come out, and x + f pitch.
+
+    The combination is null to 1e-5 of 0.2 mm (mounting errors of tens of arcsec), and to second order in 63 arcsec.
+    """
+    wrong = cameras(CHANGED | {"nadir": (-70e-6, 200e-6, 0.0)})
+    found = adjust([measured(VIEW)], wrong, NOISE, gauge=gauge)
+    error = dict(zip(found.names, found.values - truth(found.names), strict=True))
+    if gauge.held:
+        assert error["nadir x"] == pytest.approx(200e-6, rel=1e-12)
+    else:  # the correction has no part along the null vector
+        change = dict(zip(found.names, found.values, strict=True))
+        shift = [change[f"{k} x"] - wrong[k].interior[1] for k in INTERIOR]
+        assert sum(shift) - 0.65 * change["Beijing pitch"] == pytest.approx(0, abs=1e-3 * 200e-6)
+    for line in ("forward", "aft"):
+        assert error[f"{line} x"] - error["nadir x"] == pytest.approx(0, abs=1e-4 * 200e-6)
+        assert error[f"{line} f"] == pytest.approx(0, abs=1e-6 * 0.65)
+    assert error["nadir x"] + 0.65 * error["Beijing pitch"] == pytest.approx(0, abs=2e-3 * 200e-6)
+    assert len(found.open) == 1
+
+
+def test_covariance_is_that_of_the_full_system():
+    """Dense normal equations with the points in them, and no elimination."""
+    field = measured(seen(2, 12), control=np.arange(12) < 8)
+    found = adjust([field], LABORATORY, NOISE, gauge=HOLD_XY)
+    parameters = Parameters.of([field], LABORATORY, Unknowns())
+    weights = Weights(np.ones(36), {"image": 1.0})
+    ground = [found.ground["Beijing"]]
+    at = assemble([field], LABORATORY, parameters, found.values, ground, NOISE, (), weights)
+    design = np.hstack([at.design.toarray(), at.design_point.toarray()])
+    normal = design.T @ design
+    normal[12:, 12:] += at.control_weight.toarray()
+    kept = [i for i in range(len(normal)) if i >= 12 or found.names[i] not in HOLD_XY.held]
+    size = 1 / np.sqrt(np.diag(normal)[kept])
+    inverse = size[:, None] * np.linalg.inv(size[:, None] * normal[np.ix_(kept, kept)] * size) * size
+    inner = [found.names.index(found.names[i]) for i in kept if i < 12]
+    sigma = np.sqrt(np.diag(inverse))
+    assert found.covariance[np.ix_(inner, inner)] == pytest.approx(inverse[:10, :10], rel=1e-5, abs=1e-20)
+    spread = np.sqrt(found.ground_covariance["Beijing"][:, [0, 1, 2], [0, 1, 2]]).ravel()
+    assert spread == pytest.approx(sigma[10:], rel=1e-6)
+
+
+def test_estimates_are_unbiased_and_sigmas_right():
+    """100 passes with noise of image, control, attitude and orbit. Two-sided false alarm of 1e-4 each for the sum of
+    the Mahalanobis squares, for that of the residuals and, over all parameters together, for the mean."""
+    rng, squares, errors, fits = np.random.default_rng(5), [], [], []
+    axes = orbit(VIEW.node, np.zeros(1))[1][0]
+    for _ in range(100):
+        offset = ORBIT * rng.standard_normal(3)
+        field = measured(VIEW, rng, offset=axes @ offset)
+        found = adjust([field], LABORATORY, NOISE, unknowns=OFFSETS, priors=priors("Beijing"), gauge=HOLD_X)
+        free = np.array([n != "nadir x" for n in found.names])
+        true = truth(found.names)
+        true[-3:] = offset
+        error = (found.values - true)[free]
+        scale = np.sqrt(np.diag(found.covariance))[free]
+        unit = found.covariance[np.ix_(free, free)] / scale / scale[:, None]
+        squares.append(error / scale @ np.linalg.solve(unit, error / scale))
+        errors.append(error / scale)
+        fits.append((found.chi_square, found.degrees_of_freedom))
+    assert 5e-5 < stats.chi2.sf(np.sum(squares), 100 * len(error)) < 1 - 5e-5
+    mean = np.mean(errors, axis=0) * np.sqrt(100)
+    assert mean @ np.linalg.solve(unit, mean) < stats.chi2.isf(1e-4, len(mean))
+    # the offsets are drawn, and their priors count: 360 + 180 + 3 observations, 14 + 180 unknowns
+    assert fits[0][1] == 360 + 180 + 3 - 14 - 180
+    assert 5e-5 < stats.chi2.sf(sum(f[0] for f in fits), sum(f[1] for f in fits)) < 1 - 5e-5
+
+
+def test_open_combinations_are_named():
+    """x of all lines by 1 mm is 1 mm / 0.65 m = 317.3 arcsec of pitch: null vector of paper 003's twelve unknowns."""
+    with pytest.raises(RankError, match="Hold or weight") as caught:
+        adjust([measured(VIEW)], LABORATORY, NOISE)
+    (only,) = caught.value.open
+    change = dict(zip(only.names, only.change, strict=True))
+    assert set(change) == {"forward x", "nadir x", "aft x", "Beijing pitch"}
+    assert change["nadir x"] / change["forward x"] == pytest.approx(1, rel=1e-3)
+    assert change["nadir x"] / change["aft x"] == pytest.approx(1, rel=1e-3)
+    assert change["Beijing pitch"] / change["nadir x"] == pytest.approx(-1 / 0.65, rel=1e-3)
+    # roll against y is weak, yaw against y of the outer lines a correlation
+    found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_X)
+    (weak,) = found.weak
+    assert set(weak.names) == {"forward y", "nadir y", "aft y", "Beijing roll"}
+    assert 1e-3 < weak.strength < 1e-2
+    held = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_XY)
+    yaw, forward, aft = (held.names.index(n) for n in ("Beijing yaw", "forward y", "aft y"))
+    assert held.correlation[yaw, forward] < -0.9
+    assert held.correlation[yaw, aft] > 0.9
+    assert np.isnan(held.correlation[held.names.index("nadir x"), yaw])
+    # several fields share one interior: one gauge closes them all
+    two = [measured(seen(3 + i, 20 + 4 * i, node=2.2 + 0.4 * i), name=f"F{i}") for i in range(2)]
+    with pytest.raises(RankError, match=r"F0 pitch .* F1 pitch"):
+        adjust(two, LABORATORY, NOISE)
+    assert adjust(two, LABORATORY, NOISE, gauge=HOLD_X).chi_square < 1e-10
+
+
+def test_free_orbit_offsets_open_three_more_and_priors_close_them():
+    for terrain in ({}, {"relief": 0.0}, {"relief": 0.0, "plane": True}):
+        with pytest.raises(RankError) as caught:
+            adjust([measured(seen(1, **terrain))], LABORATORY, NOISE, unknowns=OFFSETS, gauge=HOLD_X)
+        assert len(caught.value.open) == 3
+        for axis in ("along", "across", "down"):
+            assert any(f"Beijing offset {axis}" in c.names for c in caught.value.open)
+    found = adjust([measured(VIEW)], LABORATORY, NOISE, unknowns=OFFSETS, priors=priors("Beijing"), gauge=HOLD_X)
+    assert found.values == pytest.approx(truth(found.names), rel=1e-6, abs=1e-9)
+
+
+def test_flat_terrain_only_matters_for_orbit_offsets():
+    """With known stations an image point tells a direction, whatever the height: bias and interior stay as they are.
+
+    Offsets against y of the lines live from relief: 2000 m are five times what the curved Earth gives on one height.
+    """
+    hilly, flat = seen(1), seen(1, relief=0.0)
+    sigmas, strengths = [], []
+    for view in (hilly, flat):
+        sigmas.append(adjust([measured(view, sigma=0.0)], LABORATORY, NOISE, gauge=HOLD_X).sigma)
+        with pytest.raises(RankError) as caught:
+            adjust([measured(view)], LABORATORY, NOISE, unknowns=OFFSETS, gauge=HOLD_X)
+        strengths.append(min(c.strength for c in caught.value.open if "Beijing offset across" in c.names))
+    for name, sigma in sigmas[0].items():
+        assert sigmas[1][name] == pytest.approx(sigma, rel=0.05)
+    assert strengths[1] < 0.5 * strengths[0]
+
+
+def test_points_on_one_line_along_the_track_cannot_tell_f_from_y():
+    points = field_points(np.random.default_rng(4), 200, 2.4)
+    view = observe(points, 2.4, cameras(), BIAS)
+    # image y of each line within 20 um of one value: take them from rays that run there
+    rays = {k: r.taken(np.argsort(np.abs(r.image[:, 1] - 0.02))[:12]) for k, r in make_rays(view).items()}
+    rays = {k: replace(r, image=np.column_stack([r.image[:, 0], np.full(12, 0.02)])) for k, r in rays.items()}
+    field = CalibrationField.of("Beijing", rays, points, CONTROL)
+    with pytest.raises(RankError) as caught:
+        adjust([field], cameras(), NOISE, gauge=HOLD_X)
+    named = {n for c in caught.value.open for n in c.names}
+    assert {f"{line} {n}" for line in INTERIOR for n in ("f", "y")} <= named
+
+
+def test_stepwise_ends_where_the_simultaneous_one_does_and_as_slowly_as_predicted():
+    rng = np.random.default_rng(8)
+    field = measured(VIEW, rng)
+    together = adjust([field], LABORATORY, NOISE, gauge=HOLD_XY)
+    steps = stepwise([field], LABORATORY, NOISE, held=HOLD_XY.held, tolerance=1e-6)
+    assert steps.converged
+    sigma = np.sqrt(np.diag(together.covariance))
+    free = sigma > 0
+    assert np.abs((steps.values - together.values)[free] / sigma[free]).max() < 1e-3
+    # the decay of the last rounds against the canonical correlation of the two blocks
+    assert steps.steps[-200] / steps.steps[-400] == pytest.approx(steps.rate**200, rel=0.01)
+    assert steps.rounds > 100
+    # each step takes the other block for exact
+    slow = together.names.index("Beijing yaw")
+    assert steps.conditional_sigma[slow] < 0.3 * sigma[slow]
+
+
+def test_stepwise_without_a_gauge_keeps_the_start_of_what_is_open():
+    """Bias first: the pitch takes the mean shift of x, wherever the laboratory put it."""
+    field = measured(VIEW)
+    ends = []
+    for shift in (0.0, 100e-6):
+        moved = {k: (v[0], v[1] + shift, v[2]) for k, v in CHANGED.items()}
+        ends.append(stepwise([field], cameras(moved), NOISE, tolerance=1e-5))
+    assert ends[0].open_count == 1
+    assert ends[0].converged
+    names = ends[0].names
+    apart = dict(zip(names, ends[1].values - ends[0].values, strict=True))
+    for line in INTERIOR:
+        assert apart[f"{line} x"] == pytest.approx(100e-6, rel=1e-2)
+    assert apart["Beijing pitch"] == pytest.approx(-100e-6 / 0.65, rel=1e-2)
+
+
+@pytest.mark.parametrize("robust", ["huber", "igg"])
+def test_wrong_matches_lose_their_weight(robust):
+    """3 per cent of the image points are off by 10 to 60 px."""
+    rng = np.random.default_rng(11)
+    fields = [measured(seen(20 + i, node=n), rng, name=f"F{i}") for i, n in enumerate((2.2, 2.4, 2.6))]
+    wrong = {}
+    for field in fields:
+        for line, rays in field.rays.items():
+            bad = rng.permutation(60)[: 2 if line != "nadir" else 1]
+            angle, size = rng.uniform(0, 2 * np.pi, len(bad)), PITCH * rng.uniform(10, 60, len(bad))
+            rays.image[bad] += size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+            wrong[field.name, line] = bad
+    plain = adjust(fields, LABORATORY, NOISE, gauge=HOLD_XY)
+    found = adjust(fields, LABORATORY, NOISE, gauge=HOLD_XY, robust=robust)
+    free = np.flatnonzero(np.diag(found.covariance)[:9] > 0)
+    true = np.array([TRUTH[n] for n in INNER])
+
+    def distance(result):
+        error = (result.values[:9] - true)[free]
+        return error @ np.linalg.solve(result.covariance[np.ix_(free, free)], error)
+
+    assert distance(plain) > 100
+    assert plain.p_value < 1e-10
+    weights = np.concatenate([found.weight[f.name][k][wrong[f.name, k]] for f in fields for k in f.rays])
+    assert len(weights) == 15
+    total = sum(float(np.sum(found.weight[f.name][k] < 0.01)) for f in fields for k in f.rays)
+    if robust == "igg":
+        assert np.all(weights == 0)
+        # 525 good points, 1 in 10 000 beyond the limit: more than three is a false alarm of 3e-7
+        assert total - 15 <= 3
+        assert distance(found) < stats.chi2.isf(1e-5, len(free))
+        assert np.sum(np.linalg.norm(found.residual["F0"]["aft"], axis=1) > REJECT) == 2
+    else:
+        assert np.all(weights < 0.25)
+        assert distance(found) < 0.1 * distance(plain)
+
+
+def test_variance_components_find_wrong_sigmas():
+    """Image noise twice and control half of what is claimed; each to 4.5 sigmas of its estimate, sqrt(2 / r)."""
+    rng = np.random.default_rng(12)
+    claimed = Noise(0.3 * PITCH)
+    fields = []
+    for i in range(3):
+        view = seen(20 + i, node=2.2 + 0.2 * i)
+        rough = measured(view, rng, Noise(0.6 * PITCH), name=f"F{i}", sigma=1.0)
+        fields.append(CalibrationField.of(f"F{i}", rough.rays, rough.ground, 2.0))
+    found = adjust(fields, LABORATORY, claimed, gauge=HOLD_XY, variance_components=True)
+    assert sum(found.redundancy.values()) == pytest.approx(found.degrees_of_freedom, abs=1e-6)
+    for group, factor in (("image", 4.0), ("control", 0.25)):
+        # the other group is estimated, too: its share adds to the scatter, at most as much again
+        assert found.factors[group] == pytest.approx(factor, rel=4.5 * np.sqrt(2 * 2 / found.redundancy[group]))
+    plain = adjust(fields, LABORATORY, claimed, gauge=HOLD_XY)
+    assert plain.factors == {"image": 1.0, "control": 1.0}
+    right = adjust(
+        [CalibrationField.of(f.name, f.rays, f.ground, 1.0) for f in fields],
+        LABORATORY,
+        Noise(0.6 * PITCH),
+        gauge=HOLD_XY,
+    )
+    assert right.sigma["nadir f"] > 1.2 * plain.sigma["nadir f"]
+    for name in INNER:
+        assert found.sigma[name] == pytest.approx(right.sigma[name], rel=0.15)
+
+
+def test_priors_pull_as_their_weight_says():
+    """A monitor that knows the difference of two principal points to a nanometre fixes it, and its sigma."""
+    prior = Prior({"forward y": 1.0, "nadir y": -1.0}, -23e-6, 1e-9, "monitor")
+    field = measured(VIEW, np.random.default_rng(13))
+    found = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, priors=[prior])
+    assert found.value("forward y") - found.value("nadir y") == pytest.approx(-23e-6, abs=5e-9)
+    without = adjust([field], LABORATORY, NOISE, gauge=HOLD_X)
+    assert found.sigma["Beijing yaw"] < 0.8 * without.sigma["Beijing yaw"]
+
+
+def test_seven_fields_are_quick_and_check_points_gain():
+    """60 points x 3 lines x 7 fields; check points without control before and after, 100 m class and metres."""
+    rng = np.random.default_rng(14)
+    fields = seven(rng)
+    names = [f.name for f in fields]
+    spent = []
+    for _ in range(2):
+        start = time.perf_counter()
+        found = adjust(fields, LABORATORY, NOISE, unknowns=OFFSETS, priors=priors(*names), gauge=HOLD_XY)
+        spent.append(time.perf_counter() - start)
+    assert min(spent) < 2.0
+    # interior to the 0.01 mm and bias to the 1 arcsec class (paper 003), in the gauge of a known nadir principal point
+    assert max(found.sigma[n] for n in INNER) < 0.01e-3
+    assert max(found.sigma[f"F0 {n}"] for n in ("roll", "pitch", "yaw")) < 1.5 * ARCSEC
+    check = seen(99, 100, node=2.35)
+    rays = make_rays(check, rng, NOISE)
+    bias = np.mean([found.bias(n) for n in names], axis=0)
+    before = check_errors(intersect(rays, LABORATORY, NOISE).ground, check.points)
+    after = check_errors(intersect(rays, found.cameras, NOISE, bias=bias).ground, check.points)
+    assert 50 < before.plan_rms < 500
+    assert after.plan_rms < 5
+    assert after.height_rms < 5
+
+
+def test_bad_input_is_told():
+    field = measured(VIEW)
+    few = measured(seen(1, 2))
+    with pytest.raises(CalibrationError, match="3 image points are too few for 11 unknowns"):
+        adjust([measured(seen(1, 1))], LABORATORY, NOISE, gauge=HOLD_X)
+    with pytest.raises(RankError):
+        adjust([few], LABORATORY, NOISE)
+    with pytest.raises(CalibrationError, match="no fields"):
+        adjust([], LABORATORY, NOISE)
+    with pytest.raises(CalibrationError, match="two fields have one name"):
+        adjust([field, field], LABORATORY, NOISE)
+    with pytest.raises(CalibrationError, match="no unknown is called 'nadir z'"):
+        adjust([field], LABORATORY, NOISE, gauge=Gauge(held=("nadir z",)))
+    with pytest.raises(CalibrationError, match="no camera is called 'aft'"):
+        adjust([field], {k: v for k, v in LABORATORY.items() if k != "aft"}, NOISE)
+    with pytest.raises(CalibrationError, match="sigmas must be finite"):
+        adjust([field], LABORATORY, Noise(np.nan))
+    with pytest.raises(CalibrationError, match="positive sigma"):
+        adjust([field], LABORATORY, NOISE, priors=[Prior({"nadir f": 1.0}, 0.65, 0.0)])
+    with pytest.raises(CalibrationError, match="nothing to solve for"):
+        adjust([field], LABORATORY, NOISE, unknowns=Unknowns(interior=False, bias="none"))
+    with pytest.raises(CalibrationError, match="attitude and of the interior"):
+        stepwise([field], LABORATORY, NOISE, unknowns=Unknowns(bias="none"))
+    with pytest.raises(CalibrationError, match="robust must be"):
+        adjust([field], LABORATORY, NOISE, gauge=HOLD_X, robust="tukey")
+    assert not stepwise([field], LABORATORY, NOISE, rounds=3).converged
