@@ -148,7 +148,7 @@ class CalibrationPlanSpec(Spec):
             )
         steps = (self.last - self.first) / self.step
         if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-            allowed = f"a whole part of the region, {format_quantity(self.last - self.first, ANGLE)}"
+            allowed = f"a whole part of the region, {math.degrees(self.last - self.first):.6g} deg"
             raise Problem("the region is no whole number of steps", shown["step"], allowed, within=("step",))
         if self.repeats < 2:
             raise Problem(

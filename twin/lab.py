@@ -61,6 +61,10 @@ def distortion(
 ) -> None:
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
+
+    distortion.json: `rms_raw_um` and `rms_compensated_um` are what a laboratory can state, the scatter of the points
+    about a smooth curve; how wrong the distortion is stands under `truth`, `error_rms_raw_um` and
+    `error_rms_compensated_um`.
     """
     options = Options(out, seed, backend, force, as_json, quiet)
     run_test(PROGRAM, file, resolve_distortion, run_distortion, options)

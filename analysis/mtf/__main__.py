@@ -165,6 +165,8 @@ def _read(path: Path, frames: int | None, saturation: float | None) -> tuple[Arr
 
     A pixel that is saturated in one page counts as saturated: its mean is put at that level.
     """
+    if path.is_dir():
+        raise _Wrong(f"{path} is a folder, not an image")
     if not path.is_file():
         raise _Wrong(f"there is no image {path}")
     try:

@@ -198,6 +198,7 @@ def test_unreadable_images(tmp_path):
     (tmp_path / "text.tiff").write_text("not a picture")
     for name, message in (
         ("none.tiff", "there is no image"),
+        (".", "is a folder, not an image"),
         ("text.png", "cannot be read as an image"),
         ("text.tiff", "cannot be read as an image"),
     ):

@@ -36,7 +36,7 @@ def lab_result(run: DistortionRun) -> LabResult:
         lead=(
             f"Principal distance {data['principal_distance_mm']:.3f} ± {data['principal_distance_mm_sigma']:.3f} mm "
             f"(truth {truth['principal_distance_mm']:.3f} mm).",
-            fit.point.statement,
+            typeset(fit.point.statement),
             f"Distortion is measured to {truth['error_rms_compensated_um']:.2f} µm rms with compensated angles and "
             f"{truth['error_rms_raw_um']:.2f} µm with angles as read (paper 004 claims "
             f"{printed_004.DISTORTION_ACCURACY_UM} µm).",
@@ -66,6 +66,13 @@ def lab_result(run: DistortionRun) -> LabResult:
     )
 
 
+def typeset(text: str) -> str:
+    """A statement of the analysis, which is plain ASCII, as the report and the terminal show it."""
+    for plain, shown in (("+-", "±"), ("tan^2", "tan²"), (" um", " µm"), (" deg", "°"), ("= -", "= −")):
+        text = text.replace(plain, shown)
+    return text
+
+
 def _warnings(run: DistortionRun) -> tuple[str, ...]:
     out = []
     kept = int(np.sum(run.truth.gross & run.means.keep))
@@ -77,7 +84,7 @@ def _warnings(run: DistortionRun) -> tuple[str, ...]:
     if abs(slope) > 0.5 * sigma:
         out.append(
             "as-built coma that grows over the field moves energy centroids against chief rays and f by "
-            f"{1e6 * slope:.0f} um, which no sigma holds ({1e6 * sigma:.0f} um): measure the wavefront at several "
+            f"{1e6 * slope:.0f} µm, which no sigma holds ({1e6 * sigma:.0f} µm): measure the wavefront at several "
             "fields"
         )
     return tuple(out)
@@ -101,10 +108,10 @@ def _summary(run: DistortionRun) -> Table:
             truth["principal_point_mm"],
         ),
         ("correlation of the two", data["correlation"], None, None),
-        ("residual of smooth model, raw angles, um rms", data["rms_raw_um"], None, None),
-        ("residual of smooth model, compensated, um rms", data["rms_compensated_um"], None, None),
-        ("error of distortion, raw angles, um rms", truth["error_rms_raw_um"], None, None),
-        ("error of distortion, compensated, um rms", truth["error_rms_compensated_um"], None, None),
+        ("residual of smooth model, raw angles, µm rms", data["rms_raw_um"], None, None),
+        ("residual of smooth model, compensated, µm rms", data["rms_compensated_um"], None, None),
+        ("error of distortion, raw angles, µm rms", truth["error_rms_raw_um"], None, None),
+        ("error of distortion, compensated, µm rms", truth["error_rms_compensated_um"], None, None),
     ]
     caption = (
         "f and p with compensated angles, by least squares with a constant: paper 004, eq. 2, with an unknown zero of "
@@ -162,7 +169,7 @@ def _compensation(run: DistortionRun) -> Section:
         "distortion-reduction",
         "What compensation brings",
         "RMS over the points, and the largest.",
-        ("quantity", "raw, um", "compensated, um", "reduction, %", "largest raw, um", "largest compensated, um"),
+        ("quantity", "raw, µm", "compensated, µm", "reduction, %", "largest raw, µm", "largest compensated, µm"),
         rows,
         (None, 2, 2, 0, 1, 1),
     )
@@ -211,13 +218,16 @@ def _estimates(run: DistortionRun) -> Section:
         "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
         "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
         "own truth.",
-        run.compensated.fit.point.statement,
+        typeset(run.compensated.fit.point.statement),
     )
     estimates = Table(
         "distortion-estimates",
         "The printed equations and fits with a constant",
         "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
-        ("estimate", "f, mm", "sigma", "error", "p, mm", "sigma of p", "error of p", "error of D, um rms"),
+        (
+            *("estimate", "f, mm", "sigma of f, mm", "error of f, mm"),
+            *("p, mm", "sigma of p, mm", "error of p, mm", "error of D, µm rms"),
+        ),
         rows,
         (None, 3, 3, 3, 2, 2, 2, 2),
     )

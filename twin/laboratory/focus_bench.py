@@ -8,7 +8,7 @@ the assembly.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -185,19 +185,27 @@ class FocusBench:
             place = site.place[None, ::-1]
             bare = TargetPath(self.camera.assembly, ROOT, ROOT, self.camera.model, self.path.backend)
             pupil = bare.pupils({}, bare.directions(place), place)[0]
-            ideal = {
-                edge: EdgeImager(EdgeOptics.build(pupil, ccd.band, i.optics.normal, _SEARCH), ccd, i.region)
-                for edge, i in site.imagers.items()
-            }
+            perfect = replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms))
             for edge, imager in site.imagers.items():
-                f = ccd.band.nyquist
-                x, y = f * imager.optics.normal
-                diffraction = abs(complex(ideal[edge].optics.at(best_focus(ideal[edge], f), np.array([f]))[0]))
-                actual = abs(complex(imager.optics.at(site.best, np.array([f]))[0]))
+                f, normal = ccd.band.nyquist, imager.optics.normal
+                x, y = f * normal
+                designed = EdgeImager(EdgeOptics.build(pupil, ccd.band, normal, _SEARCH), ccd, imager.region)
+                diffraction = _modulus(EdgeOptics.build(perfect, ccd.band, normal, _SEARCH), 0.0, f)
+                design = _modulus(designed.optics, best_focus(designed, f), f)
+                actual = _modulus(imager.optics, site.best, f)
                 parts = {k: float(v) for k, v in ccd.factors(np.array(x), np.array(y)).items()}
-                factors = {"diffraction": diffraction, "wavefront": actual / diffraction, **parts}
+                factors = {
+                    "diffraction": diffraction,
+                    "design": design / diffraction,
+                    "wavefront": actual / design,
+                    **parts,
+                }
                 out.append(BudgetLine(name, edge, factors, imager.mtf(site.best, f)))
         return tuple(out)
+
+
+def _modulus(optics: EdgeOptics, defocus: float, frequency: float) -> float:
+    return float(np.abs(optics.at(defocus, np.array([frequency])))[0])
 
 
 def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:

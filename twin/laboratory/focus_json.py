@@ -74,8 +74,9 @@ def _shims(shimming: Shimming) -> dict[str, Any]:
     names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
     piston, slope_x, slope_y = np.sqrt(np.diag(shimming.covariance))
     return {
-        "shims_um": {n: UM * float(t) for n, t in zip(names, plan.thickness, strict=True)},
-        "shim_changes_um": {n: UM * float(t) for n, t in zip(names, plan.rounded_change, strict=True)},
+        # whole steps of the workshop; beyond picometres there is only rounding
+        "shims_um": {n: round(UM * float(t), 6) for n, t in zip(names, plan.thickness, strict=True)},
+        "shim_changes_um": {n: round(UM * float(t), 6) for n, t in zip(names, plan.rounded_change, strict=True)},
         "slides_mm": {n: [1e3 * float(x) for x in s] for n, s in zip(names, plan.slide, strict=True)},
         "turn_by_hand_arcmin": plan.turn / ARCMIN,
         "line_level_without_turn_arcmin": plan.level_coupling / ARCMIN,

@@ -109,7 +109,8 @@ def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
     return (
         (
             "Camera",
-            f"{camera.name}: f {alignment.bench.focal_length:.3f} m, pupil {camera.entrance_pupil:g} m; {bands}",
+            f"{camera.name}: f {alignment.bench.focal_length:.3f} m (geometric mean of both directions), pupil "
+            f"{camera.entrance_pupil:g} m; {bands}",
         ),
         (
             "Collimator",
@@ -208,8 +209,9 @@ def _mtf_section(alignment: Alignment) -> Section:
     text = (
         "The paper's values are compared with the MTF along the track, which has everything in it: optics, pixel, "
         "charge diffusion and the motion of the image over the stages.",
-        "A perfect camera would have the first factor times the pixel's. The other factors are the degradations that "
-        "bring it to the paper's class; the paper names none of them, so that they are one plausible set among others.",
+        "The camera as designed would have the product of diffraction, design and pixel. The others are the "
+        "degradations that bring it to the paper's class; the paper names none of them, so that they are one "
+        "plausible set among others.",
     )
     return Section(
         "MTF at the Nyquist frequency",
@@ -225,9 +227,10 @@ def _mtf_section(alignment: Alignment) -> Section:
             Table(
                 "mtf-budget",
                 "What makes it, in the middle of the field",
-                "Transfer of each effect at Nyquist, from the trace and the data sheets; wavefront: the camera's and "
-                "the collimator's errors at best focus midway between the directions.",
-                ("band", "direction", *(n.replace("_", " ") for n in names), "product"),
+                "Transfer of each effect at Nyquist, from the trace and the data sheets; diffraction: the pupil "
+                "without aberrations; design: those of the prescription, at best focus of each direction; "
+                "wavefront: the camera's and the collimator's errors, at best focus midway between the directions.",
+                ("band", "direction", *(n.replace("_", " ").replace("tdi", "TDI") for n in names), "product"),
                 budget,
             ),
             SvgFigure(
