@@ -17,6 +17,7 @@ from scenes.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.orbit_angle import OrbitAngleSpec
+from scenes.orbit_calibration import OrbitCalibrationSpec
 from scenes.spec import Spec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.translate import validate
@@ -143,7 +144,7 @@ def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | N
     return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
 
 
-def find_payload(test: OrbitAngleSpec) -> Path:
+def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec) -> Path:
     """The file of the payload of a test in orbit. Raises InputError if there is none."""
     return _find(PAYLOADS, test.camera, test, ("camera",))
 

@@ -6,6 +6,7 @@ from scenes.errors import names_text, nearest
 from scenes.experiment import ExperimentSetup, read_setup
 from scenes.load import find_payload, load_orbit_test, load_three_line_camera
 from scenes.orbit_angle import LINES, OrbitAngleSpec
+from scenes.orbit_calibration import OrbitCalibrationSpec
 from scenes.three_line_camera import ThreeLineCameraSpec
 
 
@@ -31,6 +32,57 @@ def resolve_angle(path: str | Path) -> AngleSetup:
         setup = AngleSetup.model_construct(test=test, camera=load_three_line_camera(find_payload(test)))
     _require_fit(setup.test, setup.camera)
     return setup
+
+
+class CalibrationSetup(ExperimentSetup[OrbitCalibrationSpec]):
+    """An in-orbit calibration with its camera.
+
+    Attributes:
+        camera: the payload.
+    """
+
+    camera: ThreeLineCameraSpec
+
+
+def resolve_calibration(path: str | Path) -> CalibrationSetup:
+    """Read a calibration and the camera it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or test and camera do not fit.
+    """
+    setup = read_setup(CalibrationSetup, path)
+    if setup is None:
+        test = load_orbit_test(OrbitCalibrationSpec, path)
+        # only the reference and the place in the file are used
+        payload = find_payload(test)
+        setup = CalibrationSetup.model_construct(test=test, camera=load_three_line_camera(payload))
+    _require_calibration(setup.test, setup.camera)
+    return setup
+
+
+def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
+    """InputError unless the camera has exactly the three lines, and points and changes lie on them."""
+    if set(camera.lines) != set(LINES):
+        found = f"{names_text(tuple(camera.lines))} in {camera.name}"
+        problem = "the camera has other lines than three"
+        raise test.error(problem, ("camera",), found=found, allowed="a camera with lines forward, nadir and aft")
+    for name, change in test.changes.items():
+        if name not in LINES:
+            raise test.error(
+                "no such line", ("changes", name), allowed=names_text(LINES), suggestion=nearest(name, LINES)
+            )
+        if name == "nadir" and any(change.principal_point):
+            raise test.error(
+                "the nadir line's principal point is the gauge",
+                ("changes", name, "principal_point"),
+                allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
+            )
+    last = camera.pixels - 0.5
+    for key in ("first", "last"):
+        pixel = getattr(test.points, key)
+        if not -0.5 <= pixel <= last:
+            allowed = f"-0.5 to {last:g}, the ends of the lines of {camera.name}"
+            raise test.error("outside the line", ("points", key), found=f"pixel {pixel:g}", allowed=allowed)
 
 
 def _require_fit(test: OrbitAngleSpec, camera: ThreeLineCameraSpec) -> None:

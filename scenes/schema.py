@@ -23,6 +23,7 @@ from scenes.focus_test import FocusTestSpec
 from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.orbit_angle import OrbitAngleSpec
+from scenes.orbit_calibration import OrbitCalibrationSpec
 from scenes.spec import Spec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.turntable import PrincipleExperimentSpec
@@ -38,6 +39,7 @@ MODELS: dict[str, type[Spec]] = {
     "distortion_test": DistortionTestSpec,
     "turntable_test": TurntableTestSpec,
     "orbit_angle": OrbitAngleSpec,
+    "orbit_calibration": OrbitCalibrationSpec,
     "three_line_camera": ThreeLineCameraSpec,
 }
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import typer
 
-from scenes.orbit_setup import resolve_angle
+from scenes.orbit_setup import resolve_angle, resolve_calibration
 from twin.laboratory.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 from twin.orbit.angle_result import run_angle
+from twin.orbit.calibration_result import run_calibration
 
 PROGRAM = "twin.orbit"
 
@@ -43,6 +44,25 @@ def angle(
     station and of the points, with the paper's sentences on it judged.
     """
     run_test(PROGRAM, file, resolve_angle, run_angle, Options(out, seed, backend, force, as_json, quiet))
+
+
+@app.command()
+def calibrate(
+    file: File,
+    out: Out = None,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
+    parameters tested on all fields without ground control (paper 003).
+
+    calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
+    plan and height of every field before calibration and by each scheme.
+    """
+    run_test(PROGRAM, file, resolve_calibration, run_calibration, Options(out, seed, backend, force, as_json, quiet))
 
 
 if __name__ == "__main__":
