@@ -12,14 +12,14 @@ from optics.system import SystemBatch
 from optics.trace import make_rays, require_some, trace
 
 
-def chief_directions(
+def chief_rays(
     backend: Backend,
     to_stop: SystemBatch,
     to_object: SystemBatch,
     points: np.ndarray,
     guess: np.ndarray,
     transverse: np.ndarray,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Chief rays of image points, traced backward from the image through the centre of the stop.
 
     Args:
@@ -31,7 +31,7 @@ def chief_directions(
         transverse: direction near which the first transverse axis is taken, (3,).
 
     Returns:
-        Object-space directions toward the scene, world, (B, M, 3).
+        Points on the rays after the first mirror, and object-space directions toward the scene, world, (B, M, 3) each.
     """
     direction = np.broadcast_to(guess, points.shape)
     fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
@@ -39,9 +39,21 @@ def chief_directions(
     position, direction = fan.at(q)
     out = trace(backend, to_object, make_rays(backend, position, direction), world=True)
     assert out.world is not None
-    _, leaving, _, valid = out.numpy(out.world)
+    places, leaving, _, valid = out.numpy(out.world)
     require_some(valid, "the imaging path")
-    return leaving
+    return places, leaving
+
+
+def chief_directions(
+    backend: Backend,
+    to_stop: SystemBatch,
+    to_object: SystemBatch,
+    points: np.ndarray,
+    guess: np.ndarray,
+    transverse: np.ndarray,
+) -> np.ndarray:
+    """Object-space directions of ``chief_rays``, toward the scene, world, (B, M, 3)."""
+    return chief_rays(backend, to_stop, to_object, points, guess, transverse)[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """A test in orbit together with everything it refers to."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from scenes.errors import names_text, nearest
@@ -7,6 +8,7 @@ from scenes.experiment import ExperimentSetup, read_setup
 from scenes.load import find_payload, load_orbit_test, load_three_line_camera
 from scenes.orbit_angle import LINES, OrbitAngleSpec
 from scenes.orbit_calibration import OrbitCalibrationSpec
+from scenes.spec import Spec
 from scenes.three_line_camera import ThreeLineCameraSpec
 
 
@@ -53,9 +55,7 @@ def resolve_calibration(path: str | Path) -> CalibrationSetup:
     setup = read_setup(CalibrationSetup, path)
     if setup is None:
         test = load_orbit_test(OrbitCalibrationSpec, path)
-        # only the reference and the place in the file are used
-        payload = find_payload(test)
-        setup = CalibrationSetup.model_construct(test=test, camera=load_three_line_camera(payload))
+        setup = CalibrationSetup.model_construct(test=test, camera=load_three_line_camera(find_payload(test)))
     _require_calibration(setup.test, setup.camera)
     return setup
 
@@ -65,24 +65,15 @@ def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec
     if set(camera.lines) != set(LINES):
         found = f"{names_text(tuple(camera.lines))} in {camera.name}"
         problem = "the camera has other lines than three"
-        raise test.error(problem, ("camera",), found=found, allowed="a camera with lines forward, nadir and aft")
-    for name, change in test.changes.items():
-        if name not in LINES:
-            raise test.error(
-                "no such line", ("changes", name), allowed=names_text(LINES), suggestion=nearest(name, LINES)
-            )
-        if name == "nadir" and any(change.principal_point):
-            raise test.error(
-                "the nadir line's principal point is the gauge",
-                ("changes", name, "principal_point"),
-                allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
-            )
-    last = camera.pixels - 0.5
-    for key in ("first", "last"):
-        pixel = getattr(test.points, key)
-        if not -0.5 <= pixel <= last:
-            allowed = f"-0.5 to {last:g}, the ends of the lines of {camera.name}"
-            raise test.error("outside the line", ("points", key), found=f"pixel {pixel:g}", allowed=allowed)
+        raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
+    _require_lines(test, test.changes)
+    if "nadir" in test.changes and any(test.changes["nadir"].principal_point):
+        raise test.error(
+            "the nadir line's principal point is the gauge",
+            ("changes", "nadir", "principal_point"),
+            allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
+        )
+    _require_pixels(test, "points", (test.points.first, test.points.last), camera)
 
 
 def _require_fit(test: OrbitAngleSpec, camera: ThreeLineCameraSpec) -> None:
@@ -90,15 +81,27 @@ def _require_fit(test: OrbitAngleSpec, camera: ThreeLineCameraSpec) -> None:
     if missing := [name for name in LINES if name not in camera.lines]:
         found = f"{names_text(tuple(camera.lines))} in {camera.name}"
         problem = f"the camera has no {' and no '.join(missing)} line"
-        raise test.error(problem, ("camera",), found=found, allowed="a camera with lines forward, nadir and aft")
-    for name in test.changes:
+        raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
+    _require_lines(test, test.changes)
+    _require_pixels(test, "strips", (test.strips.first, test.strips.last), camera)
+
+
+_THREE_LINES = "a camera with lines forward, nadir and aft"
+
+
+def _require_lines(test: Spec, changes: Iterable[str]) -> None:
+    """InputError unless every change is one of a line."""
+    for name in changes:
         if name not in LINES:
             raise test.error(
                 "no such line", ("changes", name), allowed=names_text(LINES), suggestion=nearest(name, LINES)
             )
+
+
+def _require_pixels(test: Spec, section: str, ends: tuple[float, float], camera: ThreeLineCameraSpec) -> None:
+    """InputError unless ``first`` and ``last`` of a section lie on the camera's lines."""
     last = camera.pixels - 0.5
-    for key in ("first", "last"):
-        pixel = getattr(test.strips, key)
+    for key, pixel in zip(("first", "last"), ends, strict=True):
         if not -0.5 <= pixel <= last:
             allowed = f"-0.5 to {last:g}, the ends of the lines of {camera.name}"
-            raise test.error("outside the line", ("strips", key), found=f"pixel {pixel:g}", allowed=allowed)
+            raise test.error("outside the line", (section, key), found=f"pixel {pixel:g}", allowed=allowed)

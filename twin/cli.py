@@ -6,9 +6,19 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import typer
 from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
 
 from optics.backend import NAMES, BackendUnavailable
 from optics.llvm import LibraryMissing
@@ -48,6 +58,30 @@ def explained(errors: Console) -> Iterator[None]:
     except KeyboardInterrupt:
         errors.print("interrupted: nothing was kept", style="bold red")
         raise typer.Exit(INTERRUPTED) from None
+
+
+def progress_columns(width: int) -> tuple[ProgressColumn, ...]:
+    """Columns of a progress display: what is done, in ``width`` letters, how far, since when and for how long."""
+    return (
+        SpinnerColumn(),
+        TextColumn(f"{{task.description:{width}}}", markup=False),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+
+
+def print_whole(console: Console, table: Table) -> None:
+    """A table with all its digits: a number that is cut is worse than a line that wraps."""
+    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
+    console.print(table)
+
+
+def print_place(console: Console, target: Path) -> None:
+    """Where the run folder and its report are."""
+    console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 def print_error(errors: Console, text: str) -> None:

@@ -19,13 +19,16 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.noise import NoiseModel
 from optics.threads import cores
+
+if TYPE_CHECKING:
+    from scenes.detector import DetectorSpec
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
@@ -121,6 +124,11 @@ class EmvaDetector:
             "bit_depth", int(self.bit_depth) == self.bit_depth and 1 <= self.bit_depth <= 16, "an integer 1 to 16"
         )
         self._check("offset_dn", 0 <= self.offset_dn < self.max_dn, f"in [0, {self.max_dn}) DN")
+
+    @classmethod
+    def from_sheet(cls, sheet: DetectorSpec) -> EmvaDetector:
+        """The detector of a data sheet's file."""
+        return cls(**{field.name: getattr(sheet, field.name) for field in fields(cls)})
 
     def _check(self, name: str, good: bool, allowed: str) -> None:
         if not good:

@@ -8,7 +8,9 @@ by arcminutes scales the direction cosines by 1e-6).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -16,10 +18,21 @@ from scipy.interpolate import BSpline, make_interp_spline
 from optics.diffraction import Grid
 from optics.pupil_function import PupilFunction
 from optics.target_image import EdgeProfile
+from optics.targets import slanted_edge
 from optics.transfer import polychromatic_transfer
 from optics.vector_shape import HalfPlane
 from scenes.band import BandSpec
 from twin.line_ccd import LineCcd, band_wavelengths
+
+ALONG, TRACK = "along", "track"
+DIRECTIONS = (ALONG, TRACK)
+"""In which the MTF is measured: along the line, and along the track."""
+
+DIRECTION_NAMES: Mapping[str, str] = {ALONG: "along the line", TRACK: "along the track"}
+"""Directions for readers."""
+
+EDGE_RUNS: Mapping[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
+"""Direction -> axis of the image along which its edge runs."""
 
 FREQUENCIES = 97
 """Samples of a transfer function from 0 to the cut-off."""
@@ -30,6 +43,13 @@ more, and quintic splines through ten samples per cycle are right to 2e-4."""
 
 TABLE_REACH = 0.6e-3
 """Defocus up to which the table goes, metres; a few images farther out are worked out one by one."""
+
+
+def knife_edge(direction: str, angle: float) -> HalfPlane:
+    """The knife edge, on the target, that measures in a direction and is turned by ``angle``, radians."""
+    shape = slanted_edge(angle, EDGE_RUNS[direction]).parts[0][1]
+    assert isinstance(shape, HalfPlane)
+    return shape
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from functools import cached_property
 
 import numpy as np
@@ -42,7 +41,7 @@ class MonitorExperiment:
     def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
         self.backend = backend
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
-        self.detector = EmvaDetector(**{f.name: getattr(resolved.detector, f.name) for f in fields(EmvaDetector)})
+        self.detector = EmvaDetector.from_sheet(resolved.detector)
         self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
         self.path = MonitorPath(self.instrument, backend)
 

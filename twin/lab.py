@@ -5,10 +5,10 @@ from __future__ import annotations
 import typer
 
 from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.laboratory.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 from twin.laboratory.distortion import run_distortion
 from twin.laboratory.focus_result import run_focus
 from twin.laboratory.turntable_result import run_turntable_test
+from twin.trial.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 
 PROGRAM = "twin.lab"
 
@@ -46,7 +46,7 @@ def focus(
     and under `truth` what the exact trace says.
     """
     options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, file, resolve_focus, run_focus, options)
+    run_test(PROGRAM, "focus", file, resolve_focus, run_focus, options)
 
 
 @app.command()
@@ -67,7 +67,7 @@ def distortion(
     `error_rms_compensated_um`.
     """
     options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, file, resolve_distortion, run_distortion, options)
+    run_test(PROGRAM, "distortion", file, resolve_distortion, run_distortion, options)
 
 
 @app.command()
@@ -82,7 +82,7 @@ def turntable(
 ) -> None:
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles."""
     options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, file, resolve_turntable, run_turntable_test, options)
+    run_test(PROGRAM, "turntable", file, resolve_turntable, run_turntable_test, options)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,7 +48,7 @@ class LineCcd:
     @classmethod
     def from_specs(cls, band: BandSpec, sheet: DetectorSpec) -> LineCcd:
         """From what the files say."""
-        return cls(band, EmvaDetector(**{f.name: getattr(sheet, f.name) for f in fields(EmvaDetector)}))
+        return cls(band, EmvaDetector.from_sheet(sheet))
 
     def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
         """Each effect's transfer at frequencies along the line (fx) and along the track (fy), cycles/m.

@@ -10,7 +10,6 @@ reads 0.03 to 0.15 arcsec, so that it is a second reading at zero).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 
 import numpy as np
 
@@ -147,7 +146,7 @@ class Reader:
     def __init__(self, setup: PrincipleSetup, backend: Backend) -> None:
         self.spec = setup.spec
         self.backend = backend
-        self.detector = EmvaDetector(**{f.name: getattr(setup.detector, f.name) for f in fields(EmvaDetector)})
+        self.detector = EmvaDetector.from_sheet(setup.detector)
         self.exposure: float = setup.spec.autocollimator.area_ccd.exposure
         self._paths: dict[float, AutocollimatorPath] = {}
         self.map = self._calibrate()

@@ -13,21 +13,33 @@ import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from analysis.recovery import ESTIMATORS
 from optics.backend import load_backend
 from scenes.course import moment
 from scenes.resolved import ResolvedJob, resolve
-from twin.cli import BACKEND_HELP, FAILURE, LARGEST_SEED, check_backend, exit_on_terminate, explained, print_error
+from twin.cli import (
+    BACKEND_HELP,
+    FAILURE,
+    LARGEST_SEED,
+    check_backend,
+    exit_on_terminate,
+    explained,
+    print_error,
+    print_place,
+    print_whole,
+    progress_columns,
+)
+from twin.edge_images import DIRECTIONS
 from twin.output import write_run
 from twin.picture import write_pictures
 from twin.picture_light import PictureError
 from twin.render_job import STAGES, render_job
 from twin.results import RenderRun
 from twin.run_folder import RunFolder, next_free
-from twin.target_images import DIRECTIONS, PLACES
+from twin.target_images import PLACES
 from twin.target_result import EdgeReading, TargetRun
 
 WRITE = "write the run folder"
@@ -140,18 +152,14 @@ def _run(
 ) -> tuple[RenderRun, str]:
     """The run, and why its pictures are not complete (empty when they are, or nobody asked for them)."""
     started, clock = time.time(), time.monotonic()
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description:24}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
     tracer = load_backend(backend)
     problems: list[str] = []
     hidden = silent or not errors.is_terminal
-    with exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
+    with (
+        exit_on_terminate(),
+        folder,
+        Progress(*progress_columns(24), console=errors, disable=hidden, transient=True) as bar,
+    ):
         task = bar.add_task("start", total=len(STAGES) + 1)
         parts: dict[str, TaskID] = {}
 
@@ -183,9 +191,7 @@ def _print_result(run: RenderRun, target: Path) -> None:
     """Result table and where to look next."""
     table = _table(run)
     console = Console()
-    # a number that is cut is worse than a line that wraps
-    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
-    console.print(table)
+    print_whole(console, table)
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:
@@ -203,8 +209,7 @@ def _print_result(run: RenderRun, target: Path) -> None:
         )
     for warning in run.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-    console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+    print_place(console, target)
 
 
 def _mtf_table(targets: TargetRun) -> Table | None:

@@ -19,22 +19,16 @@ from optics.aperture import Rectangle
 from optics.diffraction import Grid
 from optics.pupil_function import PupilFunction
 from optics.target_image import target_image
-from optics.targets import BarLayout, Target, bar_target, pinhole, siemens_star, slanted_edge
+from optics.targets import BarLayout, Target, bar_target, pinhole, siemens_star
 from optics.trace import BeamMissedError
 from optics.transfer import TransferTable, polychromatic_transfer
 from optics.tree import State
-from optics.vector_shape import HalfPlane
 from scenes.band import BandSpec
-from twin.edge_images import EdgeImager, EdgeOptics
+from twin.edge_images import ALONG, TRACK, EdgeImager, EdgeOptics, knife_edge
 from twin.line_ccd import LineCcd, band_wavelengths
 from twin.target_path import LocalMap, TargetPath
 
-ALONG, TRACK = "along", "track"
-DIRECTIONS = (ALONG, TRACK)
-"""In which the MTF is measured: along the line, and along the track."""
-
 AXES: Mapping[str, Literal["x", "y"]] = {ALONG: "x", TRACK: "y"}
-_EDGE_RUNS: Mapping[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
 
 PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Places on the line by their share of its usable half; left is the +Y' end."""
@@ -101,9 +95,8 @@ class View:
 
     def edge(self, direction: str, angle: float) -> EdgeImager:
         """Images of the knife edge that measures in a direction and is turned by ``angle``, radians."""
-        shape = slanted_edge(angle, _EDGE_RUNS[direction]).parts[0][1]
-        assert isinstance(shape, HalfPlane)
-        optics = EdgeOptics.build(self.pupil, self.band, shape.mapped(self.local).normal, _FOCUS)
+        normal = knife_edge(direction, angle).mapped(self.local).normal
+        optics = EdgeOptics.build(self.pupil, self.band, normal, _FOCUS)
         return EdgeImager(optics, self.ccd, self.region)
 
     def edge_image(self, imager: EdgeImager) -> np.ndarray:

@@ -15,9 +15,9 @@ from scenes.instrument_model import Instrument
 from scenes.resolved import ResolvedJob, target_band
 from scenes.targets import TargetsSpec
 from twin.detector import FixedPattern
+from twin.edge_images import DIRECTIONS
 from twin.line_ccd import LineCcd
 from twin.target_images import (
-    DIRECTIONS,
     PLACES,
     BarDesign,
     TargetCamera,
@@ -116,7 +116,7 @@ def render_targets(
         pattern = ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN, number)))
         places = {}
         for k, place in enumerate(PLACES):
-            shooter = _Shooter(settings, images, before[place], pattern)
+            shooter = _Shooter(settings, frames, images, before[place], pattern)
             shots = []
             for when, view in enumerate((before[place], after[place])):
                 advance(done, total)
@@ -131,8 +131,11 @@ def render_targets(
 class _Shooter:
     """Takes the images of all targets at one place."""
 
-    def __init__(self, settings: TargetsSpec, images: tuple[str, ...], nominal: View, pattern: FixedPattern) -> None:
+    def __init__(
+        self, settings: TargetsSpec, frames: int, images: tuple[str, ...], nominal: View, pattern: FixedPattern
+    ) -> None:
         self.settings = settings
+        self.count = frames
         self.images = images
         self.pattern = pattern
         self.bars = {d: BarDesign.build(nominal, d) for d in DIRECTIONS} if "bars" in images else {}
@@ -144,18 +147,17 @@ class _Shooter:
 
         def expose(name: str, share: np.ndarray) -> np.ndarray:
             photons = view.ccd.white_photons(self.settings.white) * share
-            count = self.settings.frames or 1
-            frames[name] = view.ccd.expose(photons, view.column, self.pattern, count, seed.spawn(1)[0])
+            frames[name] = view.ccd.expose(photons, view.column, self.pattern, self.count, seed.spawn(1)[0])
             return np.asarray(frames[name].mean(axis=0))
 
         if "knife_edge" in self.images:
             for direction in DIRECTIONS:
                 imager = view.edge(direction, self.settings.angle)
                 mean = expose(f"knife_edge_{direction}", view.edge_image(imager))
-                edges[direction] = read_edge(view, imager.optics.normal, mean, self.settings.frames or 1)
+                edges[direction] = read_edge(view, imager.optics.normal, mean, self.count)
         for direction, design in self.bars.items():
             mean = expose(f"bars_{direction}", view.image(design.target))
-            bars[direction] = read_bars(view, design, mean, self.settings.frames or 1)
+            bars[direction] = read_bars(view, design, mean, self.count)
         if "star" in self.images:
             expose("star", view.image(star_target(view.band.pitch, view.region)))
         if "pinhole" in self.images:

@@ -16,7 +16,16 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from optics.backend import load_backend
-from twin.cli import BACKEND_HELP, FAILURE, LARGEST_SEED, InputErrorText, check_backend, exit_on_terminate, explained
+from twin.cli import (
+    BACKEND_HELP,
+    FAILURE,
+    LARGEST_SEED,
+    InputErrorText,
+    check_backend,
+    exit_on_terminate,
+    explained,
+    print_whole,
+)
 from twin.run_folder import RunFolder
 from twin.validation import registry
 from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, Verdict
@@ -191,9 +200,7 @@ def _print_result(validation: Validation, target: Path | None) -> None:
         cells = (r.id, printed_text(r), measured_text(r), sigma_text(r), unit)
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
     console = Console()
-    # a number that is cut is worse than a line that wraps
-    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
-    console.print(table)
+    print_whole(console, table)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in validation.counts.items() if count)
     number = len(validation.results)
     console.print(f"{number} check{'' if number == 1 else 's'}: {counts}", markup=False, highlight=False)

@@ -36,11 +36,13 @@ class ShimError(ValueError):
     """The motion cannot be made with this mount and these shims.
 
     holes: indices of the holes at fault, empty when it is the mount as a whole. The message counts them from 1.
+    slides: by how much these holes would slide, metres; empty when that is not what is wrong.
     """
 
-    def __init__(self, message: str, holes: tuple[int, ...] = ()) -> None:
+    def __init__(self, message: str, holes: tuple[int, ...] = (), slides: tuple[float, ...] = ()) -> None:
         super().__init__(message)
         self.holes = holes
+        self.slides = slides
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +230,7 @@ def _check_clearance(slide: Array, clearance: float) -> None:
         f"shims: the motion slides {text}; the screws allow {1e3 * clearance:.4g} mm, which is"
         f" {1e3 * (size.max() - clearance):.4g} mm too little; widen the holes by as much",
         tuple(int(h) for h in over),
+        tuple(float(size[h]) for h in over),
     )
 
 

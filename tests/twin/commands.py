@@ -1,5 +1,7 @@
 """Commands run inside the test process, and what they leave in a folder."""
 
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from typer import Typer
@@ -17,3 +19,20 @@ def invoke(app: Typer, *arguments: object):
 def files(folder: Path) -> set[str]:
     """Names of all files below a folder."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def refused(run: Callable, command: str, path: Path, key: str, words: Sequence[str]) -> int:
+    """A command refuses the file ``path``: exit code 2, nothing written beside the file, a message that names file,
+    line and key and holds all words. Returns the line.
+    """
+    before = files(path.parent)
+    result = run(command, path, "--out", path.parent / "run", "--json")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert files(path.parent) == before
+    assert not (path.parent / "run").exists()
+    found = re.search(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}", result.stderr)
+    assert found, result.stderr
+    for word in words:
+        assert word in result.stderr, result.stderr
+    return int(found[1])

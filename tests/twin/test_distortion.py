@@ -17,12 +17,12 @@ from optics.targets import pinhole
 from optics.transfer import TransferTable
 from scenes.lab_setup import resolve_distortion
 from twin.laboratory import printed_004
-from twin.laboratory.bench_error import BenchError
 from twin.laboratory.distortion import DistortionRun, measure
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_json import to_dict
 from twin.laboratory.distortion_sections import lab_result
 from twin.laboratory.dividing_error import TurntableModel
+from twin.trial.bench_error import BenchError
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4

@@ -19,13 +19,14 @@ from optics.pose import Pose
 from optics.rotation import rotation_matrix, rotation_vector
 from scenes.lab_setup import FocusSetup, resolve_focus
 from scenes.load import LAB, LIBRARY
-from twin.laboratory.bench_error import BenchError
+from twin.edge_images import TRACK
 from twin.laboratory.focus import Alignment, align, line_turn, misset, mount_of, plan_shims
-from twin.laboratory.focus_bench import TRACK, FocusBench
+from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_json import to_dict
 from twin.laboratory.focus_result import run_focus
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
-from twin.laboratory.result import silent
+from twin.trial.bench_error import BenchError
+from twin.trial.result import silent
 
 FILE = LIBRARY / LAB / "focus.yaml"
 ARCMIN = np.pi / 180 / 60

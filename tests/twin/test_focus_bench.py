@@ -17,8 +17,8 @@ from optics.tree import Motion
 from scenes.camera_under_test import ROOT
 from scenes.lab_setup import resolve_focus
 from scenes.load import LAB, LIBRARY
-from twin.edge_images import TABLE_REACH, EdgeImager
-from twin.laboratory.focus_bench import ALONG, EDGES, TRACK, BudgetLine, FocusBench, Site
+from twin.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
+from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.laboratory.printed_004 import MTF_NYQUIST
 from twin.line_ccd import band_wavelengths
 
@@ -161,7 +161,7 @@ def test_a_moved_target_is_a_moved_detector(bench, shift: float) -> None:
 def test_images_are_measured_right(bench) -> None:
     """Without noise: rendered edges, measured from the pixels, against the transfer function up to Nyquist."""
     for site in bench.sites:
-        for edge in EDGES:
+        for edge in DIRECTIONS:
             imager = site.imagers[edge]
             for defocus in (site.best, site.best + 80e-6):
                 image = imager.image(defocus, 0.3 * imager.ccd.band.pitch)
@@ -177,7 +177,7 @@ def test_images_are_measured_right(bench) -> None:
 def test_site_image_moves_target_and_chip(middle) -> None:
     """A target moved as far as the chip stands gives the image in focus."""
     site = middle.sites[0]
-    for edge in EDGES:
+    for edge in DIRECTIONS:
         standing = Pose(np.eye(3), np.array([0.0, 0.0, site.edge_focus[edge] + 60e-6]))
         moved = site.image(edge, standing, 0.0, 60e-6 / site.defocus_per_shift[edge], 0.0)
         np.testing.assert_allclose(moved, site.imagers[edge].image(site.edge_focus[edge], 0.0), rtol=0.0, atol=1e-9)

@@ -18,12 +18,12 @@ from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_angle import LINES
 from scenes.orbit_setup import AngleSetup, resolve_angle
 from tests.analysis.test_sensitivity import REFUTED
-from tests.twin.commands import files, invoke
-from twin.laboratory.result import silent
+from tests.twin.commands import files, invoke, refused
 from twin.orbit.angle_analysis import ARCSEC, estimated, frame_rows, resected, run_passes, tls_angles
 from twin.orbit.angle_test import PAIRS, AnglePass, fly
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.line_camera import look_angle
+from twin.trial.result import silent
 
 run = partial(invoke, command.app)
 EXAMPLE = LIBRARY / ORBIT / "angle.yaml"
@@ -346,17 +346,8 @@ BAD = {
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
     path = write(tmp_path, old, new)
-    before = files(tmp_path)
-    result = run("angle", path, "--out", tmp_path / "run", "--json")
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert files(tmp_path) == before
-    assert not (tmp_path / "run").exists()
-    found = re.search(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}", result.stderr)
-    assert found, result.stderr
-    assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[int(found[1]) - 1]
-    for word in words:
-        assert word in result.stderr, result.stderr
+    line = refused(run, "angle", path, key, words)
+    assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[line - 1]
 
 
 def test_help() -> None:

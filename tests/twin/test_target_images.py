@@ -22,11 +22,9 @@ from optics.tree import Motion
 from scenes.band import BandSpec
 from scenes.camera_model import LAUNCH_DISTANCE
 from scenes.load import load_detector
+from twin.edge_images import ALONG, DIRECTIONS, TRACK
 from twin.line_ccd import LineCcd, band_wavelengths
 from twin.target_images import (
-    ALONG,
-    DIRECTIONS,
-    TRACK,
     BarDesign,
     TargetCamera,
     TargetLostError,

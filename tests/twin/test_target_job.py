@@ -14,8 +14,9 @@ from scenes.job import JobSpec
 from scenes.load import EXAMPLES, LIBRARY
 from scenes.resolved import resolve, resolve_job
 from tests.twin.commands import files, invoke
+from twin.edge_images import DIRECTIONS
 from twin.experiment import MonitorExperiment
-from twin.target_images import DIRECTIONS, PLACES
+from twin.target_images import PLACES
 from twin.target_measurement import render_targets
 
 run = partial(invoke, command.app)

@@ -31,10 +31,10 @@ from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
 from optics.backend import Backend
 from scenes.lab_setup import DistortionSetup
-from twin.laboratory.bench_error import BenchError
 from twin.laboratory.distortion_bench import Advance, DistortionBench, DistortionRecord, DistortionTruth, silent
 from twin.laboratory.dividing_error import TurntableModel
-from twin.laboratory.result import LabResult
+from twin.trial.bench_error import BenchError
+from twin.trial.result import LabResult
 
 Array = NDArray[np.float64]
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")

@@ -21,11 +21,11 @@ from optics.targets import pinhole
 from optics.tree import State
 from scenes.camera_under_test import ROOT, build_camera_under_test
 from scenes.lab_setup import DistortionSetup
-from twin.laboratory.bench_error import BenchError
 from twin.laboratory.dividing_error import TurntableModel
 from twin.laboratory.pinhole_images import PinholeImages, at_nodes, between, centroid_offset
 from twin.line_ccd import LineCcd
 from twin.target_path import TargetPath
+from twin.trial.bench_error import BenchError
 
 Advance = Callable[[str, int, int], None]
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,9 +16,9 @@ from twin.laboratory import printed_004
 from twin.laboratory.distortion import DistortionRun, rms
 from twin.laboratory.distortion_figure import curve_svg, points_svg, spot_svg
 from twin.laboratory.distortion_json import to_dict
-from twin.laboratory.result import LabResult
-from twin.laboratory.section import Section
 from twin.laboratory.turntable_figure import FIT_NAMES
+from twin.trial.result import LabResult
+from twin.trial.section import Section
 
 Array = NDArray[np.float64]
 SHOWN = 3
@@ -59,8 +62,8 @@ def lab_result(run: DistortionRun) -> LabResult:
             ),
         ),
         data=data,
-        summary=_summary(run),
-        sections=(_curve(run), _compensation(run), _estimates(run), _noise(run)),
+        summary=_summary(data),
+        sections=(_curve(run), _compensation(run), _estimates(run), _noise(run, data)),
         images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
         warnings=_warnings(run),
     )
@@ -90,8 +93,7 @@ def _warnings(run: DistortionRun) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _summary(run: DistortionRun) -> Table:
-    data = to_dict(run)
+def _summary(data: Mapping[str, Any]) -> Table:
     truth = data["truth"]
     rows: list[tuple[Cell, ...]] = [
         (
@@ -245,8 +247,7 @@ def _estimates(run: DistortionRun) -> Section:
     return Section("Estimators and what can be observed", text, (estimates, correlation))
 
 
-def _noise(run: DistortionRun) -> Section:
-    data = to_dict(run)
+def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     noise, truth = data["noise"], data["truth"]
     plan = run.setup.turntable.dividing_error
     about = run.compensated.fit.value("principal_distance")

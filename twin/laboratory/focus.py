@@ -19,7 +19,6 @@ from analysis.focal_plane.shims import Mount, ShimError, ShimPlan, shim_plan
 from optics.pose import Pose
 from optics.rotation import about_axis, rotation_matrix
 from twin.detector import FixedPattern
-from twin.laboratory.bench_error import BenchError
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import (
     VERTEX_ERROR,
@@ -31,7 +30,8 @@ from twin.laboratory.focus_scan import (
     in_focus,
     scan,
 )
-from twin.laboratory.result import Advance, silent
+from twin.trial.bench_error import BenchError
+from twin.trial.result import Advance, silent
 
 if TYPE_CHECKING:
     from scenes.focus_test import FocusTestSpec
@@ -165,19 +165,17 @@ def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> Sh
     Raises:
         BenchError: the mount does not allow the motion.
     """
-    move = correction.displacement(mount.holes)
-    slide = np.linalg.norm(move - np.outer(move @ mount.normal, mount.normal), axis=1)
-    far = int(np.argmax(slide))
-    if slide[far] > mount.clearance:
-        raise BenchError(
-            f"the alignment would slide hole_{far + 1} by {1e3 * slide[far]:.3g} mm in the mounting surface, "
-            f"the screws allow {1e3 * mount.clearance:.3g} mm",
-            ("mount", "clearance"),
-            "more clearance, or a smaller misset",
-        )
     try:
         return shim_plan(correction, mount, present)
     except ShimError as error:
+        if error.slides:
+            slide, far = max(zip(error.slides, error.holes, strict=True))
+            raise BenchError(
+                f"the alignment would slide hole_{far + 1} by {1e3 * slide:.3g} mm in the mounting surface, "
+                f"the screws allow {1e3 * mount.clearance:.3g} mm",
+                ("mount", "clearance"),
+                "more clearance, or a smaller misset",
+            ) from error
         raise BenchError(str(error), ("mount", "thickness"), "thicker shims to begin with") from error
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -17,22 +17,15 @@ from scipy.optimize import minimize_scalar
 from optics.backend import Backend
 from optics.pose import Pose
 from optics.pupil_function import PupilFunction
-from optics.targets import slanted_edge
-from optics.vector_shape import HalfPlane
 from scenes.camera_under_test import ROOT, CameraUnderTest, build_camera_under_test
-from twin.edge_images import EdgeImager, EdgeOptics
-from twin.laboratory.result import Advance, silent
+from twin.edge_images import ALONG, DIRECTIONS, EdgeImager, EdgeOptics, knife_edge
 from twin.line_ccd import LineCcd
 from twin.target_path import LocalMap, TargetPath
+from twin.trial.result import Advance, silent
 
 if TYPE_CHECKING:
     from scenes.lab_setup import FocusSetup
 
-ALONG, TRACK = "along", "track"
-EDGES = (ALONG, TRACK)
-"""Edges by the direction in which they measure: along the line and along the track."""
-
-_AXES: dict[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
 _SEARCH = 0.3e-3
 """Defocus up to which best focus is looked for, metres."""
 
@@ -66,7 +59,7 @@ class Site:
     @property
     def best(self) -> float:
         """Z' of best focus: midway between those of the two edges, which astigmatism moves apart, metres."""
-        return float(np.mean([self.edge_focus[edge] for edge in EDGES]))
+        return float(np.mean([self.edge_focus[edge] for edge in DIRECTIONS]))
 
     @property
     def nyquist(self) -> float:
@@ -163,9 +156,8 @@ class FocusBench:
         local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
         nominal = self.path.local_map({}, direction, ccd.band.pitch * test.edge.region)
         imagers, ratio, nominal_ratio = {}, {}, {}
-        for edge in EDGES:
-            shape = slanted_edge(test.edge.angle, _AXES[edge]).parts[0][1]
-            assert isinstance(shape, HalfPlane)
+        for edge in DIRECTIONS:
+            shape = knife_edge(edge, test.edge.angle)
             normal = shape.mapped(local).normal
             imagers[edge] = EdgeImager(EdgeOptics.build(pupil, ccd.band, normal), ccd, test.edge.region)
             ratio[edge] = _longitudinal(local, normal)

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.mtf.slanted_edge import measure_edge
+from twin.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 from twin.laboratory.focus import Alignment, State
-from twin.laboratory.focus_bench import ALONG, EDGES, TRACK
 from twin.laboratory.printed_004 import CONFOCAL_UM
 from twin.report.svg import (
     BLUE,
@@ -26,7 +26,6 @@ from twin.report.svg import (
 )
 
 FIELD_COLOURS = (BLUE, GREEN, ORANGE, VERMILION, PURPLE)
-EDGE_NAMES = {ALONG: "along the line", TRACK: "along the track"}
 EDGE_COLOURS = {ALONG: BLUE, TRACK: VERMILION}
 UM, PER_MM = 1e6, 1e-3
 
@@ -68,10 +67,10 @@ def _through_focus(alignment: Alignment) -> Figure:
                 if site.band != band:
                     continue
                 colour = FIELD_COLOURS[fields.index(site.field) % len(FIELD_COLOURS)]
-                mean = np.mean([scan.mtf[e] for e in EDGES], axis=0)
-                error = np.sqrt(sum(scan.sigma[e] ** 2 for e in EDGES)) / len(EDGES)
+                mean = np.mean([scan.mtf[e] for e in DIRECTIONS], axis=0)
+                error = np.sqrt(sum(scan.sigma[e] ** 2 for e in DIRECTIONS)) / len(DIRECTIONS)
                 good = np.isfinite(error)
-                shift = np.mean([scan.shift[e] for e in EDGES], axis=0)
+                shift = np.mean([scan.shift[e] for e in DIRECTIONS], axis=0)
                 label = f"field {site.field:g}".replace("-", "−") if row == 0 and column == 0 else None
                 axes.errorbar(
                     UM * shift[good], mean[good], error[good], fmt="o-", ms=2.4, lw=0.9, color=colour, label=label
@@ -128,7 +127,7 @@ def _mtf(alignment: Alignment) -> Figure:
         number = min((i for i, s in enumerate(bench.sites) if s.band == band), key=lambda i: abs(bench.sites[i].field))
         site, ccd = bench.sites[number], bench.ccds[band]
         defocus = float(site.crossing(state.standing.pose, state.standing.heights[band])[2])
-        for edge in EDGES:
+        for edge in DIRECTIONS:
             frames = state.focus[number].frames[edge]
             measured = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames))
             frequency = measured.frequency / ccd.band.pitch
@@ -142,7 +141,7 @@ def _mtf(alignment: Alignment) -> Figure:
                 alpha=0.25,
                 lw=0,
             )
-            axes.plot(PER_MM * frequency, measured.mtf, color=colour, lw=1.2, label=EDGE_NAMES[edge])
+            axes.plot(PER_MM * frequency, measured.mtf, color=colour, lw=1.2, label=DIRECTION_NAMES[edge])
             axes.plot(PER_MM * frequency, true, color=INK, lw=0.8, ls="--", label="truth" if edge == TRACK else None)
         axes.axvline(PER_MM * ccd.band.nyquist, color=GREY, lw=0.8, ls=":")
         axes.set(title=band, xlabel="cycles/mm", xlim=(0.0, PER_MM / ccd.band.pitch), ylim=(0.0, 1.02))
@@ -160,8 +159,8 @@ def _edges(alignment: Alignment) -> Figure:
     panels = figure.subplots(1, 2 * len(bands), squeeze=False)[0]
     for k, band in enumerate(bands):
         number = min((i for i, s in enumerate(bench.sites) if s.band == band), key=lambda i: abs(bench.sites[i].field))
-        for axes, edge in zip(panels[2 * k : 2 * k + 2], EDGES, strict=True):
+        for axes, edge in zip(panels[2 * k : 2 * k + 2], DIRECTIONS, strict=True):
             axes.imshow(state.focus[number].frames[edge][0], cmap="gray", interpolation="none")
-            axes.set_title(f"{band}, measures\n{EDGE_NAMES[edge]}")
+            axes.set_title(f"{band}, measures\n{DIRECTION_NAMES[edge]}")
             axes.set(xlabel="pixel along the line", ylabel="line" if edge == ALONG and k == 0 else "")
     return figure

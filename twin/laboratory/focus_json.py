@@ -8,8 +8,8 @@ import numpy as np
 
 from analysis.monitoring import ARCSEC
 from optics.rotation import rotation_vector
+from twin.edge_images import ALONG, TRACK
 from twin.laboratory.focus import Alignment, Shimming, State
-from twin.laboratory.focus_bench import ALONG, TRACK
 from twin.laboratory.focus_scan import VERTEX_ERROR
 
 ARCMIN = 60.0 * ARCSEC

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,15 +12,16 @@ from optics.backend import Backend
 from optics.collimator import TooNarrowError
 from optics.trace import BeamMissedError
 from twin.artefact import SvgFigure, Table
-from twin.laboratory.bench_error import BenchError
+from twin.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 from twin.laboratory.focus import Alignment, align, mount_of
-from twin.laboratory.focus_bench import ALONG, EDGES, TRACK, FocusBench
-from twin.laboratory.focus_figure import EDGE_NAMES, defocus_svg, edges_svg, mtf_svg, through_focus_svg
+from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_figure import defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.laboratory.focus_json import ARCMIN, UM, to_dict
 from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
-from twin.laboratory.result import Advance, LabResult
-from twin.laboratory.section import Section
 from twin.report.numbers import fixed
+from twin.trial.bench_error import BenchError
+from twin.trial.result import Advance, LabResult
+from twin.trial.section import Section
 
 if TYPE_CHECKING:
     from scenes.lab_setup import FocusSetup
@@ -71,7 +73,7 @@ def focus_result(alignment: Alignment) -> LabResult:
     images = {
         f"{bench.sites[i].band}_field{k}_{edge}": scan.frames[edge]
         for i, scan in enumerate(last.focus)
-        for edge in EDGES
+        for edge in DIRECTIONS
         for k in [bench.setup.test.fields.index(bench.sites[i].field) + 1]
     }
     return LabResult(
@@ -80,8 +82,8 @@ def focus_result(alignment: Alignment) -> LabResult:
         lead,
         _facts(alignment),
         data,
-        _summary(alignment),
-        (_alignment_section(alignment), _mtf_section(alignment), _shim_section(alignment)),
+        _summary(data),
+        (_alignment_section(alignment), _mtf_section(alignment, data), _shim_section(alignment)),
         images,
     )
 
@@ -127,8 +129,7 @@ def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _summary(alignment: Alignment) -> Table:
-    data = to_dict(alignment)
+def _summary(data: Mapping[str, Any]) -> Table:
     stages = [("before", data["initial"], data["truth"]["initial"])]
     for k, (measured, true) in enumerate(zip(data["rounds"], data["truth"]["rounds"], strict=True)):
         stages.append((f"after round {k + 1}", measured, true))
@@ -183,8 +184,7 @@ def _anamorphism(alignment: Alignment) -> float:
     return float(abs(site.nominal_per_shift[TRACK] / site.nominal_per_shift[ALONG] - 1.0))
 
 
-def _mtf_section(alignment: Alignment) -> Section:
-    data = to_dict(alignment)
+def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
     end, true = data["rounds"][-1], data["truth"]["rounds"][-1]
     rows = [
         (
@@ -200,7 +200,7 @@ def _mtf_section(alignment: Alignment) -> Section:
     budget = [
         (
             line["band"],
-            EDGE_NAMES[line["direction"]],
+            DIRECTION_NAMES[line["direction"]],
             *(f"{line['factors'][n]:.3f}" for n in names),
             f"{line['total']:.3f}",
         )

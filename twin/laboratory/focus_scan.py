@@ -14,9 +14,10 @@ from analysis.mtf.slanted_edge import measure_edge
 from optics.pose import Pose
 from optics.threads import cores, one_blas_thread
 from twin.detector import FixedPattern
-from twin.laboratory.bench_error import BenchError
-from twin.laboratory.focus_bench import ALONG, EDGES, FocusBench, Site
-from twin.laboratory.result import Advance, silent
+from twin.edge_images import ALONG, DIRECTIONS
+from twin.laboratory.focus_bench import FocusBench, Site
+from twin.trial.bench_error import BenchError
+from twin.trial.result import Advance, silent
 
 NYQUIST = 0.5
 """Cycles per pixel."""
@@ -118,7 +119,8 @@ class Recorder:
         site, bench = self.bench.sites[number], self.bench
         height = self.standing.heights[site.band]
         ccd = bench.ccds[site.band]
-        offset_seed, frame_seed = (self._stream(which, number, EDGES.index(edge), take) for which in (_OFFSET, _FRAMES))
+        way = DIRECTIONS.index(edge)
+        offset_seed, frame_seed = (self._stream(which, number, way, take) for which in (_OFFSET, _FRAMES))
         offset = float(np.random.default_rng(offset_seed).uniform(-0.5, 0.5)) * ccd.band.pitch
         share = site.image(edge, self.standing.pose, height, shift, offset)
         photons = ccd.white_photons(bench.setup.test.white) * share
@@ -180,7 +182,7 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
 
     def site(number: int) -> NyquistMtf:
         try:
-            takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in EDGES}
+            takes = {edge: recorder.measure(number, edge, 0.0, 9000) for edge in DIRECTIONS}
         except EdgeError as error:
             where = recorder.bench.sites[number]
             raise BenchError(
@@ -205,13 +207,13 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
         target = centre + steps
         taken = {
             edge: [recorder.attempt(number, edge, float(s), 1000 * (attempt + 1) + k) for k, s in enumerate(target)]
-            for edge in EDGES
+            for edge in DIRECTIONS
         }
-        shift = {edge: target * ratio[edge] for edge in EDGES}
-        mtf = {edge: np.array([one[0] for one in taken[edge]]) for edge in EDGES}
-        sigma = {edge: np.array([one[1] for one in taken[edge]]) for edge in EDGES}
+        shift = {edge: target * ratio[edge] for edge in DIRECTIONS}
+        mtf = {edge: np.array([one[0] for one in taken[edge]]) for edge in DIRECTIONS}
+        sigma = {edge: np.array([one[1] for one in taken[edge]]) for edge in DIRECTIONS}
         try:
-            vertex = {edge: focus_vertex(shift[edge], mtf[edge], sigma[edge]) for edge in EDGES}
+            vertex = {edge: focus_vertex(shift[edge], mtf[edge], sigma[edge]) for edge in DIRECTIONS}
         except FocusError as problem:
             if attempt == _ATTEMPTS - 1:
                 raise _lost(site, problem) from problem
@@ -219,7 +221,7 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
             best = int(np.argmax(sum(mtf.values())))
             centre = _search(recorder, number, zero) if attempt == 1 or not search else float(target[best])
             continue
-        frames = {edge: taken[edge][int(np.argmax(mtf[edge]))][2][0] for edge in EDGES}
+        frames = {edge: taken[edge][int(np.argmax(mtf[edge]))][2][0] for edge in DIRECTIONS}
         return SiteScan(shift, mtf, sigma, vertex, frames)
     raise AssertionError("unreachable")
 

@@ -18,14 +18,11 @@ from optics.threads import one_blas_thread
 from optics.transfer import TransferTable, transfer
 from optics.tree import State
 from optics.vector_shape import Disk, Polygon
-from twin.line_ccd import LineCcd
+from twin.line_ccd import LineCcd, band_wavelengths
 from twin.target_path import TargetPath
 
 NODES = 10
 """Chebyshev nodes over the field: images of gf7 between them are right to 1e-5 of their peak, their centres to 1 nm."""
-
-WAVELENGTHS = 7
-"""Gauss-Legendre nodes over the band, whose light is evenly spread."""
 
 GUARD = 160.0
 """Distance between the window and the copies of the spot in the Fourier sum, in units of 1/cut-off. The irradiance of a
@@ -85,9 +82,7 @@ class PinholeImages:
         """
         light = directions(reach * _nodes())
         pupils = path.pupils(state, light, path.places(state, light))
-        first, last = ccd.band.spectrum
-        node, weight = np.polynomial.legendre.leggauss(WAVELENGTHS)
-        wavelengths = first + 0.5 * (last - first) * (node + 1.0)
+        wavelengths, weights = band_wavelengths(ccd.band)
         rim = np.stack([np.cos(_RIM), np.sin(_RIM)], axis=-1)
         cutoff = max(float(np.max(pupil.cutoff(rim, wavelengths[0]))) for pupil in pupils)
         pitch = ccd.band.pitch
@@ -102,7 +97,7 @@ class PinholeImages:
         spectra, middle = np.empty((NODES, len(fy), len(fx)), complex), 0.0
         for n, (pupil, one) in enumerate(zip(pupils, light, strict=True)):
             image = hole.mapped(path.local_map(state, one, 1.5 * hole.radius))
-            table = TransferTable.build(pupil, wavelengths, weight)
+            table = TransferTable.build(pupil, wavelengths, weights)
             spectra[n] = image.spectrum(*grid) * table(*grid) * common
             middle = _width(image) if n == NODES // 2 else middle
             progress(n + 1, NODES)

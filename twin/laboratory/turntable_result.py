@@ -8,10 +8,10 @@ from optics.backend import Backend
 from scenes.units import ANGLE, format_quantity
 from twin.artefact import Table
 from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC
-from twin.laboratory.result import Advance, LabResult
 from twin.laboratory.turntable import TurntableRun, run_turntable
 from twin.laboratory.turntable_figure import FIT_NAMES
 from twin.laboratory.turntable_sections import sections
+from twin.trial.result import Advance, LabResult
 
 if TYPE_CHECKING:
     from scenes.lab_setup import TurntableSetup

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from analysis.monitoring import ARCSEC
 from scenes.units import ANGLE, format_quantity
 from twin.artefact import SvgFigure, Table
 from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC
-from twin.laboratory.section import Section
 from twin.laboratory.turntable import TurntableRun
 from twin.laboratory.turntable_figure import FIT_NAMES, drawn
+from twin.trial.section import Section
 
 
 def sections(run: TurntableRun) -> tuple[Section, ...]:
     """Comparison, and fits."""
-    return _comparison(run), _fits(run)
+    result = run.to_dict()
+    return _comparison(run, result), _fits(run, result)
 
 
-def _comparison(run: TurntableRun) -> Section:
-    series, result = run.series, run.to_dict()
-    plan = run.spec.calibration
+def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
+    series, plan = run.series, run.spec.calibration
     region = f"{format_quantity(plan.first, ANGLE)} to {format_quantity(plan.last, ANGLE)}"
     text = [
         f"The dividing error is the table's reading minus its true angle. It is compared with a polygon and an "
@@ -62,8 +65,7 @@ def _comparison(run: TurntableRun) -> Section:
     return Section("Regional comparison of the turntable", tuple(text), (figure, table))
 
 
-def _fits(run: TurntableRun) -> Section:
-    result = run.to_dict()
+def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     fits, truth = result["fits"], result["truth"]["fits"]
     chosen, best = result["chosen"], result["ranking"][0]
     held = fits[chosen]["heldout_rms_arcsec"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import typer
 
 from scenes.orbit_setup import resolve_angle, resolve_calibration
-from twin.laboratory.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 from twin.orbit.angle_result import run_angle
 from twin.orbit.calibration_result import run_calibration
+from twin.trial.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 
 PROGRAM = "twin.orbit"
 
@@ -43,7 +43,8 @@ def angle(
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points, with the paper's sentences on it judged.
     """
-    run_test(PROGRAM, file, resolve_angle, run_angle, Options(out, seed, backend, force, as_json, quiet))
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "angle", file, resolve_angle, run_angle, options)
 
 
 @app.command()
@@ -62,7 +63,8 @@ def calibrate(
     calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
     plan and height of every field before calibration and by each scheme.
     """
-    run_test(PROGRAM, file, resolve_calibration, run_calibration, Options(out, seed, backend, force, as_json, quiet))
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "calibrate", file, resolve_calibration, run_calibration, options)
 
 
 if __name__ == "__main__":

@@ -17,9 +17,9 @@ from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneErr
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
 from analysis.orbit.sensitivity import Sensitivity, sensitivity
 from scenes.orbit_angle import LINES
-from twin.laboratory.bench_error import BenchError
 from twin.orbit.angle_test import PAIRS, AnglePass, Measurement, fly
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
+from twin.trial.bench_error import BenchError
 
 if TYPE_CHECKING:
     from scenes.orbit_setup import AngleSetup

@@ -9,11 +9,11 @@ import numpy as np
 from optics.backend import Backend
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Cell, Table
-from twin.laboratory.result import Advance, LabResult
 from twin.orbit.angle_analysis import ANGLES, ARCSEC, AngleRun, resected, run_passes, true_angles
 from twin.orbit.angle_json import PRINTED_DIFFERENCE_ARCSEC, to_dict
 from twin.orbit.angle_sections import sections
 from twin.report.numbers import fixed
+from twin.trial.result import Advance, LabResult
 
 if TYPE_CHECKING:
     from scenes.orbit_setup import AngleSetup

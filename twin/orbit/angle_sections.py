@@ -6,11 +6,11 @@ import numpy as np
 
 from analysis.orbit.sensitivity import STATEMENTS, Judgement, judge
 from twin.artefact import Cell, SvgFigure, Table
-from twin.laboratory.section import Section
 from twin.orbit.angle_analysis import ARCSEC, FRAMES, AngleRun, Scatter
 from twin.orbit.angle_figure import drawn
 from twin.orbit.angle_json import PRINTED_DIFFERENCE_ARCSEC
 from twin.report.numbers import fixed
+from twin.trial.section import Section
 
 
 def sections(run: AngleRun) -> tuple[Section, ...]:

@@ -18,7 +18,6 @@ from analysis.orbit.planes import Station, Strip
 from optics.frozen_map import FrozenMap
 from optics.rotation import about_axis, rotation_matrix
 from scenes.orbit_angle import LINES
-from twin.laboratory.bench_error import BenchError
 from twin.orbit.attitude import Attitude
 from twin.orbit.earth import Earth, east_north_up
 from twin.orbit.light_effects import (
@@ -33,6 +32,7 @@ from twin.orbit.line_camera import LineCamera, dihedral_angle, line_cameras, lin
 from twin.orbit.orbit import propagate
 from twin.orbit.sensor import Sensor
 from twin.orbit.trajectory import Trajectory
+from twin.trial.bench_error import BenchError
 
 if TYPE_CHECKING:
     from scenes.orbit_angle import OrbitAngleSpec

@@ -19,9 +19,9 @@ from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR, LineModel
 from optics.frozen_map import FrozenMap
 from scenes.orbit_angle import LINES
-from twin.laboratory.bench_error import BenchError
-from twin.laboratory.result import Advance
 from twin.orbit.calibration_test import Campaign, FieldPass, fly_fields
+from twin.trial.bench_error import BenchError
+from twin.trial.result import Advance
 
 if TYPE_CHECKING:
     from scenes.orbit_setup import CalibrationSetup

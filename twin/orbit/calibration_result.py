@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 from optics.backend import Backend
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Cell, Table
-from twin.laboratory.result import Advance, LabResult
 from twin.orbit.calibration_analysis import CalibrationRun, run_calibration_passes
 from twin.orbit.calibration_json import meets, to_dict
 from twin.orbit.calibration_sections import said, sections, values_of
+from twin.trial.result import Advance, LabResult
 
 if TYPE_CHECKING:
     from scenes.orbit_setup import CalibrationSetup

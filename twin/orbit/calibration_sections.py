@@ -10,9 +10,9 @@ from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
 from scenes.orbit_angle import LINES
 from twin.artefact import Cell, Table
-from twin.laboratory.section import Section
 from twin.orbit.calibration_analysis import INNER, OFFSET, STEPWISE_TOLERANCE, CalibrationRun, Finding
 from twin.orbit.calibration_json import unit
+from twin.trial.section import Section
 
 _ARCSEC = np.pi / 648000.0
 

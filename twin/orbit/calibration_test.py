@@ -23,7 +23,6 @@ from optics.rotation import about_axis, rotation_matrix
 from scenes.orbit_angle import LINES
 from scenes.orbit_spec import OrbitSpec, PassingSpec
 from scenes.three_line_camera import ThreeLineCameraSpec
-from twin.laboratory.bench_error import BenchError
 from twin.orbit.attitude import Attitude
 from twin.orbit.earth import Earth
 from twin.orbit.light_effects import NO_EFFECTS
@@ -32,6 +31,7 @@ from twin.orbit.measurement_errors import TERMS
 from twin.orbit.orbit import propagate
 from twin.orbit.sensor import Sensor
 from twin.orbit.trajectory import Trajectory
+from twin.trial.bench_error import BenchError
 
 if TYPE_CHECKING:
     from scenes.orbit_calibration import FieldSpec, OrbitCalibrationSpec

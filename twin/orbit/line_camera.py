@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from optics.aim import RayFan, aim, transverse_axes
 from optics.assembly import points_to_world
 from optics.backend import Backend
+from optics.line_of_sight import chief_rays
 from optics.rotation import about_axis, rotation_matrix
 from optics.system import assemble
-from optics.trace import make_rays, require_some, trace
 from optics.tree import State
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
@@ -135,15 +134,8 @@ def traced_line_cameras(instrument: Instrument, backend: Backend, state: State |
         guesses.append(instrument.toward_optics(placed, name))
     to_stop = assemble(instrument.assembly, [f"{name}/image_to_stop" for name in names], states, placed=placed)
     to_object = assemble(instrument.assembly, [f"{name}/image_to_object" for name in names], states, placed=placed)
-    image = np.concatenate(points)
-    guess = np.broadcast_to(np.concatenate(guesses)[:, None], image.shape)
-    along_line = np.broadcast_to(np.array([0.0, 1.0, 0.0]), image.shape)
-    fan = RayFan(image, guess, transverse_axes(guess, along_line))
-    through_stop, _ = aim(backend, to_stop, fan, np.zeros(2))
-    out = trace(backend, to_object, make_rays(backend, *fan.at(through_stop)), world=True)
-    assert out.world is not None
-    position, direction, _, valid = out.numpy(out.world)
-    require_some(valid, "the imaging path")
+    image, guess = np.concatenate(points), np.concatenate(guesses)[:, None]
+    position, direction = chief_rays(backend, to_stop, to_object, image, guess, np.array([0.0, 1.0, 0.0]))
     cameras = {}
     for i, (name, line) in enumerate(lines.items()):
         camera_origin = np.array(instrument.spec.cameras[name].position)

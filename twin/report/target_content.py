@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from twin.edge_images import DIRECTION_NAMES, DIRECTIONS
 from twin.report.numbers import FAR, fixed, plain, residual, residual_text, significant
 from twin.results import RenderRun
-from twin.target_images import DIRECTIONS
 from twin.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, PlaceTargets
 
-DIRECTION_NAMES = dict(zip(DIRECTIONS, ("along the line", "along the track"), strict=True))
 METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
 DECIMALS = 4
 """Of an MTF."""

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import AsinhNorm, Normalize
 
+from twin.edge_images import DIRECTION_NAMES, DIRECTIONS
 from twin.report.svg import BLUE, GREY, LIGHT, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.target_images import DIRECTIONS
 from twin.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading
 
 COLOURS = {"before": BLUE, "after": VERMILION}
@@ -18,7 +18,6 @@ LEAST_SPAN = 4.0
 """Half height of the panels of differences at least, thousandths."""
 EVERY = 2
 """Every how many-th frequency gets a dot."""
-TITLES = dict(zip(DIRECTIONS, ("along the line", "along the track"), strict=True))
 IMAGE_NAMES = {
     "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
     "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
@@ -58,7 +57,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
                     if direction in shots.bars:
                         _bars(axes, when, shots.bars[direction], camera.pitch)
                 axes.set(xlim=(0.0, 2.0 * nyquist), ylim=(0.0, 1.03))
-                axes.set_title(f"{place}, {TITLES[direction]}", loc="left")
+                axes.set_title(f"{place}, {DIRECTION_NAMES[direction]}", loc="left")
                 if column == 0:
                     axes.set_ylabel("MTF")
                     below.set_ylabel("error [10$^{-3}$]")

@@ -9,8 +9,9 @@ import numpy as np
 from optics.threads import one_blas_thread
 from scenes.lab_setup import resolve_focus
 from twin.artefact import Cell, Table
+from twin.edge_images import TRACK
 from twin.laboratory.focus import Alignment, align
-from twin.laboratory.focus_bench import TRACK, FocusBench
+from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_json import ARCMIN, to_dict
 from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.validation import laboratory_004_distortion, laboratory_004_equations, laboratory_004_turntable

@@ -10,7 +10,7 @@ import numpy as np
 
 from optics.frozen_map import FrozenMap
 from twin.artefact import Table
-from twin.laboratory.section import Section
+from twin.trial.section import Section
 
 Advance = Callable[[str, int, int], None]
 """Told what is being done, and how many of how many parts of it are."""

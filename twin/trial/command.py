@@ -13,17 +13,26 @@ from typing import Annotated, Any
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from optics.backend import Backend, load_backend
 from scenes.errors import InputError
-from twin.cli import BACKEND_HELP, LARGEST_SEED, check_backend, exit_on_terminate, explained
-from twin.laboratory.bench_error import BenchError
-from twin.laboratory.output import RunFacts, write_lab
-from twin.laboratory.result import Advance, LabResult
+from twin.cli import (
+    BACKEND_HELP,
+    LARGEST_SEED,
+    check_backend,
+    exit_on_terminate,
+    explained,
+    print_place,
+    print_whole,
+    progress_columns,
+)
 from twin.report.page import cell_text
 from twin.run_folder import RunFolder, next_free
+from twin.trial.bench_error import BenchError
+from twin.trial.output import RunFacts, write_lab
+from twin.trial.result import Advance, LabResult
 
 File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
 Out = Annotated[Path | None, typer.Option(readable=False, help="Run folder to make. Default: runs/TEST-001, -002, ...")]
@@ -59,6 +68,7 @@ class Options:
 
 def run_test(
     program: str,
+    command: str,
     file: Path,
     resolve: Callable[[Path], Any],
     run: Callable[[Any, Backend, int, Advance], LabResult],
@@ -68,6 +78,7 @@ def run_test(
 
     Args:
         program: as the user calls it, ``twin.lab``.
+        command: its subcommand, ``focus``.
         file: of the test.
         resolve: file -> set-up with ``test`` (which has a ``seed``), ``with_seed`` and ``to_yaml``.
         run: set-up, backend, seed and progress -> result.
@@ -86,16 +97,12 @@ def run_test(
         )
         tracer = load_backend(options.backend)
         started, clock = time.time(), time.monotonic()
-        columns = (
-            SpinnerColumn(),
-            TextColumn("{task.description:28}", markup=False),
-            BarColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-        )
         hidden = options.as_json or options.quiet or not errors.is_terminal
-        with exit_on_terminate(), folder, Progress(*columns, console=errors, disable=hidden, transient=True) as bar:
+        with (
+            exit_on_terminate(),
+            folder,
+            Progress(*progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+        ):
             parts: dict[str, TaskID] = {}
 
             def advance(part: str, done: int, total: int) -> None:
@@ -109,7 +116,8 @@ def run_test(
                 raise _explained_at(setup.test, error) from error
             config = setup.with_seed(number).to_yaml()
             seconds = time.monotonic() - clock
-            write_lab(result, RunFacts(config, str(file), tracer.name, number, started, seconds, program), folder)
+            facts = RunFacts(config, str(file), tracer.name, number, started, seconds, program, command)
+            write_lab(result, facts, folder)
     if options.as_json:
         json.dump(dict(result.data), sys.stdout, allow_nan=False)
         sys.stdout.write("\n")
@@ -133,12 +141,9 @@ def _print_result(result: LabResult, target: Path) -> None:
     for row in summary.shown():
         table.add_row(*(cell_text(cell) for cell in row))
     console = Console()
-    # a number that is cut is worse than a line that wraps
-    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
-    console.print(table)
+    print_whole(console, table)
     for line in result.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     for warning in result.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-    console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+    print_place(console, target)

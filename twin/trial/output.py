@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from twin.artefact import Artefact
 from twin.image_file import preview_png, tiff
-from twin.laboratory.result import LabResult
 from twin.report.page import artefact_content, environment
 from twin.run_folder import MANIFEST, RunFolder
+from twin.trial.result import LabResult
 from twin.versions import versions
 
-TEMPLATE = "lab.html.j2"
+TEMPLATE = "trial.html.j2"
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class RunFacts:
         started: seconds since the epoch.
         seconds: that it took.
         program: that ran it, as the user calls it.
+        command: its subcommand.
     """
 
     config: str
@@ -34,7 +35,8 @@ class RunFacts:
     seed: int
     started: float
     seconds: float
-    program: str = "twin.lab"
+    program: str
+    command: str
 
 
 def place(artefact: Artefact) -> str:
@@ -60,7 +62,7 @@ def render_report(result: LabResult, facts: RunFacts) -> str:
                 for section in result.sections
             ],
             facts=facts,
-            command=f"python -m {facts.program} {result.kind} config.yaml {options}",
+            command=f"python -m {facts.program} {facts.command} config.yaml {options}",
             versions=versions(),
         )
     )

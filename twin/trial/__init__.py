@@ -1,0 +1,1 @@
+"""What commands that run one test share: options, progress, result, report and run folder."""
