@@ -1,0 +1,261 @@
+"""Least squares matching of many points together (Gruen, South African Journal of Photogrammetry 14(3), 1985).
+
+The image's pixels y in a window are explained by the template t,
+
+    y(x) = offset + gain t(u) + sharp_r t_rr(u) + sharp_c t_cc(u),   u = A (x - place),
+
+with u counted from the template's middle, A an affine matrix, and second derivatives that take up a difference in
+sharpness. The template is interpolated and not the image, so that the image's noise enters as it is and does not pull
+the fit towards places between pixels, where an interpolated image is smoother.
+
+**Covariance.** Noise of the image, interpolated noise of the template and what the model leaves unexplained all stand
+in the residuals. Assumed: over one window they are stationary, with a variance of its own (residual square sum over
+redundancy) and with a correlation of neighbours up to three pixels that all points share. It is the median over
+the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel)
+the covariance is B C B'. The noise of a template that is as noisy as the image would make slopes too steep and the
+place lean towards whole pixels; the second derivatives act as a smoothing that the fit chooses, and take nearly all of
+it away. Not in the covariance: what pulls all points alike (an error of the reference's georeference), aliasing of the
+image, and the interpolation's own error, some thousandths of a pixel for detail up to 0.45 cycles a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.matching.checks import checked_image, checked_places, checked_templates
+from analysis.matching.options import MatchOptions
+from analysis.matching.reason import Reason
+from analysis.matching.residual_correlation import ResidualCorrelation, residual_correlation
+from analysis.matching.spline import SplineStack
+
+__all__ = ["Fits", "least_squares"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+# Points that are fitted together; bounds memory to some 100 MB.
+_CHUNK = 128
+# Last step of the place, px, and of the affine change at the window's side, px. The next is an order smaller.
+_REST = 2e-4
+_LONGEST_STEP = 0.7
+# Steps are found to this relative accuracy where the normal matrix is singular.
+_RIDGE = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Fitted points; numbers are NaN where the window could not be fitted at all.
+
+    Attributes:
+        place: (n, 2) row and column of the templates' middles in the image.
+        affine: (n, 2, 2) A: template pixels by image pixels.
+        gain: (n,) of the image against the template.
+        correlation: (n,) of the image with the fitted template.
+        sigma: (n,) residual standard deviation, DN of the image, by redundancy.
+        contrast: (n,) standard deviation of the image in the window over that of one pixel's noise, the latter from
+            differences of 2 x 2 pixels.
+        iterations: (n,) steps.
+        reason: (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, SATURATED, FLAT, DIVERGED, MOVED,
+            DISTORTED.
+        spread: what the covariance is made of.
+    """
+
+    place: Array
+    affine: Array
+    gain: Array
+    correlation: Array
+    sigma: Array
+    contrast: Array
+    iterations: Index
+    reason: NDArray[np.int8]
+    spread: ResidualCorrelation
+
+    def covariance(self, good: NDArray[np.bool_] | None = None) -> Array:
+        """(n, 2, 2) px^2 of places, with the correlation of residuals of points good (n,); None: the converged."""
+        return self.spread.covariance(self.reason == Reason.ACCEPTED if good is None else good)
+
+
+def least_squares(
+    image: ArrayLike, templates: ArrayLike, start: ArrayLike, options: MatchOptions | None = None
+) -> Fits:
+    """Places of templates near start.
+
+    Args:
+        image: (H, W), any real type.
+        templates: (n, k, k), k odd.
+        start: (n, 2) row and column, good to a pixel.
+        options: model and limits; the thresholds on correlation, ratio and sigma are not applied here.
+
+    Raises:
+        ValueError: wrong shapes, a template too small for its margin.
+    """
+    plane = checked_image(image, "least squares matching")
+    patch = checked_templates(templates, "least squares matching")
+    first = checked_places(start, len(patch), "least squares matching")
+    chosen = options or MatchOptions()
+    width = patch.shape[1] - 2 * chosen.margin
+    if width < 7:
+        raise ValueError(
+            f"least squares matching: templates of {patch.shape[1]} px leave a window of {width} px after a margin of "
+            f"{chosen.margin} px at each side; take {2 * chosen.margin + 7} px or more"
+        )
+    parts = [
+        _fit(plane, patch[k : k + _CHUNK], first[k : k + _CHUNK], chosen) for k in range(0, max(len(patch), 1), _CHUNK)
+    ]
+    columns = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(Fits)
+        if field.name != "spread"
+    }
+    return Fits(**columns, spread=ResidualCorrelation.joined([part.spread for part in parts]))
+
+
+def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:
+    """Some points together."""
+    count, half = len(templates), templates.shape[1] // 2
+    reach = half - options.margin
+    row, column = (g.ravel().astype(np.float64) for g in np.mgrid[-reach : reach + 1, -reach : reach + 1])
+    grey, anchor, reason = _windows(image, templates, start, reach, options)
+    stack = SplineStack(np.where((reason == 0)[:, None, None], templates, 0.0))
+
+    shift = start - anchor
+    affine = np.tile(np.eye(2), (count, 1, 1))
+    linear = np.full((count, options.parameters - 2 - 4 * options.affine), np.nan)
+    linear[:, 0], linear[:, 1:] = grey.mean(axis=1), 0.0
+    iterations = np.zeros(count, np.intp)
+    design = np.zeros((count, options.parameters, row.size))
+    residual = np.full((count, row.size), np.nan)
+    going = np.flatnonzero(reason == 0)
+    for iteration in range(options.iterations + 1):
+        if not going.size:
+            break
+        step, design[going], residual[going] = _step(
+            stack, going, grey[going], (row, column), shift[going], affine[going], linear[going, 1:], iteration, options
+        )
+        size = np.abs(step[:, :2]).max(axis=1)
+        turn = step[:, 2:6].reshape(-1, 2, 2) if options.affine else np.zeros((going.size, 2, 2))
+        rest = np.maximum(size, reach * np.abs(turn).max(axis=(1, 2))) < _REST
+        moved = iteration > 0
+        short = np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))[:, None]
+        if moved:
+            shift[going] += short * step[:, :2]
+            affine[going] += short[:, :, None] * turn
+        linear[going] = step[:, 2 + 4 * options.affine :]
+        iterations[going] = iteration
+        far = np.abs(shift[going] + anchor[going] - start[going]).max(axis=1) > options.largest_move
+        bent = np.abs(affine[going] - np.eye(2)).max(axis=(1, 2)) > options.largest_distortion
+        reason[going[bent]] = Reason.DISTORTED
+        reason[going[far]] = Reason.MOVED
+        going = going[~((rest & moved) | far | bent)]
+    reason[going] = Reason.DIVERGED
+    return _summary(grey, anchor + shift, affine, linear, design, residual, iterations, reason, stack, reach)
+
+
+def _windows(
+    image: NDArray[np.generic], templates: Array, start: Array, reach: int, options: MatchOptions
+) -> tuple[Array, Array, NDArray[np.int8]]:
+    """Grey values (n, p), middles of the windows (n, 2) and what is wrong with them."""
+    reason = np.zeros(len(templates), np.int8)
+    anchor = np.rint(start)
+    fits = np.all((anchor >= reach) & (anchor <= np.array(image.shape) - 1 - reach), axis=1)
+    reason[~fits] = Reason.OUTSIDE
+    reason[~(np.isfinite(templates).all(axis=(1, 2)) & np.isfinite(start).all(axis=1))] = Reason.TEMPLATE
+    offset = np.arange(-reach, reach + 1)
+    usable = np.flatnonzero(reason == 0)
+    rows, columns = (anchor[usable, k, None].astype(np.intp) + offset for k in range(2))
+    grey = np.zeros((len(templates), (2 * reach + 1) ** 2))
+    grey[usable] = image[rows[:, :, None], columns[:, None, :]].reshape(usable.size, grey.shape[1])
+    finite = np.isfinite(grey).all(axis=1)
+    reason[~finite] = Reason.IMAGE
+    grey[~finite] = 0.0
+    top = options.saturation
+    if top is None and image.dtype.kind in "ui":
+        top = float(np.iinfo(image.dtype).max)  # type: ignore[type-var]
+    if top is not None:
+        reason[(reason == 0) & (grey.max(axis=1, initial=-np.inf) >= top)] = Reason.SATURATED
+    even = (np.ptp(grey, axis=1) == 0) | (np.ptp(templates, axis=(1, 2)) == 0)
+    reason[(reason == 0) & even] = Reason.FLAT
+    return grey, np.where(reason[:, None] == Reason.TEMPLATE, 0.0, anchor), reason
+
+
+def _step(
+    stack: SplineStack,
+    which: Index,
+    grey: Array,
+    window: tuple[Array, Array],
+    shift: Array,
+    affine: Array,
+    linear: Array,
+    iteration: int,
+    options: MatchOptions,
+) -> tuple[Array, Array, Array]:
+    """Gauss-Newton step of place and matrix with the new linear unknowns, design (m, q, p) and residuals (m, p)."""
+    apart = np.stack([window[0] - shift[:, :1], window[1] - shift[:, 1:]], axis=1)
+    u = affine @ apart + stack.size // 2
+    value = stack(u[:, 0], u[:, 1], which, order=3 if options.sharpness else 1)
+    # the linear unknowns are not known before the first pass, which finds them for the place at the start
+    known = linear.T[:, :, None] if iteration else np.zeros((linear.shape[1], len(grey), 1))
+    by_row, by_column = known[0] * value[1], known[0] * value[2]
+    if options.sharpness:
+        by_row = by_row + known[1] * value[6] + known[2] * value[8]
+        by_column = by_column + known[1] * value[7] + known[2] * value[9]
+    slope = np.stack([by_row, by_column], axis=1)
+    columns = [-np.swapaxes(affine, 1, 2) @ slope]
+    if options.affine:
+        columns.append((slope[:, :, None] * apart[:, None]).reshape(len(grey), 4, -1))
+    columns.append(np.stack([np.ones_like(value[0]), value[0] - value[0].mean(axis=1, keepdims=True)], axis=1))
+    columns.extend([np.stack([value[3], value[5]], axis=1)] if options.sharpness else [])
+    design = np.concatenate(columns, axis=1)
+    step = _solve(design, grey)
+    return step, design, grey - np.einsum("mqp,mq->mp", design, step)
+
+
+def _solve(design: Array, grey: Array) -> Array:
+    scale = 1.0 / np.maximum(np.sqrt(np.einsum("mqp,mqp->mq", design, design)), 1e-300)
+    scaled = design * scale[:, :, None]
+    normal = scaled @ np.swapaxes(scaled, 1, 2) + _RIDGE * np.eye(design.shape[1])
+    return scale * np.linalg.solve(normal, scaled @ grey[:, :, None])[:, :, 0]
+
+
+def _summary(
+    grey: Array,
+    place: Array,
+    affine: Array,
+    linear: Array,
+    design: Array,
+    residual: Array,
+    iterations: Index,
+    reason: NDArray[np.int8],
+    stack: SplineStack,
+    reach: int,
+) -> Fits:
+    none = np.isin(reason, (Reason.TEMPLATE, Reason.OUTSIDE, Reason.IMAGE, Reason.FLAT, Reason.SATURATED))
+    square = np.einsum("np,np->n", residual, residual)
+    about = grey - grey.mean(axis=1, keepdims=True)
+    total = np.einsum("np,np->n", about, about)
+    redundancy = grey.shape[1] - design.shape[1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.sqrt(np.clip(1.0 - square / total, 0.0, 1.0)) * np.sign(linear[:, 1])
+        side = 2 * reach + 1
+        plane = grey.reshape(-1, side, side)
+        checker = plane[:, 1:, 1:] - plane[:, 1:, :-1] - plane[:, :-1, 1:] + plane[:, :-1, :-1]
+        contrast = np.sqrt(total / grey.shape[1]) / (
+            0.7413 * np.median(np.abs(checker).reshape(len(grey), (side - 1) ** 2), axis=1)
+        )
+    spread = residual_correlation(
+        np.where(none[:, None, None], np.nan, design), np.where(none[:, None], np.nan, residual), side
+    )
+    hidden = np.where(none, np.nan, 1.0)
+    return Fits(
+        place * hidden[:, None],
+        affine * hidden[:, None, None],
+        linear[:, 1] * hidden,
+        correlation * hidden,
+        np.sqrt(square / redundancy) * hidden,
+        contrast,
+        iterations,
+        reason,
+        spread,
+    )

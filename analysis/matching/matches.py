@@ -1,0 +1,113 @@
+"""Matching of templates in an image: search, least squares, thresholds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.matching.checks import checked_image, checked_places, checked_templates
+from analysis.matching.correlation import search
+from analysis.matching.least_squares import least_squares
+from analysis.matching.options import MatchOptions
+from analysis.matching.reason import Reason
+from analysis.matching.spline import resampled
+
+__all__ = ["MatchOptions", "Matches", "Reason", "match", "resampled"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Matched points.
+
+    Attributes:
+        place: (n, 2) row and column of the templates' middles in the image; NaN where least squares matching gave none.
+        covariance: (n, 2, 2) px^2, for those that follow the model; see `analysis.matching.least_squares`.
+        correlation: (n,) of the image with the fitted template; of the search where there is no fit; NaN if neither.
+        ratio: (n,) second best to best peak of the search.
+        accepted: (n,) bool.
+        reason: (n,) codes of `Reason`.
+    """
+
+    place: Array
+    covariance: Array
+    correlation: Array
+    ratio: Array
+    accepted: NDArray[np.bool_]
+    reason: NDArray[np.int8]
+
+    @property
+    def sigma(self) -> Array:
+        """(n,) standard deviation along the worst direction, px; NaN without a fit."""
+        return _worst(self.covariance)
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """(n,) reasons in words."""
+        return tuple(Reason(int(code)).text for code in self.reason)
+
+    @property
+    def text(self) -> str:
+        """How many were accepted, and why the others were not, the most frequent reason first."""
+        count = Counter(text for text in self.texts if text != Reason.ACCEPTED.text)
+        parts = [f"{int(self.accepted.sum())} of {len(self.accepted)} accepted"]
+        return "; ".join(parts + [f"{number} x {text}" for text, number in count.most_common()])
+
+
+def match(
+    image: ArrayLike,
+    templates: ArrayLike,
+    predicted: ArrayLike,
+    *,
+    reach: int,
+    options: MatchOptions | None = None,
+) -> Matches:
+    """Find templates in an image, each near its predicted place.
+
+    Args:
+        image: (H, W), any real type.
+        templates: (n, k, k), k odd, resampled into the image's geometry (`resampled`); NaN makes a point unusable.
+        predicted: (n, 2) row and column at which their middles are expected.
+        reach: how far the prediction may be off along rows and columns, px.
+        options: model and thresholds.
+
+    Raises:
+        ValueError: wrong shapes, reach out of range, a template too small for its margin.
+    """
+    plane = checked_image(image, "match")
+    patch = checked_templates(templates, "match")
+    expected = checked_places(predicted, len(patch), "match")
+    chosen = options or MatchOptions()
+    peaks = search(plane, patch, expected, reach)
+    fits = least_squares(plane, patch, peaks.place, chosen)
+    # points without a peak have no start, which the fit calls a bad template
+    reason = np.where(peaks.reason != 0, peaks.reason, fits.reason).astype(np.int8)
+    weak = np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value) < chosen.least_correlation
+    reason[_open(reason) & weak] = Reason.WEAK
+    reason[(reason == 0) & (peaks.ratio > chosen.largest_ratio)] = Reason.AMBIGUOUS
+    covariance = fits.covariance(reason == Reason.ACCEPTED)
+    # NaN compares false
+    reason[(reason == 0) & ~(_worst(covariance) <= chosen.largest_sigma)] = Reason.UNCERTAIN
+    reason[_open(reason) & (reason != 0) & (fits.contrast < chosen.least_contrast)] = Reason.FLAT
+    return Matches(
+        place=fits.place,
+        covariance=covariance,
+        correlation=np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value),
+        ratio=peaks.ratio,
+        accepted=reason == Reason.ACCEPTED,
+        reason=reason,
+    )
+
+
+def _open(reason: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Verdicts that another one may explain better: fitted, or tried to."""
+    return (reason == Reason.ACCEPTED) | (reason >= Reason.BORDER)
+
+
+def _worst(covariance: Array) -> Array:
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))

@@ -1,0 +1,69 @@
+"""Thresholds and model of a match."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+__all__ = ["MatchOptions"]
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """What least squares matching solves for, and what is accepted.
+
+    Attributes:
+        affine: solve for an affine change beside the shift.
+        sharpness: solve for a difference in sharpness along rows and columns (second derivatives of the template).
+            Where the template is noisy (image against image) this also damps its noise; without it the slopes of a
+            noisy template are too steep, the place is drawn towards whole pixels, and the covariance is too small.
+        margin: rows and columns at each side of a template that only feed its interpolation, px; also bounds how far
+            the fit may go before the template's rim enters it.
+        iterations: most Gauss-Newton steps.
+        least_correlation: of template and image after the fit; below it WEAK. White noise of r times the texture's
+            standard deviation alone brings it down to 1 / sqrt(1 + r^2).
+        largest_ratio: of the second best to the best peak of the search; above it AMBIGUOUS.
+        largest_move: of the fit from the search's peak along an axis, px.
+        largest_distortion: of any element of the affine matrix from the unit matrix.
+        largest_sigma: of the place along its worst direction, px.
+        least_contrast: standard deviation of the image under the template over that of one pixel's noise; a point that
+            fails otherwise is called FLAT below it.
+        saturation: DN from which a pixel counts as saturated; None: the largest value of an integer type.
+    """
+
+    affine: bool = True
+    sharpness: bool = True
+    margin: int = 3
+    iterations: int = 20
+    least_correlation: float = 0.6
+    largest_ratio: float = 0.9
+    largest_move: float = 1.5
+    largest_distortion: float = 0.2
+    largest_sigma: float = 0.2
+    least_contrast: float = 2.0
+    saturation: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ValueError: a value that is not positive and finite, correlation or ratio above 1, a margin
+                below 2 px or too small for the largest move.
+        """
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in ("affine", "sharpness", "saturation") and not (value > 0 and math.isfinite(value)):
+                raise ValueError(f"match options: {field.name} must be positive and finite, found {value}")
+        for name in ("least_correlation", "largest_ratio"):
+            if getattr(self, name) > 1.0:
+                raise ValueError(f"match options: {name} must not exceed 1, found {getattr(self, name)}")
+        if self.margin < 2 or self.largest_move > self.margin - 0.5:
+            raise ValueError(
+                f"match options: a margin of {self.margin} px does not hold the fit's way of {self.largest_move:g} px: "
+                "take at least 2 px and half a pixel more than the way"
+            )
+
+    @property
+    def parameters(self) -> int:
+        """Unknowns of a fit: place, affine matrix, offset, gain, sharpness."""
+        return 4 + 4 * self.affine + 2 * self.sharpness

@@ -1,0 +1,154 @@
+"""Interpolating B-splines: patches of an image at any places, and stacks of templates with their derivatives.
+
+Splines by prefilter and basis (Unser, IEEE Signal Processing Magazine 16(6), 1999). Degree 3 for resampling; templates
+that are fitted take degree 5, whose error at a quarter of the sampling frequency is 0.1 per cent of the amplitude
+against 1 per cent, and which passes white noise more evenly over the sub-pixel phase.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.interpolate import BSpline, PPoly
+
+from analysis.matching.checks import checked_image
+
+__all__ = ["SplineStack", "resampled"]
+
+Array = NDArray[np.float64]
+# Pixels beyond a patch that its spline sees: the cubic prefilter decays by 0.268 a pixel, so the rest is 1e-8.
+_HALO = 14
+# Knots that a cubic spline weighs directly, at each side.
+_SUPPORT = 2
+_DEGREE = 5
+# Rim about a template that continues it with its slope: a plain mirror has a kink that the prefilter spreads inwards.
+_RIM = 10
+
+
+def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothing: float = 0.0) -> Array:
+    """Grey values of an image at any places by cubic splines.
+
+    An image of finer pixels than the grid must be low-passed first, or its detail aliases: smoothing about 0.3 to 0.5
+    times the ratio of the pixels makes up for pixel and optics of the coarser one.
+
+    Args:
+        image: (H, W), any real type; NaN marks missing pixels.
+        rows: (..., k, l) rows of the samples; each (k, l) is one patch, and is cut out with a halo, so that only the
+            patches and not the image are filtered.
+        columns: (..., k, l).
+        smoothing: standard deviation of a Gaussian low pass in pixels of the image; 0 for none.
+
+    Returns:
+        (..., k, l) float64; NaN outside of the image and next to missing pixels.
+
+    Raises:
+        ValueError: image not a plane, rows and columns of different shapes or without patches, smoothing negative.
+    """
+    plane = checked_image(image, "resampling")
+    row, column = np.asarray(rows, np.float64), np.asarray(columns, np.float64)
+    if row.shape != column.shape or row.ndim < 2:
+        raise ValueError(
+            f"resampling: rows {row.shape} and columns {column.shape} must be grids of one shape (..., k, l)"
+        )
+    if not (smoothing >= 0 and np.isfinite(smoothing)):
+        raise ValueError(f"resampling: smoothing must be 0 or a positive number of pixels, found {smoothing}")
+    patches = (-1, *row.shape[-2:])
+    out = np.full(row.reshape(patches).shape, np.nan)
+    for sample, r, c in zip(out, row.reshape(patches), column.reshape(patches), strict=True):
+        _fill(sample, plane, r, c, smoothing)
+    return out.reshape(row.shape)
+
+
+def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, smoothing: float) -> None:
+    height, width = image.shape
+    # NaN compares false
+    inside = (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1)
+    if not inside.any():
+        return
+    halo = _HALO + int(np.ceil(5.0 * smoothing))
+    top, left = (max(int(x[inside].min()) - halo, 0) for x in (row, column))
+    bottom, right = (int(x[inside].max()) + halo + 2 for x in (row, column))
+    crop = np.asarray(image[top:bottom, left:right], np.float64)
+    at = np.stack([row[inside] - top, column[inside] - left])
+    missing = ~np.isfinite(crop)
+    if missing.all():
+        return
+    if missing.any():
+        crop = np.where(missing, crop[~missing].mean(), crop)
+    if smoothing:
+        crop = ndimage.gaussian_filter(crop, smoothing, mode="mirror", truncate=5.0)
+    value = ndimage.map_coordinates(crop, at, order=3, mode="mirror")
+    if missing.any():
+        reach = _SUPPORT + int(np.ceil(3.0 * smoothing))
+        near = ndimage.binary_dilation(missing, np.ones((2 * reach + 1, 2 * reach + 1)))
+        value[near[tuple(np.rint(at).astype(np.intp))]] = np.nan
+    sample[inside] = value
+
+
+class SplineStack:
+    """Quintic splines through n templates (n, k, k), evaluated at other places in each.
+
+    The templates must be finite.
+    """
+
+    def __init__(self, templates: Array) -> None:
+        count, self.size = templates.shape[0], templates.shape[1]
+        knots = np.pad(templates, ((0, 0), (_RIM, _RIM), (_RIM, _RIM)), mode="reflect", reflect_type="odd")
+        for axis in (1, 2):
+            knots = ndimage.spline_filter1d(knots, _DEGREE, axis=axis, mode="mirror")
+        self._knots = np.ascontiguousarray(knots)
+        self._stride = self.size + 2 * _RIM
+        self._first = np.arange(count) * self._stride**2
+
+    def __call__(self, row: Array, column: Array, which: NDArray[np.intp], *, order: int) -> Array:
+        """Values and derivatives.
+
+        Args:
+            row: (m, p) in pixels of the template; clipped to it.
+            column: (m, p).
+            which: (m,) template of each row of places.
+            order: highest derivative, 1 to 3.
+
+        Returns:
+            (3, 6 or 10, m, p): value; by row, column; by row row, row column, column column; by row row row, row row
+            column, row column column, column column column.
+        """
+        weights, base = [], np.broadcast_to(self._first[which][:, None], row.shape)
+        for place, step in ((row, self._stride), (column, 1)):
+            place = np.clip(place, 0.0, self.size - 1.0)
+            whole = np.minimum(np.floor(place), self.size - 2.0)
+            base = base + (whole.astype(np.intp) + _RIM - _DEGREE // 2) * step
+            weights.append(_weights(place - whole, order))
+        down, across = weights
+        kinds = [(total - k, k) for total in range(order + 1) for k in range(total + 1)]
+        out = np.zeros((len(kinds), *row.shape))
+        flat = self._knots.ravel()
+        for a in range(_DEGREE + 1):
+            line = np.zeros((order + 1, *row.shape))
+            for b in range(_DEGREE + 1):
+                line += across[:, b] * flat.take(base + (a * self._stride + b))
+            for value, (by_row, by_column) in zip(out, kinds, strict=True):
+                value += down[by_row, a] * line[by_column]
+        return out
+
+
+def _weights(fraction: Array, orders: int) -> Array:
+    """(orders + 1, 6, ...) weights of the knots from -2 to +3 about a place, and their derivatives by it."""
+    powers = fraction[None] ** np.arange(_DEGREE + 1).reshape(-1, *(1,) * fraction.ndim)
+    return np.stack([np.tensordot(_PIECES[order], powers, axes=1) for order in range(orders + 1)])
+
+
+def _pieces() -> Array:
+    """(4, 6, 6) coefficients of the basis and its derivatives: order, knot, power."""
+    basis = PPoly.from_spline(BSpline.basis_element(np.arange(_DEGREE + 2.0), extrapolate=False))
+    table = np.zeros((4, _DEGREE + 1, _DEGREE + 1))
+    start = np.searchsorted(basis.x, np.arange(_DEGREE + 1.0), side="right") - 1
+    for order in range(4):
+        # highest power first; knot j + m about place j + f meets the piece (degree + 1) / 2 - m
+        rising = basis.derivative(order).c[::-1][:, start[::-1]] if order else basis.c[::-1][:, start[::-1]]
+        table[order, :, : len(rising)] = rising.T
+    return table
+
+
+_PIECES = _pieces()

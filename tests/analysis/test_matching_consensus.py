@@ -1,0 +1,98 @@
+"""Consensus of displacements that are made up: wrong ones out, right ones in at the stated rate."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.matching.consensus import consensus
+
+
+def scene(seed, count, wrong, sigma=0.05, height=False):
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(0, 3000, (count, 2))
+    row, column = ((place - 1500) / 1500).T
+    level = rng.uniform(0, 800, count)
+    shift = np.stack([8 + 3 * row - 2 * column * row, -5 + column + 2 * row**2], axis=1)
+    shift[:, 0] += 0.004 * level if height else 0.0
+    bad = rng.random(count) < wrong
+    size = np.broadcast_to(sigma, count)[:, None]
+    found = place + shift + size * rng.standard_normal((count, 2))
+    found[bad] = place[bad] + rng.uniform(-40, 40, (bad.sum(), 2))
+    return place, found, level, bad, shift
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("count", "degree"), [(60, 2), (400, 2), (400, 3)])
+def test_forty_per_cent_wrong(seed, count, degree):
+    """A wrong one lies within 3.7 sigma of 0.05 px by chance once in 60 000; a right one is lost once in 1000.
+
+    Binomial limits, false alarm 1e-5 each; with few points the fit's own error adds to the share.
+    """
+    place, found, _, bad, shift = scene(seed, count, 0.4)
+    result = consensus(place, found, degree=degree, seed=seed)
+    assert (result.accepted & bad).sum() <= 1
+    assert (~result.accepted & ~bad).sum() <= stats.binom.ppf(1 - 1e-5, count, 0.003)
+    # five sigmas of a fit of the right ones where it is worst
+    row, column = ((place[~bad] - 1500) / 1500).T
+    terms = np.stack([row**i * column**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    leverage = np.sum(np.linalg.qr(terms)[0] ** 2, axis=1).max()
+    assert np.abs(result.field(place[~bad]) - shift[~bad]).max() < 5 * 0.05 * np.sqrt(leverage)
+    assert result.scatter == pytest.approx(0.05, rel=0.5 if count == 60 else 0.2)
+    again = consensus(place, found, degree=degree, seed=seed)
+    assert np.array_equal(again.accepted, result.accepted)
+
+
+def test_covariances_weigh_and_scatter_is_what_they_lack():
+    """Sigmas from 0.02 to 0.5 px: at the stated rate none of them is lost for being poor."""
+    sigma = np.random.default_rng(1).uniform(0.02, 0.5, 2000)
+    place, found, _, bad, _ = scene(2, 2000, 0.2, sigma)
+    covariance = sigma[:, None, None] ** 2 * np.eye(2)
+    result = consensus(place, found, covariance=covariance, false_alarm=0.01)
+    lost = (~result.accepted & ~bad).sum()
+    # a scatter estimated slightly above 0 lowers the rate a little
+    low, high = stats.binom.ppf([1e-5, 1 - 1e-5], (~bad).sum(), 0.01)
+    assert 0.5 * low <= lost <= high
+    assert result.scatter < 0.02
+    assert (result.accepted & bad).sum() <= 5
+    # half of the variance is not stated: it is found
+    honest = consensus(place, found, covariance=0.5 * covariance)
+    assert honest.scatter > 0.03
+    assert (~honest.accepted & ~bad).sum() < 0.02 * (~bad).sum()
+
+
+def test_height_takes_parallax():
+    place, found, level, bad, _ = scene(3, 300, 0.3, height=True)
+    with_height = consensus(place, found, height=level)
+    assert with_height.scatter == pytest.approx(0.05, rel=0.25)
+    assert (~with_height.accepted & ~bad).sum() <= 4
+    without = consensus(place, found)
+    assert without.scatter > 0.3
+    with pytest.raises(ValueError, match="heights exactly if"):
+        with_height.field(place)
+
+
+def test_nothing_agrees():
+    rng = np.random.default_rng(4)
+    place = rng.uniform(0, 1000, (200, 2))
+    result = consensus(place, place + rng.uniform(-40, 40, (200, 2)))
+    assert not result.accepted.any()
+    assert "no consensus" in result.text
+
+
+def test_missing_matches_take_no_part_and_bad_input_is_told():
+    place, found, _, bad, _ = scene(5, 100, 0.2)
+    found[:10] = np.nan
+    result = consensus(place, found, degree=1, largest_scatter=5.0)
+    assert not result.accepted[:10].any()
+    assert np.isnan(result.distance[:10]).all()
+    with pytest.raises(ValueError, match="5 usable matches do not carry 6 terms; need 12"):
+        consensus(place[10:15], found[10:15])
+    with pytest.raises(ValueError, match=r"covariances \(100, 2, 2\)"):
+        consensus(place, found, covariance=np.zeros((100, 2)))
+    with pytest.raises(ValueError, match="degree of 0 to 3"):
+        consensus(place, found, degree=4)
+    # an exact field leaves no scatter
+    exact = consensus(place, place + 3.0)
+    assert exact.accepted.all()
+    assert exact.scatter < 1e-8
+    assert not bad.all()

@@ -1,0 +1,214 @@
+"""Least squares matching against textures that are known exactly: accuracy without noise, covariance with it."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.matching.least_squares import least_squares
+from analysis.matching.matches import MatchOptions, Reason, resampled
+from analysis.matching.spline import SplineStack
+from tests.analysis.texture_image import Texture, detected, lattice
+
+SIZE = 570
+PLACES = lattice(18, 28, 47, seed=3)  # windows of 25 px do not overlap: errors are independent
+
+
+@pytest.fixture(scope="module")
+def texture():
+    return Texture(1)
+
+
+@pytest.fixture(scope="module")
+def clean(texture):
+    return texture.grid(np.arange(SIZE), np.arange(SIZE))
+
+
+@pytest.fixture(scope="module")
+def templates(texture):
+    return texture.patches(PLACES)
+
+
+def started(seed=4):
+    return PLACES + np.random.default_rng(seed).uniform(-0.7, 0.7, PLACES.shape)
+
+
+def chi_square(error, covariance):
+    return float(np.einsum("ni,nij,nj->", error, np.linalg.inv(covariance), error))
+
+
+def limits(freedom):
+    """Of chi-square, false alarm 1e-4."""
+    return stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], freedom)
+
+
+def test_shift_without_noise_and_pixel_locking(clean, templates):
+    """What is left is the spline's error for detail up to 0.45 cycles a pixel; it has the period of a pixel."""
+    fits = least_squares(clean, templates, started())
+    assert np.all(fits.reason == Reason.ACCEPTED)
+    error = fits.place - PLACES
+    assert np.abs(error).max() < 0.005
+    phase = PLACES - np.rint(PLACES)
+    for axis in range(2):
+        bins = np.digitize(phase[:, axis], np.linspace(-0.5, 0.5, 11)[1:-1])
+        means = [error[bins == k, axis].mean() for k in range(10)]
+        assert np.abs(means).max() < 0.004
+    # without detail above 0.3 cycles a pixel the spline is better; left is the rim of the template, which it must guess
+    smooth = Texture(5, top=0.3)
+    fits = least_squares(smooth.grid(np.arange(SIZE), np.arange(SIZE)), smooth.patches(PLACES), started())
+    assert np.abs(fits.place - PLACES).max() < 1e-3
+
+
+def test_affine_change_without_noise(texture, templates):
+    matrix = np.array([[1.03, 0.02], [-0.04, 0.98]])
+    shift = np.array([12.3, 20.7])
+    grey = texture.grid(np.arange(SIZE), np.arange(SIZE), matrix=matrix, shift=shift)
+    inside = np.linalg.solve(matrix, (PLACES - shift).T).T
+    used = np.all((inside > 15) & (inside < SIZE - 16), axis=1)
+    assert used.sum() > 250
+    fits = least_squares(0.6 * grey + 40.0, templates[used], inside[used] + 0.4)
+    assert np.all(fits.reason == Reason.ACCEPTED)
+    assert np.abs(fits.place - inside[used]).max() < 0.006
+    # the place's error over half a window of 12 px
+    assert np.abs(fits.affine - matrix).max() < 1e-3
+    # the second derivatives share in the gain: spline error again
+    assert np.abs(fits.gain - 0.6).max() < 0.02
+
+
+@pytest.mark.parametrize(("sharp", "largest"), [((0.45, 0.45), 0.006), ((0.1, 0.4), 0.008), ((0.1, 0.1), 0.008)])
+@pytest.mark.parametrize("sharpness", [True, False])
+def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpness):
+    """An MTF of 0.25 at the limit in the image against others in the template, gain 0.7: with the terms for sharpness
+    still the spline's error; without them chance correlations of slopes and bends, below 0.02 px.
+    """
+    other = 0.7 * texture.patches(PLACES, sharp=sharp) + 90.0
+    fits = least_squares(clean, other, started(), MatchOptions(sharpness=sharpness))
+    error = fits.place - PLACES
+    assert np.all(fits.reason == Reason.ACCEPTED)
+    assert np.abs(error).max() < (largest if sharpness else 0.02)
+    assert np.abs(error.mean(axis=0)).max() < 0.001
+
+
+def test_reference_of_finer_pixels(texture, clean):
+    """Templates resampled from half the pixel, with an MTF of its own, about half a fine pixel off the coarse grid."""
+    fine = 0.5 * texture.grid(
+        np.arange(2 * SIZE), np.arange(2 * SIZE), matrix=0.5 * np.eye(2), shift=(-0.25, -0.25), sharp=(0.7, 0.6)
+    )
+    offset = np.arange(-15, 16.0)
+    rows, columns = np.broadcast_arrays(PLACES[:, 0, None, None] + offset[:, None], PLACES[:, 1, None, None] + offset)
+    other = resampled(fine, 2.0 * (rows + 0.25), 2.0 * (columns + 0.25), smoothing=0.7)
+    fits = least_squares(detected(clean, 11), other, started())
+    plain = least_squares(clean, other, started())
+    assert np.abs(plain.place - PLACES).max() < 0.01
+    assert limits(2 * len(PLACES))[0] < chi_square(fits.place - PLACES, fits.covariance()) < limits(2 * len(PLACES))[1]
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_covariance_with_noise(clean, templates, seed):
+    """Shot noise and 20 electrons of read noise on contrast 120; spline errors are a tenth of the sigma."""
+    fits = least_squares(detected(clean, seed), templates, started())
+    assert np.all(fits.reason == Reason.ACCEPTED)
+    low, high = limits(2 * len(PLACES))
+    assert low < chi_square(fits.place - PLACES, fits.covariance()) < high
+    assert 0.01 < np.sqrt(np.median(fits.covariance()[:, 0, 0])) < 0.03
+    assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
+
+
+def test_covariance_with_a_noisy_template(texture, clean, templates):
+    """Image against image: both are noisy, the second is resampled at other phases, and errors keep in their sigmas."""
+    shift = np.array([0.37, -0.21])
+    second = detected(texture.grid(np.arange(SIZE), np.arange(SIZE), shift=shift), 32)
+    offset = np.arange(-15, 16.0)
+    at = PLACES - shift
+    rows, columns = np.broadcast_arrays(at[:, 0, None, None] + offset[:, None], at[:, 1, None, None] + offset)
+    noisy = resampled(second, rows, columns)
+    image = detected(clean, 31)
+    fits = least_squares(image, noisy, started())
+    low, high = limits(2 * len(PLACES))
+    error = fits.place - PLACES
+    assert low < chi_square(error, fits.covariance()) < high
+    # twice the noise: sqrt(2) times the sigma, a little more for what is not used
+    ratio = np.median(fits.covariance()[:, 0, 0]) / np.median(
+        least_squares(image, templates, started()).covariance()[:, 0, 0]
+    )
+    assert 1.6 < ratio < 3.0
+    # pull towards whole pixels, with its own standard error of 0.0025 px
+    phase = PLACES - np.rint(PLACES)
+    assert np.abs(2 * np.mean(error * np.sin(2 * np.pi * phase), axis=0)).max() < 0.01
+
+
+def test_scatter_reaches_the_bound(texture, clean, templates):
+    """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
+    the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.
+    """
+    image = detected(clean, 41)
+    fits = least_squares(image, templates, started())
+    half = 12
+    offset = np.arange(-half, half + 1)
+    bounds = []
+    for row, column in PLACES:
+        r, c = np.rint(row) + offset, np.rint(column) + offset
+        part = {order: texture.grid(r, c, order=order) for order in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))}
+        dr, dc = np.meshgrid(r - row, c - column, indexing="ij")
+        by_row, by_column = part[1, 0], part[0, 1]
+        columns = [by_row, by_column, by_row * dr, by_row * dc, by_column * dr, by_column * dc]
+        columns += [np.ones_like(by_row), part[0, 0], part[2, 0], part[0, 2]]
+        design = np.stack([x.ravel() for x in columns]) / np.sqrt(part[0, 0].ravel() + 400.0 + 1 / 12)
+        scale = np.linalg.norm(design, axis=1)
+        design /= scale[:, None]
+        inverse = np.linalg.inv(design @ design.T)[:2, :2] / np.outer(scale[:2], scale[:2])
+        bounds.append(inverse)
+    bound = np.array(bounds)
+    low, high = limits(2 * len(PLACES))
+    assert low < chi_square(fits.place - PLACES, bound) < 1.03 * high
+    claimed = np.trace(fits.covariance(), axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
+    # 324 points of some 10 per cent each: 0.6 per cent for the mean
+    assert 0.96 < claimed.mean() < 1.06
+
+
+def test_spline_and_its_derivatives_follow_the_texture():
+    """Band-limited to 0.2 cycles a pixel; the middle of the template, where its rim is forgotten."""
+    smooth = Texture(6, top=0.2)
+    stack = SplineStack(smooth.patches([[100.0, 100.0], [130.0, 90.0]]))
+    rng = np.random.default_rng(7)
+    row, column = rng.uniform(12, 18, (2, 1, 40))
+    values = stack(row, column, np.array([1]), order=3)
+    kinds = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
+    # relative to contrast 120: the spline's order falls by one a derivative
+    bounds = {0: 2e-4, 1: 1e-3, 2: 6e-3, 3: 4e-2}
+    for value, order in zip(values, kinds, strict=True):
+        exact = [
+            smooth.grid([130.0 + r - 15], [90.0 + c - 15], order=order)[0, 0]
+            for r, c in zip(row[0], column[0], strict=True)
+        ]
+        assert np.abs(value[0] - exact).max() < bounds[sum(order)] * 120.0
+
+
+def test_resampling_keeps_knots_and_marks_what_is_missing():
+    image = np.random.default_rng(8).uniform(0, 1, (60, 80))
+    rows, columns = np.mgrid[20:31.0, 30:41.0]
+    assert resampled(image, rows, columns) == pytest.approx(image[20:31, 30:41], abs=1e-12)
+    out = resampled(image, rows - 25.0, columns)
+    assert np.array_equal(np.isnan(out), np.broadcast_to(rows < 25, out.shape))
+    image[25, 35] = np.nan
+    out = resampled(image, rows[None], columns[None] + 0.3)
+    assert np.isnan(out[0, 5, 5])
+    assert np.isnan(out).sum() == 25
+    assert np.isnan(resampled(image, rows + 1000, columns)).all()
+
+
+def test_bad_input_is_told():
+    image, patch = np.zeros((50, 50)), np.zeros((3, 15, 15))
+    with pytest.raises(ValueError, match=r"one band.*|plane of real grey values"):
+        least_squares(np.zeros((5, 5, 3)), patch, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"k odd.*\(3, 14, 14\)"):
+        least_squares(image, np.zeros((3, 14, 14)), np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"need \(3, 2\) places.*\(2, 2\)"):
+        least_squares(image, patch, np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="take 17 px or more"):
+        least_squares(image, patch, np.zeros((3, 2)), MatchOptions(margin=5))
+    with pytest.raises(ValueError, match="largest_sigma must be positive"):
+        MatchOptions(largest_sigma=0.0)
+    with pytest.raises(ValueError, match="does not hold"):
+        MatchOptions(largest_move=3.0)
+    with pytest.raises(ValueError, match=r"grids of one shape"):
+        resampled(image, np.zeros((3, 3)), np.zeros((3, 4)))
