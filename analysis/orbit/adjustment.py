@@ -23,18 +23,19 @@ from analysis.orbit.calibration_parameters import (
     Unknowns,
     index,
 )
-from analysis.orbit.normal_equations import Equations, Weights, assemble
+from analysis.orbit.normal_equations import Equations, State, Weights, assemble
 from analysis.orbit.null_space import Combination, Gauge, combinations, free_basis, null_vectors, solved
-from analysis.orbit.residual_weights import Robust, robust_weights, standardised
+from analysis.orbit.residual_weights import Robust, extrapolated, robust_weights, standardised
 from analysis.orbit.residual_weights import variance_components as components
-from analysis.orbit.three_line_model import LineModel
+from analysis.orbit.shared_noise import SharedNoise
+from analysis.orbit.three_line_model import DRIFT, LineModel
 
 __all__ = ["Adjustment", "Robust", "adjust"]
 
 Array = NDArray[np.float64]
 # A step of this many sigmas ends the iteration, and so does one that rounding keeps from falling further.
 _CONVERGED = 1e-6
-_ROUNDS = 30
+_ROUNDS = 50
 _HUBER_ROUNDS = 6
 _SETTLED = 1e-3
 
@@ -48,11 +49,12 @@ class Adjustment:
             as given times `factors`; zero rows for held unknowns.
         gauge: what was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were
             solved for all the same.
-        cameras: with the adjusted interior.
+        cameras: with the adjusted interior, in the reference state.
         ground: field -> (m, 3) adjusted points. ground_covariance: field -> (m, 3, 3).
         residual: field -> line -> (n, 2) standardised residuals of image points. weight: field -> line -> (n,) robust.
         chi_square, degrees_of_freedom: weighted, points left out do not count.
-        factors: variance group -> estimated factor (1 where not estimated). redundancy: of each group.
+        factors: variance group -> estimated factor (1 where not estimated). redundancy: of each group. Noise that image
+            points share is a group of its own.
         iterations: Gauss-Newton steps in all.
     """
 
@@ -99,6 +101,15 @@ class Adjustment:
         found = [n if n in self.names else f"{field} {n}" for n in ("roll", "pitch", "yaw")]
         return np.array([self.value(n) if n in self.names else 0.0 for n in found])
 
+    def cameras_of(self, field: str) -> dict[str, LineModel]:
+        """Cameras in their state during one field: adjusted interior and, where solved for, drift."""
+        found = {}
+        for line, camera in self.cameras.items():
+            names = [f"{field} {line} {n}" for n in DRIFT]
+            drift = names[0] in self.names
+            found[line] = camera.drifted([self.value(n) for n in names]) if drift else camera
+        return found
+
 
 def adjust(
     fields: Sequence[CalibrationField],
@@ -124,30 +135,35 @@ def adjust(
         priors: pseudo-observations, for example of an on-board monitor of the cameras.
         gauge: how open combinations are closed.
         robust: "huber" takes weight from image points with large residuals, "igg" leaves the worst out.
-        variance_components: estimate a factor on the variances of "image", "control" and each group of priors.
+        variance_components: estimate a factor on the variances of "image", "control", each group of priors and, where
+            image points share them, "attitude", "slow attitude" and "station".
         iterations: most Gauss-Newton steps of one round.
 
     Raises:
         RankError: open combinations that nothing closes.
         CalibrationError: other input that cannot be used, fewer observations than unknowns, no convergence.
     """
-    if not (np.isfinite([noise.image, noise.attitude, noise.station]).all() and noise.image > 0):
-        raise CalibrationError(f"calibration: sigmas must be finite and that of the image positive, found {noise}")
+    noise.check()
     if robust not in (None, "huber", "igg"):
         raise CalibrationError(f"calibration: robust must be huber or igg, found {robust!r}")
     parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
     gauge = gauge or Gauge()
-    problem = _Problem(fields, cameras, parameters, noise, tuple(priors), gauge, iterations)
-    groups = ("image", "control", *dict.fromkeys(p.group for p in priors))
+    shared = SharedNoise.of(fields, noise)
+    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations)
+    groups = ("image", "control", *shared.groups, *dict.fromkeys(p.group for p in priors))
     count = sum(len(r.point) for f in fields for r in f.rays.values())
-    state = _State(parameters.start, [f.ground for f in fields], Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
+    start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
+    state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
     if 2 * count < len(parameters.names) - len(gauge.held) - len(priors):
         raise CalibrationError(
             f"calibration: {count} image points are too few for {len(parameters.names) - len(gauge.held)} unknowns"
         )
+    factors: list[Mapping[str, float]] = []
     for turn in range(_ROUNDS):
         state, equations, covariance = problem.solve(state)
         old = state.weights
+        if not robust and not variance_components:
+            break
         cofactors = equations.image_cofactors(covariance)
         if robust:
             kind: Robust = "huber" if turn < _HUBER_ROUNDS else robust
@@ -155,12 +171,16 @@ def adjust(
             state = replace(state, weights=replace(state.weights, image=image))
         if variance_components:
             factor, _ = components(equations, covariance, cofactors, old, priors)
+            factors.append(factor)
             state = replace(state, weights=replace(state.weights, factor=factor))
         change = float(np.abs(state.weights.image - old.image).max())
         change = max(change, *(abs(state.weights.factor[g] / old.factor[g] - 1.0) for g in groups))
         if change < _SETTLED and not (robust == "igg" and turn < _HUBER_ROUNDS):
             state = replace(state, weights=old)
             break
+        if len(factors) == 3:
+            state = replace(state, weights=replace(state.weights, factor=extrapolated(factors)))
+            factors = []
     else:
         raise CalibrationError(
             f"calibration: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}"
@@ -169,11 +189,10 @@ def adjust(
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    """Where the iteration stands: unknowns (P,), ground points of each field, weights, Gauss-Newton steps so far."""
+class _Iteration:
+    """Where the iteration stands, its weights, Gauss-Newton steps so far."""
 
-    values: Array
-    grounds: list[Array]
+    state: State
     weights: Weights
     steps: int
 
@@ -186,23 +205,24 @@ class _Problem:
     cameras: Mapping[str, LineModel]
     parameters: Parameters
     noise: Noise
+    shared: SharedNoise
     priors: tuple[Prior, ...]
     gauge: Gauge
     iterations: int
 
-    def equations(self, state: _State) -> Equations:
+    def equations(self, at: _Iteration) -> Equations:
         return assemble(
             self.fields,
             self.cameras,
             self.parameters,
-            state.values,
-            state.grounds,
+            at.state,
             self.noise,
             self.priors,
-            state.weights,
+            at.weights,
+            self.shared,
         )
 
-    def solve(self, state: _State) -> tuple[_State, Equations, Array]:
+    def solve(self, state: _Iteration) -> tuple[_Iteration, Equations, Array]:
         """Gauss-Newton with the weights of the state: state, equations there and covariance (P, P)."""
         scale = self.parameters.scale
         equations = self.equations(state)
@@ -212,13 +232,7 @@ class _Problem:
             normal = basis.T @ (scale[:, None] * equations.reduced * scale) @ basis
             step = scale * (basis @ solved(normal, -basis.T @ (scale * equations.right)))
             size = float(np.sqrt(max(float(step @ equations.reduced @ step), 0.0)))
-            moved = np.split(equations.point_step(step), np.cumsum([len(g) for g in state.grounds])[:-1])
-            state = _State(
-                state.values + step,
-                [g + m for g, m in zip(state.grounds, moved, strict=True)],
-                state.weights,
-                state.steps + 1,
-            )
+            state = _Iteration(state.state.moved(equations, step), state.weights, state.steps + 1)
             equations = self.equations(state)
             if size < _CONVERGED or (size < 1e3 * _CONVERGED and size > 0.5 * last):
                 break
@@ -231,7 +245,7 @@ class _Problem:
         spread = scale[:, None] * (basis @ solved(normal, np.eye(len(normal))) @ basis.T) * scale
         return state, equations, 0.5 * (spread + spread.T)
 
-    def result(self, state: _State, equations: Equations, covariance: Array) -> Adjustment:
+    def result(self, state: _Iteration, equations: Equations, covariance: Array) -> Adjustment:
         names, scale = self.parameters.names, self.parameters.scale
         basis, opened = free_basis(equations.reduced, equations.length, scale, names, self.gauge)
         kept = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in self.gauge.held]).tolist()
@@ -251,21 +265,23 @@ class _Problem:
             np.sum(state.weights.image * np.sum(r.image**2, axis=1)) / state.weights.factor["image"]
             + np.sum(r.control**2) / state.weights.factor["control"]
             + np.sum(equations.prior_weight * r.prior**2)
+            + sum(v / state.weights.factor[g] for g, v in r.shared.items())
         )
+        parts = self.parameters.parts
         return Adjustment(
             names=names,
-            values=state.values,
+            values=state.state.values,
             covariance=covariance,
             gauge=self.gauge,
             open=opened,
             weak=weak,
             cameras={
-                k: self.parameters.parts(state.values, f.name, k, c)[0]
+                k: c.with_interior(parts(state.state.values, f.name, k, c)[0].interior)
                 for f in self.fields
                 for k, c in self.cameras.items()
                 if k in f.rays
             },
-            ground={f.name: g for f, g in zip(self.fields, state.grounds, strict=True)},
+            ground={f.name: g for f, g in zip(self.fields, state.state.grounds, strict=True)},
             ground_covariance={f.name: s for f, s in zip(self.fields, spreads, strict=True)},
             residual=self._by_line(standard),
             weight=self._by_line(state.weights.image),

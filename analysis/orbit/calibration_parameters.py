@@ -2,7 +2,9 @@
 
 Names of the unknowns: "forward f", "forward x", "forward y" and so on for each line camera; "Beijing roll", "Beijing
 pitch", "Beijing yaw" for each field, or "roll", "pitch", "yaw" where all fields share one bias; "Beijing offset along",
-"... across", "... down" for a constant error of the orbit during one field, in the field's mean body axes.
+"... across", "... down" for a constant error of the orbit during one field, in the field's mean body axes; "Beijing
+forward d_alpha", "... d_beta", "... d_gamma", "... d_f" for the drift of a camera during one field from its reference
+state, which interior orientation and mounting describe.
 """
 
 from __future__ import annotations
@@ -14,13 +16,23 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.orbit.three_line_model import BIAS, INTERIOR, LineModel, Rays
+from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Rays
 
-__all__ = ["CalibrationError", "CalibrationField", "Noise", "Parameters", "Prior", "Unknowns"]
+__all__ = [
+    "CalibrationError",
+    "CalibrationField",
+    "Noise",
+    "NoiseTerm",
+    "Parameters",
+    "Prior",
+    "Unknowns",
+    "monitor_priors",
+]
 
 Array = NDArray[np.float64]
 OFFSET = ("along", "across", "down")
 _SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.314245])  # WGS84
+_SHORTEST = 1e-3  # of f: half a line that is taken to be at least that long
 _FARTHEST = 12e3  # metres: no land is higher, and geodetic coordinates or kilometres are far beyond
 
 
@@ -29,21 +41,65 @@ class CalibrationError(ValueError):
 
 
 @dataclass(frozen=True)
-class Noise:
-    """Standard deviations of the measurements that are independent from one exposure to the next.
+class NoiseTerm:
+    """One source of noise of attitude or station.
 
     Attributes:
-        image: of an image point in x and in y, metres; x is the image line times the pixel pitch.
-        attitude: of the measured attitude about each body axis, radians.
-        station: of the measured station along each axis, metres.
+        group: variance group.
+        kind: what it acts on.
+        sigma: of a reading, about each body axis in radians or along each axis in metres.
+        interval: of the readings, seconds, that a cubic spline joins; None where each exposure has noise of its own.
+    """
 
-    Attitude and station enter through the model, so each image point gets its own (2, 2) covariance. Points of one line
-    that are exposed at the same time share these errors in truth; here they count as independent.
+    group: str
+    kind: Literal["attitude", "station"]
+    sigma: float
+    interval: float | None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the measurements.
+
+    Attributes:
+        image: of an image point in x and in y, metres; x is the image line times the pixel pitch. Independent. Where
+            rays have a spread of their own it counts in units of this.
+        attitude: of a reading of the attitude about each body axis, radians.
+        station: of a reading of the station along each axis, metres.
+        attitude_interval, station_interval: seconds between readings, at whole multiples of it. A cubic spline joins
+            them, so that rays with known times share errors. None: each exposure has its own.
+        slow_attitude: of slow errors of the attitude, a cubic spline through independent values every `slow_interval`
+            seconds, radians.
     """
 
     image: float
     attitude: float = 0.0
     station: float = 0.0
+    attitude_interval: float | None = None
+    station_interval: float | None = None
+    slow_attitude: float = 0.0
+    slow_interval: float | None = None
+
+    @property
+    def terms(self) -> tuple[NoiseTerm, ...]:
+        """Those of attitude and station that are not zero."""
+        every = (
+            NoiseTerm("attitude", "attitude", self.attitude, self.attitude_interval),
+            NoiseTerm("slow attitude", "attitude", self.slow_attitude, self.slow_interval),
+            NoiseTerm("station", "station", self.station, self.station_interval),
+        )
+        return tuple(t for t in every if t.sigma > 0)
+
+    def check(self) -> None:
+        """Raises CalibrationError for sigmas and intervals that cannot be used."""
+        sigmas = (self.image, self.attitude, self.station, self.slow_attitude)
+        if not (np.isfinite(sigmas).all() and self.image > 0 and min(sigmas) >= 0):
+            raise CalibrationError(
+                f"calibration: sigmas must be finite, that of the image positive and no other negative, found {self}"
+            )
+        intervals = [v for v in (self.attitude_interval, self.station_interval, self.slow_interval) if v is not None]
+        if not all(np.isfinite(v) and v > 0 for v in intervals):
+            raise CalibrationError(f"calibration: intervals must be finite and positive, found {self}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +193,14 @@ class Unknowns:
         interior: f, x and y of every line camera.
         bias: attitude bias, one for each field, one common to all, or none.
         offset: constant error of the orbit of each field, or none.
+        drift: change of every camera during each field against its reference state, or none. It is open against bias
+            and interior unless priors, for example of an on-board monitor, tell it.
     """
 
     interior: bool = True
     bias: Literal["field", "common", "none"] = "field"
     offset: Literal["field", "none"] = "none"
+    drift: Literal["field", "none"] = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +217,22 @@ class Prior:
     group: str = "prior"
 
 
+def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike, group: str = "monitor") -> list[Prior]:
+    """What an on-board monitor of one camera tells of its drift during one field.
+
+    reading, sigma: (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state; where
+    sigma is infinite nothing is told.
+
+    Raises:
+        CalibrationError: other shapes.
+    """
+    values, sigmas = np.asarray(reading, np.float64), np.asarray(sigma, np.float64)
+    if values.shape != (4,) or sigmas.shape != (4,):
+        raise CalibrationError(f"monitor: reading and sigma must be (4,), {', '.join(DRIFT)}")
+    told = zip(DRIFT, values.tolist(), sigmas.tolist(), strict=True)
+    return [Prior({f"{field} {line} {n}": 1.0}, v, s, group) for n, v, s in told if s != np.inf]
+
+
 @dataclass(frozen=True, eq=False)
 class Parameters:
     """The unknowns in order, with start values.
@@ -166,13 +241,14 @@ class Parameters:
         names: of the unknowns.
         start: (P,) start values, metres and radians.
         scale: (P,) the change of each that moves the image by about one metre: 1 for the interior, 1/f rad, range/f m.
-        columns: (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), -1 if fixed.
+        columns: (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), (of d_alpha,
+            d_beta, d_gamma, d_f), -1 if fixed.
     """
 
     names: tuple[str, ...]
     start: Array
     scale: Array
-    columns: Mapping[tuple[str, str], tuple[Array, Array, Array]] = field(repr=False)
+    columns: Mapping[tuple[str, str], tuple[Array, Array, Array, Array]] = field(repr=False)
 
     @classmethod
     def of(
@@ -208,6 +284,12 @@ class Parameters:
             if unknowns.offset == "field":
                 metres = float(np.mean(np.concatenate(reach))) / focal
                 entries |= {f"{one.name} offset {n}": (0.0, metres) for n in OFFSET}
+            if unknowns.drift == "field":
+                for line, rays in one.rays.items():
+                    # d_gamma swings the ends of the line
+                    ends = max(float(np.abs(rays.image[:, 1]).max(initial=0.0)), _SHORTEST * focal)
+                    sizes = (1.0 / focal, 1.0 / focal, 1.0 / ends, 1.0)
+                    entries |= {f"{one.name} {line} {n}": (0.0, s) for n, s in zip(DRIFT, sizes, strict=True)}
         if not entries:
             raise CalibrationError("calibration: nothing to solve for")
         names = tuple(entries)
@@ -224,16 +306,18 @@ class Parameters:
                     [f"{line} {n}" for n in INTERIOR],
                     [n if unknowns.bias == "common" else f"{one.name} {n}" for n in BIAS],
                     [f"{one.name} offset {n}" for n in OFFSET],
+                    [f"{one.name} {line} {n}" for n in DRIFT],
                 )
-                inner, turn, shift = (np.array([where.get(n, -1) for n in g]) for g in groups)
-                columns[one.name, line] = (inner, turn, shift)
+                inner, turn, shift, drift = (np.array([where.get(n, -1) for n in g]) for g in groups)
+                columns[one.name, line] = (inner, turn, shift, drift)
         return cls(names, values, np.array([entries[n][1] for n in names]), columns)
 
     def parts(self, values: Array, name: str, line: str, camera: LineModel) -> tuple[LineModel, Array, Array]:
-        """Camera with its interior, bias (3,) and offset (3,) (field axes) of one line of one field."""
-        inner, turn, shift = self.columns[name, line]
+        """Camera with interior and drift, bias (3,) and offset (3,) (field axes) of one line of one field."""
+        inner, turn, shift, drift = self.columns[name, line]
         bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
-        return (camera.with_interior(values[inner]) if inner[0] >= 0 else camera), bias, offset
+        camera = camera.with_interior(values[inner]) if inner[0] >= 0 else camera
+        return (camera.drifted(values[drift]) if drift[0] >= 0 else camera), bias, offset
 
 
 def index(names: Sequence[str], name: str) -> int:

@@ -1,7 +1,8 @@
 """Forward intersection of points from all rays that see them, without ground control, and its errors at check points.
 
-Each ray weighs by what noise of image, attitude and station does in its image. The covariance is that of this noise;
-errors of the calibration, which all points share, are not in it.
+Each ray weighs by what noise of image, attitude and station does in its image. The covariance is that of this noise,
+for each point by itself: that points exposed within a few readings of the attitude share errors is not in it, and is
+what `strip_adjustment` uses. Errors of the calibration, which all points share, are in neither.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.orbit.calibration_parameters import CalibrationError, Noise, vertical
+from analysis.orbit.shared_noise import ray_covariance
 from analysis.orbit.three_line_model import LineModel, Rays, bias_rotation, misclosure, partials
 
 __all__ = ["CheckErrors", "Intersection", "check_errors", "intersect"]
@@ -64,7 +66,7 @@ def intersect(
 
     Args:
         rays: line -> its image points.
-        cameras: line -> calibrated camera.
+        cameras: line -> calibrated camera, in its state during this pass (`LineModel.drifted`).
         noise: of image, attitude and station.
         bias: (3,) roll, pitch, yaw, radians.
         offset: (3,) of the station, ITRS, metres.
@@ -88,9 +90,7 @@ def intersect(
             used = row.taken(good[row.point])
             shown = ground[used.point]
             by = partials(cameras[line], used, shown, small, shift)
-            spread = noise.image**2 * np.eye(2) + noise.attitude**2 * by.attitude @ np.swapaxes(by.attitude, 1, 2)
-            spread = spread + noise.station**2 * by.ground @ np.swapaxes(by.ground, 1, 2)
-            white = np.linalg.inv(np.linalg.cholesky(spread))
+            white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, used, by, shared=True)))
             design = white @ by.ground
             miss = np.einsum("nij,nj->ni", white, misclosure(cameras[line], used, shown, small, shift))
             np.add.at(normal, used.point, np.swapaxes(design, 1, 2) @ design)
@@ -136,12 +136,7 @@ def _start(
     normal, right = np.zeros((len(good), 3, 3)), np.zeros((len(good), 3))
     for line, row in rays.items():
         camera = cameras[line]
-        f, x0, y0 = camera.interior
-        at = row.image - [x0, y0]
-        square = np.sum(at**2, axis=1)
-        at = at * (1.0 + square * (camera.k1 + camera.k2 * square))[:, None]
-        look = np.column_stack([-at, np.full(len(at), f)]) @ camera.to_body.T @ turn.T
-        look = np.einsum("nij,nj->ni", row.attitude, look / np.linalg.norm(look, axis=1, keepdims=True))
+        look = np.einsum("nij,nj->ni", row.attitude, camera.directions(row.image) @ turn.T)
         origin = row.station + shift + np.einsum("nij,j->ni", row.attitude, turn @ camera.position)
         across = np.eye(3) - look[:, :, None] * look[:, None, :]
         np.add.at(normal, row.point, across)

@@ -1,25 +1,33 @@
-"""Normal equations of a three-line calibration, the ground points eliminated.
+"""Normal equations of a three-line calibration, the ground points and the noise that image points share eliminated.
 
-Rows are whitened by the covariance of their image point: image measurement plus what noise of attitude and station does
-in the image. A ground point meets only its own rays and its control coordinates, so that its (3, 3) block is inverted
-alone and the reduced equations of the unknowns are N_xx - N_xp N_pp^-1 N_px (Schur complement).
+Rows are whitened by the covariance of their image point: image measurement plus what independent noise of attitude and
+station does in the image. Noise that image points share enters as unknowns z with a prior (`shared_noise`). A ground
+point meets only its own rays and its control coordinates, so that its (3, 3) block is inverted alone and the equations
+of the rest are N_yy - N_yp N_pp^-1 N_py (Schur complement). The block of z is sparse then, too; it is factorised and
+eliminated in the same way, and what is left are the equations of the unknowns x.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.sparse.linalg import splu
 
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, index
+from analysis.orbit.shared_noise import SharedNoise, ray_covariance
 from analysis.orbit.three_line_model import LineModel, misclosure, partials
 
-__all__ = ["Equations", "Residuals", "Weights", "assemble"]
+__all__ = ["Equations", "Residuals", "State", "Weights", "assemble"]
 
 Array = NDArray[np.float64]
+_CHUNK = 512
+"""Points or image points whose covariances are made at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,31 +39,59 @@ class Weights:
 
 
 @dataclass(frozen=True, eq=False)
+class State:
+    """Where an iteration stands.
+
+    values: (P,) unknowns. grounds: points (m, 3) of each field. shared: (S,) unknowns of the shared noise.
+    """
+
+    values: Array
+    grounds: tuple[Array, ...]
+    shared: Array
+
+    def moved(self, equations: Equations, step: Array) -> State:
+        """After a step (P,) of the unknowns, all else following."""
+        cuts = np.cumsum([len(g) for g in self.grounds])[:-1]
+        points = np.split(equations.point_step(step), cuts)
+        grounds = tuple(g + d for g, d in zip(self.grounds, points, strict=True))
+        return State(self.values + step, grounds, self.shared + equations.shared_step(step))
+
+
+@dataclass(frozen=True, eq=False)
 class Residuals:
-    """Of the observations, whitened by the a-priori covariances: image (M, 2), control (m, 3), prior (K,)."""
+    """Of the observations, whitened by the a-priori covariances: image (M, 2), control (m, 3), prior (K,).
+
+    shared: group -> sum of squares of its readings' corrections.
+    """
 
     image: Array
     control: Array
     prior: Array
+    shared: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Linearised system at one state.
+    """Linearised system at one state: P unknowns x, S unknowns z of the shared noise, m points p, M image points.
 
     Attributes:
-        design: (2M, P) sparse, by the unknowns, and `design_point` (2M, 3m) by the points: whitened, not weighted.
+        design: (2M, P) sparse by x, design_shared: (2M, S) by z, design_point: (2M, 3m) by p; whitened, not weighted.
         row_weight: (2M,) weight of each row.
         design_prior: (K, P) whitened. prior_weight: (K,).
         control_weight: (3m, 3m) sparse, weights of the control coordinates with the factor; 0 for tie points.
         residuals: at this state.
-        reduced: (P, P) normal matrix with the points eliminated. right: (P,) its negative right side.
-        length: (P,) root of the diagonal, of the image points alone and before the ground points were eliminated.
-        point_inverse: (3m, 3m) sparse block inverse. cross: (3m, P) N_px. right_point: (3m,).
+        reduced: (P, P) normal matrix with z and p eliminated. right: (P,) its negative right side.
+        length: (P,) root of the diagonal, of the image points alone and before anything was eliminated.
+        shared: what z stands for. shared_weight: (S, S) sparse, their prior with the factors. shared_normal: (S, S)
+            sparse, their normal matrix with p eliminated.
+        follow: (S, P) change of z with x. shared_start: (S,) change of z where x stays.
+        point_inverse: (3m, 3m) sparse block inverse. cross: (3m, P + S) N_py. right_point: (3m,).
         movable: (m,) points that are unknown.
+        row_spans, point_spans: first and last + 1 row (of 2M) and coordinate (of 3m) of each field.
     """
 
     design: sparse.csr_matrix
+    design_shared: sparse.csr_matrix
     design_point: sparse.csr_matrix
     row_weight: Array
     design_prior: Array
@@ -65,134 +101,227 @@ class Equations:
     reduced: Array
     right: Array
     length: Array
+    shared: SharedNoise
+    shared_weight: sparse.csr_matrix
+    shared_normal: sparse.csr_matrix
+    follow: Array
+    shared_start: Array
     point_inverse: sparse.bsr_matrix
     cross: sparse.csr_matrix
     right_point: Array
     movable: NDArray[np.bool_]
+    row_spans: tuple[tuple[int, int], ...]
+    point_spans: tuple[tuple[int, int], ...]
+
+    def shared_step(self, step: Array) -> Array:
+        """(S,) change of the shared noise that goes with a change (P,) of the unknowns."""
+        return np.asarray(self.shared_start + self.follow @ step)
 
     def point_step(self, step: Array) -> Array:
         """(m, 3) change of the ground points that goes with a change (P,) of the unknowns."""
-        return np.asarray(-self.point_inverse @ (self.right_point + self.cross @ step)).reshape(-1, 3)
+        change = np.concatenate([step, self.shared_step(step)])
+        return np.asarray(-self.point_inverse @ (self.right_point + self.cross @ change)).reshape(-1, 3)
 
     def through_points(self) -> Array:
-        """(2M, P) change of the rows with the unknowns when the ground points follow."""
-        return (self.design - self.design_point @ (self.point_inverse @ self.cross)).toarray()
+        """(2M, P) change of the rows with the unknowns when shared noise and ground points follow."""
+        by_x, by_z = self._carried
+        fixed = (self.design - self.design_point @ by_x).toarray()
+        return np.asarray(fixed + (self.design_shared - self.design_point @ by_z) @ self.follow)
+
+    @cached_property
+    def shared_inverse(self) -> tuple[Array, ...]:
+        """Covariance (s, s) of the z of each field at known x."""
+        return tuple(_inverse(self.shared_normal[a:b, a:b].toarray()) for a, b in self.shared.spans)
 
     def image_cofactors(self, covariance: Array) -> Array:
         """(M, 2, 2) covariance of the adjusted, whitened image points, from that (P, P) of the unknowns."""
-        followed = self.through_points().reshape(-1, 2, covariance.shape[0])
-        from_points = np.zeros((len(followed), 2, 2))
-        half = (self.design_point @ self.point_inverse).tocsr()
-        for i in range(2):
-            for j in range(2):
-                rows = half[i::2].multiply(self.design_point[j::2]).sum(axis=1)
-                from_points[:, i, j] = np.asarray(rows).ravel()
-        return np.asarray(followed @ covariance @ np.swapaxes(followed, 1, 2) + from_points)
+        followed = self.through_points().reshape(len(self.row_weight) // 2, 2, covariance.shape[0])
+        found = followed @ covariance @ np.swapaxes(followed, 1, 2)
+        found += _products((self.design_point @ self.point_inverse).tocsr(), self.design_point, 2)
+        if self.shared.size:
+            rows = (self.design_shared - self.design_point @ self._carried[1]).tocsr()
+            found += self._of_shared(rows, self.row_spans, 2)
+        return np.asarray(found)
 
     def point_covariance(self, covariance: Array) -> Array:
         """(m, 3, 3) of the adjusted ground points, zero for those that are held."""
-        count = len(self.movable)
-        own = self.point_inverse.toarray().reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count), :]
-        carried = np.asarray((self.point_inverse @ self.cross).toarray()).reshape(count, 3, -1)
-        total = own + carried @ covariance @ np.swapaxes(carried, 1, 2)
+        by_x, by_z = self._carried
+        moved = np.asarray(by_x.toarray() + by_z @ self.follow).reshape(len(self.movable), 3, len(covariance))
+        total = self.point_inverse.data + moved @ covariance @ np.swapaxes(moved, 1, 2)
+        if self.shared.size:
+            total = total + self._of_shared(by_z, self.point_spans, 3)
         return np.where(self.movable[:, None, None], total, 0.0)
+
+    def shared_redundancy(self, covariance: Array) -> dict[str, float]:
+        """Group -> how many of its readings the image points check."""
+        taken = np.zeros(self.shared.size)
+        for (a, b), inverse in zip(self.shared.spans, self.shared_inverse, strict=True):
+            found = inverse + self.follow[a:b] @ covariance @ self.follow[a:b].T
+            taken[a:b] = np.asarray(self.shared_weight[a:b, a:b].multiply(found).sum(axis=1)).ravel()
+        return {g: float(len(c) - np.sum(taken[c])) for g, c in self.shared.groups.items()}
+
+    @cached_property
+    def _carried(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+        """(3m, P) and (3m, S): the points move by their negative with x and z."""
+        both, count = (self.point_inverse @ self.cross).tocsc(), self.design.shape[1]
+        return both[:, :count].tocsr(), both[:, count:].tocsr()
+
+    def _of_shared(self, rows: sparse.csr_matrix, spans: Sequence[tuple[int, int]], size: int) -> Array:
+        """Diagonal blocks (n, size, size) of rows (n size, S) times the covariance of z at known x times rows'."""
+        found = np.zeros((rows.shape[0] // size, size, size))
+        for (first, last), (a, b), inverse in zip(spans, self.shared.spans, self.shared_inverse, strict=True):
+            if b == a:
+                continue
+            values, columns = _padded(rows[first:last, a:b].tocoo(), size)
+            for begin in range(0, len(values), _CHUNK):
+                some, where = values[begin : begin + _CHUNK], columns[begin : begin + _CHUNK]
+                spread = inverse[where[:, :, None], where[:, None, :]]
+                found[first // size + begin :][: len(some)] = some @ spread @ np.swapaxes(some, 1, 2)
+        return found
 
 
 def assemble(
     fields: Sequence[CalibrationField],
     cameras: Mapping[str, LineModel],
     parameters: Parameters,
-    values: Array,
-    grounds: Sequence[Array],
+    state: State,
     noise: Noise,
     priors: Sequence[Prior],
     weights: Weights,
+    shared: SharedNoise,
 ) -> Equations:
-    """Linearise at values (P,) and ground points (each (m, 3)).
+    """Linearise at a state.
 
-    Image rows run by field, line and ray, x before y; points by field.
+    Image rows run by field, line and ray, x before y; points and shared unknowns by field.
     """
-    count = len(values)
-    rows, points, misses, places = [], [], [], []
-    first = 0
-    for one, ground in zip(fields, grounds, strict=True):
-        axes = one.axes
-        for line, rays in one.rays.items():
-            camera, bias, offset = parameters.parts(values, one.name, line, cameras[line])
+    count = len(state.values)
+    rows, points, misses, places, shares = [], [], [], [], []
+    spans: list[list[tuple[int, int]]] = [[], []]
+    first = row = 0
+    for one, ground in zip(fields, state.grounds, strict=True):
+        axes, begin = one.axes, row
+        for line, measured in one.rays.items():
+            rays = shared.corrected(one.name, line, measured, state.shared)
+            camera, bias, offset = parameters.parts(state.values, one.name, line, cameras[line])
             shown, moved = ground[rays.point], axes @ offset
             by = partials(camera, rays, shown, bias, moved)
-            spread = noise.image**2 * np.eye(2) + noise.attitude**2 * by.attitude @ np.swapaxes(by.attitude, 1, 2)
-            spread = spread + noise.station**2 * by.ground @ np.swapaxes(by.ground, 1, 2)
-            white = np.linalg.inv(np.linalg.cholesky(spread))
+            white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, rays, by, shared=False)))
             block = np.zeros((len(rays.point), 2, count))
-            inner, turn, shift = parameters.columns[one.name, line]
-            for where, part in ((inner, by.interior), (turn, by.bias), (shift, -by.ground @ axes)):
+            parts = (by.interior, by.bias, -by.ground @ axes, by.drift)
+            for where, part in zip(parameters.columns[one.name, line], parts, strict=True):
                 if where[0] >= 0:
                     block[:, :, where] = part
-            rows.append(sparse.csr_matrix((white @ block).reshape(-1, count)))
+            rows.append(sparse.csr_matrix((white @ block).reshape(2 * len(block), count)))
+            shares.append(shared.rows(one.name, line, white, by))
             points.append(white @ by.ground)
             misses.append(np.einsum("nij,nj->ni", white, misclosure(camera, rays, shown, bias, moved)))
             places.append(first + rays.point)
+            row += 2 * len(rays.point)
+        spans[0].append((begin, row))
+        spans[1].append((3 * first, 3 * (first + len(ground))))
         first += len(ground)
-    return _reduce(fields, grounds, parameters, values, priors, weights, (rows, points, misses, places))
+    found = _Rows(
+        sparse.vstack(rows).tocsr(),
+        sparse.vstack(shares).tocsr(),
+        np.concatenate(points),
+        np.concatenate(misses),
+        np.concatenate(places),
+        (tuple(spans[0]), tuple(spans[1])),
+    )
+    return _reduce(fields, state, found, _priors(parameters, state.values, priors, weights), weights, shared)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Whitened rows: by x (2M, P), z (2M, S) and the point (M, 2, 3); misclosures (M, 2); which point (M,); spans."""
+
+    design: sparse.csr_matrix
+    design_shared: sparse.csr_matrix
+    point: Array
+    miss: Array
+    place: NDArray[np.intp]
+    spans: tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]]
 
 
 def _reduce(
     fields: Sequence[CalibrationField],
-    grounds: Sequence[Array],
-    parameters: Parameters,
-    values: Array,
-    priors: Sequence[Prior],
+    state: State,
+    rows: _Rows,
+    prior: tuple[Array, Array, Array],
     weights: Weights,
-    parts: tuple[list[sparse.csr_matrix], list[Array], list[Array], list[NDArray[np.intp]]],
+    shared: SharedNoise,
 ) -> Equations:
-    rows, points, misses, places = parts
-    design = sparse.vstack(rows).tocsr()
-    miss, place, point = np.concatenate(misses), np.concatenate(places), np.concatenate(points)
     exact = np.concatenate([f.control & ~np.any(f.covariance, axis=(1, 2)) for f in fields])
     control = np.concatenate([f.control for f in fields]) & ~exact
-    total = len(exact)
-    point = np.where(exact[place][:, None, None], 0.0, point)
+    total, count = len(exact), rows.design.shape[1]
+    point = np.where(exact[rows.place][:, None, None], 0.0, rows.point)
     # one (2, 3) block for each image point
-    blocks = sparse.bsr_matrix((point, place, np.arange(len(place) + 1)), shape=(2 * len(place), 3 * total))
-    design_point = blocks.tocsr()
+    pattern = (point, rows.place, np.arange(len(rows.place) + 1))
+    design_point = sparse.bsr_matrix(pattern, shape=(2 * len(rows.place), 3 * total)).tocsr()
     row_weight = np.repeat(weights.image, 2) / weights.factor.get("image", 1.0)
-    spread = np.concatenate([f.covariance for f in fields])
     inverse = np.zeros((total, 3, 3))
-    inverse[control] = np.linalg.inv(spread[control])
-    departure = np.concatenate([g - f.ground for g, f in zip(grounds, fields, strict=True)])
+    inverse[control] = np.linalg.inv(np.concatenate([f.covariance for f in fields])[control])
+    departure = np.concatenate([g - f.ground for g, f in zip(state.grounds, fields, strict=True)])
     control_residual = np.einsum("nji,nj->ni", _root(inverse, control), departure)
     held = _blocks(inverse * (1.0 / weights.factor.get("control", 1.0)))
-    design_prior, prior_residual, prior_weight = _priors(parameters, values, priors, weights)
-    weighted = sparse.diags(row_weight) @ design
+    every = sparse.hstack([rows.design, rows.design_shared]).tocsr()
+    weighted = (sparse.diags(row_weight) @ every).tocsr()
     cross = (design_point.T @ weighted).tocsr()
-    own = sparse.bsr_matrix(design_point.T @ (sparse.diags(row_weight) @ design_point) + held, blocksize=(3, 3))
-    own_blocks = _diagonal_blocks(own, total)
+    own_blocks = _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total) + held.data
     own_blocks[exact] = np.eye(3)
     try:
         point_inverse = _blocks(np.asarray(np.linalg.inv(own_blocks), np.float64))
     except np.linalg.LinAlgError:
         raise CalibrationError("calibration: too few good rays are left at a tie point") from None
-    right_point = design_point.T @ (row_weight * miss.ravel()) + held @ departure.ravel()
-    seen = (design.T @ weighted).toarray()
-    full = seen + design_prior.T @ (prior_weight[:, None] * design_prior)
-    right = weighted.T @ miss.ravel() + design_prior.T @ (prior_weight * prior_residual)
-    reduced = full - (cross.T @ (point_inverse @ cross)).toarray()
+    miss = rows.miss.ravel()
+    right_point = np.asarray(design_point.T @ (row_weight * miss) + held @ departure.ravel())
+    normal = (every.T @ weighted - cross.T @ (point_inverse @ cross)).tocsc()
+    right = np.asarray(weighted.T @ miss - cross.T @ (point_inverse @ right_point))
+    design_prior, prior_residual, prior_weight = prior
+    reduced = normal[:count, :count].toarray() + design_prior.T @ (prior_weight[:, None] * design_prior)
+    right_x = right[:count] + design_prior.T @ (prior_weight * prior_residual)
+    scale = np.ones(shared.size)
+    for group, columns in shared.groups.items():
+        scale[columns] = 1.0 / weights.factor.get(group, 1.0)
+    prior_shared = (sparse.diags(scale) @ shared.precision).tocsr()
+    departed = shared.precision @ state.shared
+    normal_shared = (normal[count:, count:] + prior_shared).tocsc()
+    follow, shared_start = np.zeros((0, count)), np.zeros(0)
+    if shared.size:
+        mixed = normal[count:, :count].toarray()
+        factor = splu(normal_shared, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        shared_start = -factor.solve(right[count:] + scale * departed)
+        follow = -factor.solve(mixed) if count else np.zeros((shared.size, 0))
+        reduced, right_x = reduced + mixed.T @ follow, right_x + mixed.T @ shared_start
+    seen = weighted[:, :count].multiply(rows.design)
     return Equations(
-        design=design,
+        design=rows.design,
+        design_shared=rows.design_shared,
         design_point=design_point,
         row_weight=row_weight,
         design_prior=design_prior,
         prior_weight=prior_weight,
         control_weight=held.tocsr(),
-        residuals=Residuals(miss, control_residual, prior_residual),
+        residuals=Residuals(
+            rows.miss,
+            control_residual,
+            prior_residual,
+            {g: float(state.shared[c] @ departed[c]) for g, c in shared.groups.items()},
+        ),
         reduced=0.5 * (reduced + reduced.T),
-        right=np.asarray(right - cross.T @ (point_inverse @ right_point)),
-        length=np.sqrt(np.diag(seen)),
+        right=right_x,
+        length=np.sqrt(np.asarray(seen.sum(axis=0)).ravel()),
+        shared=shared,
+        shared_weight=prior_shared,
+        shared_normal=normal_shared.tocsr(),
+        follow=follow,
+        shared_start=shared_start,
         point_inverse=point_inverse,
         cross=cross,
-        right_point=np.asarray(right_point),
+        right_point=right_point,
         movable=~exact,
+        row_spans=rows.spans[0],
+        point_spans=rows.spans[1],
     )
 
 
@@ -224,8 +353,43 @@ def _blocks(blocks: Array) -> sparse.bsr_matrix:
     return sparse.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
 
 
-def _diagonal_blocks(matrix: sparse.bsr_matrix, count: int) -> Array:
+def _inverse(matrix: Array) -> Array:
+    """Inverse of a positive definite matrix."""
+    if not len(matrix):
+        return matrix
+    root, failed = dpotrf(matrix, lower=1, clean=1)
+    half, wrong = dpotri(root, lower=1)  # zero above the diagonal, as the root is
+    if failed or wrong:
+        raise CalibrationError("calibration: the shared noise cannot be solved for; are its sigmas of the right size?")
+    half[np.diag_indices(len(half))] *= 0.5
+    return np.asarray(half + half.T)
+
+
+def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: int) -> Array:
+    """(m, 3, 3) normal matrices of the points from the (M, 2, 3) blocks of their image points."""
     blocks = np.zeros((count, 3, 3))
-    row = np.repeat(np.arange(count), np.diff(matrix.indptr))
-    blocks[row[row == matrix.indices]] = matrix.data[row == matrix.indices]
+    np.add.at(blocks, place, weight[:, None, None] * (np.swapaxes(point, 1, 2) @ point))
     return blocks
+
+
+def _padded(rows: sparse.coo_matrix, size: int) -> tuple[Array, NDArray[np.intp]]:
+    """Sparse rows (n size, K), taken by `size`: values (n, size, w) of the columns (n, w) that any of them meets."""
+    count, width = rows.shape[0] // size, rows.shape[1]
+    key = (rows.row // size).astype(np.int64) * width + rows.col
+    used, slot = np.unique(key, return_inverse=True)
+    group = used // width
+    place = np.arange(len(used)) - np.searchsorted(group, group)
+    most = int(place.max(initial=0)) + 1
+    values, columns = np.zeros((count, size, most)), np.zeros((count, most), np.intp)
+    values[rows.row // size, rows.row % size, place[slot]] = rows.data
+    columns[group, place] = used % width
+    return values, columns
+
+
+def _products(left: sparse.csr_matrix, right: sparse.csr_matrix, size: int) -> Array:
+    """Diagonal blocks (n, size, size) of left right', both (n size, K)."""
+    found = np.empty((left.shape[0] // size, size, size))
+    for i in range(size):
+        for j in range(size):
+            found[:, i, j] = np.asarray(left[i::size].multiply(right[j::size]).sum(axis=1)).ravel()
+    return found

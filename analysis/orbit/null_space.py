@@ -9,6 +9,8 @@ starts with. Below `WEAK` it is reported. What opens in a three-line camera:
 - Orbit offsets against bias and interior: broken by relief and by the curvature of the Earth, a thousandth.
 - Roll against y of all lines, yaw against y of the outer ones: broken by the turn of the outer lines about their line
   of sight, so weak or correlated, not open.
+- Drift of the cameras in each field, unless a monitor tells it: d_alpha, d_beta and d_f of one line in all fields
+  against its x, y and f; d_alpha, d_beta and d_gamma of all lines in one field against the bias of that field.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from analysis.orbit.calibration_parameters import CalibrationError, index
+from analysis.orbit.three_line_model import BIAS, DRIFT
 
 __all__ = [
     "OPEN",
@@ -43,6 +46,7 @@ WEAK = 3e-2
 # Image motion: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as without any calibration (paper 003: 100 m class).
 WORST = 1e-4
 _SHOWN = 1e-2
+_ANGLES = (*BIAS, *DRIFT[:3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +192,6 @@ def _echelon(rows: Array) -> Array:
 def _shown(name: str, change: float) -> str:
     if "offset" in name:
         return f"{name} {change:+.4g} m"
-    if name.split()[-1] in ("roll", "pitch", "yaw"):
+    if name.split()[-1] in _ANGLES:
         return f"{name} {np.degrees(change) * 3600:+.4g} arcsec"
     return f"{name} {change * 1e3:+.4g} mm"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from analysis.orbit.calibration_parameters import Prior
 from analysis.orbit.normal_equations import Equations, Weights
 
-__all__ = ["HUBER", "REJECT", "Robust", "robust_weights", "standardised", "variance_components"]
+__all__ = ["HUBER", "REJECT", "Robust", "extrapolated", "robust_weights", "standardised", "variance_components"]
 
 Array = NDArray[np.float64]
 Robust = Literal["huber", "igg"]
@@ -24,6 +24,7 @@ REJECT = float(np.sqrt(chi2.isf(1e-4, 2)))
 _LEAST_REDUNDANCY = 10.0
 # A part of an image point that no other observation checks has no residual to standardise.
 _UNCHECKED = 1e-6
+_LARGEST_RATIO = 0.9
 
 
 def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Array:
@@ -75,8 +76,24 @@ def variance_components(
         member = np.array([p.group == group for p in priors])
         square[group] = float(np.sum((equations.prior_weight * residuals.prior**2)[member]))
         redundancy[group] = float(np.sum(1.0 - own[member]))
+    square |= {g: v / factor[g] for g, v in residuals.shared.items()}
+    redundancy |= equations.shared_redundancy(covariance)
     new = {
         g: float(factor[g] * square[g] / redundancy[g]) if redundancy[g] >= _LEAST_REDUNDANCY else float(factor[g])
         for g in square
     }
     return new, redundancy
+
+
+def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Where three rounds of variance factors lead to, by Aitken's rule in the logarithm.
+
+    Factors of groups that check each other creep: rounds leave up to nine tenths of the way.
+    """
+    found = {}
+    for group in factors[-1]:
+        first, middle, last = (float(np.log(max(f[group], 1e-300))) for f in factors)
+        ratio = (last - middle) / (middle - first) if middle != first else 0.0
+        ratio = min(max(ratio, 0.0), _LARGEST_RATIO)
+        found[group] = float(np.exp(last + (last - middle) * ratio / (1.0 - ratio)))
+    return found

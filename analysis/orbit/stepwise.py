@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
-from analysis.orbit.normal_equations import Weights, assemble
+from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import free_basis, solved
+from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
 
 __all__ = ["Stepwise", "stepwise"]
@@ -84,9 +85,10 @@ def stepwise(
     if not all(len(b) for b in blocks):
         raise CalibrationError("stepwise calibration: needs unknowns of the attitude and of the interior")
     weights = Weights(np.ones(sum(len(r.point) for f in fields for r in f.rays.values())), {"image": 1.0})
-    values, grounds = parameters.start, [f.ground for f in fields]
-    cuts = np.cumsum([len(g) for g in grounds])[:-1]
-    equations = assemble(fields, cameras, parameters, values, grounds, noise, priors, weights)
+    noise.check()
+    common = SharedNoise.of(fields, noise)
+    state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(common.size))
+    equations = assemble(fields, cameras, parameters, state, noise, priors, weights, common)
     sigma = np.zeros(len(names))
     for b in blocks:
         normal = equations.reduced[np.ix_(b, b)]
@@ -98,15 +100,13 @@ def stepwise(
         most = 1 if len(sizes) < _RELINEARISED else rounds - len(sizes)
         step, taken = _alternate(equations.reduced, equations.right, blocks, sigma, tolerance, most)
         sizes += taken
-        values = values + step
-        moved = np.split(equations.point_step(step), cuts)
-        grounds = [g + m for g, m in zip(grounds, moved, strict=True)]
-        equations = assemble(fields, cameras, parameters, values, grounds, noise, priors, weights)
+        state = state.moved(equations, step)
+        equations = assemble(fields, cameras, parameters, state, noise, priors, weights, common)
         converged = len(taken) == 1 and taken[0] < tolerance
     shared = _canonical_squares(equations.reduced, *blocks)
     return Stepwise(
         names=names,
-        values=values,
+        values=state.values,
         converged=converged,
         steps=np.array(sizes),
         conditional_sigma=sigma,

@@ -13,19 +13,24 @@ image is the real one: a point at +y sees the scene at -Y. x is the place of the
 0: the measurement of the image line is in the exposure time. An error of one line acts as an error of one pixel in x at
 nadir, where lines are spaced as pixels are, and of cos^2 of the look angle (0.82) in the outer lines.
 
+A camera that has drifted since its reference state is turned in its own axes, R_camera Rx(d_beta) Ry(d_alpha)
+Rz(d_gamma), and sees with f + d_f: d_gamma is a turn about the line of sight, + d_alpha moves it toward +X, + d_beta
+toward -Y.
+
 R_bias = Rx(roll) Ry(pitch) Rz(yaw) about the body's axes. `misclosure` is analytic in all arguments, so that a complex
 step through it gives derivatives to rounding; `partials` has them in closed form.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
     "BIAS",
+    "DRIFT",
     "INTERIOR",
     "LineModel",
     "Partials",
@@ -39,6 +44,8 @@ __all__ = [
 Array = NDArray[np.float64]
 INTERIOR = ("f", "x", "y")
 BIAS = ("roll", "pitch", "yaw")
+DRIFT = ("d_alpha", "d_beta", "d_gamma", "d_f")
+_DRIFT_AXIS = (1, 0, 2)
 _NEXT = ((1, 2), (2, 0), (0, 1))
 
 
@@ -51,6 +58,7 @@ class LineModel:
         interior: (3,) principal distance f and principal point x0, y0, metres.
         position: (3,) projection centre in the body frame, metres.
         k1, k2: radial distortion, 1/m^2 and 1/m^4.
+        drift: (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres) against that state; zero in the reference state.
     """
 
     to_body: Array
@@ -58,6 +66,7 @@ class LineModel:
     position: Array
     k1: float = 0.0
     k2: float = 0.0
+    drift: Array = field(default_factory=lambda: np.zeros(4))
 
     @classmethod
     def of(
@@ -77,6 +86,41 @@ class LineModel:
         """The same camera with another f, x0, y0."""
         return replace(self, interior=np.array(interior, np.float64))
 
+    def drifted(self, drift: ArrayLike) -> LineModel:
+        """The same camera in another state: (4,) d_alpha, d_beta, d_gamma, d_f against the reference state.
+
+        It replaces an earlier drift. Raises ValueError for another shape.
+        """
+        change = np.asarray(drift)
+        if change.shape != (4,):
+            raise ValueError(f"line model: a drift is (4,) {', '.join(DRIFT)}, found {change.shape}")
+        return replace(self, drift=change)
+
+    @property
+    def axes(self) -> Array:
+        """(3, 3) rotation from the axes of the drifted camera to the body's."""
+        return np.asarray(self.to_body @ self._turned())
+
+    @property
+    def focal_length(self) -> Array:
+        """Principal distance of the drifted camera, metres."""
+        return np.asarray(self.interior[0] + self.drift[3])
+
+    def directions(self, image: Array) -> Array:
+        """(n, 3) unit vectors in the body frame that image points (n, 2) look along."""
+        at = image - self.interior[1:]
+        square = np.sum(at**2, axis=1)
+        at = at * (1.0 + square * (self.k1 + self.k2 * square))[:, None]
+        look = np.column_stack([-at, np.full(len(at), self.focal_length)]) @ self.axes.T
+        return np.asarray(look / np.linalg.norm(look, axis=1, keepdims=True))
+
+    def _turned(self, slope: int | None = None) -> Array:
+        """Rx(d_beta) Ry(d_alpha) Rz(d_gamma), or its derivative by one of DRIFT."""
+        chain: list[np.ndarray] = [np.eye(3)] * 3
+        for k, axis in enumerate(_DRIFT_AXIS):
+            chain[axis] = _turn_slope(axis, self.drift[k]) if k == slope else _turn(axis, self.drift[k])
+        return np.asarray(chain[0] @ chain[1] @ chain[2])
+
 
 @dataclass(frozen=True, eq=False)
 class Rays:
@@ -87,23 +131,34 @@ class Rays:
         image: (n, 2) x and y in the focal plane, metres, counted from the line's centre.
         station: (n, 3) of the body's origin, ITRS, metres.
         attitude: (n, 3, 3) body to ITRS.
+        time: (n,) of the exposures, seconds, on the scale of the readings of attitude and station; None where unknown,
+            the rays' noise then counts as independent.
     """
 
     point: NDArray[np.intp]
     image: Array
     station: Array
     attitude: Array
+    time: Array | None = None
 
     @classmethod
-    def of(cls, point: ArrayLike, image: ArrayLike, station: ArrayLike, attitude: ArrayLike) -> Rays:
+    def of(
+        cls,
+        point: ArrayLike,
+        image: ArrayLike,
+        station: ArrayLike,
+        attitude: ArrayLike,
+        time: ArrayLike | None = None,
+    ) -> Rays:
         """Raises ValueError for shapes that do not match, values that are not finite, points shown twice."""
         which = np.array(point)
         if which.ndim != 1 or (which.size and not np.issubdtype(which.dtype, np.integer)):
             raise ValueError("rays: point must be a row of whole numbers")
         n = len(which)
-        rows = [np.array(v, np.float64) for v in (image, station, attitude)]
-        shapes = [(n, 2), (n, 3), (n, 3, 3)]
-        for what, row, shape in zip(("image", "station", "attitude"), rows, shapes, strict=True):
+        moments = np.zeros(n) if time is None else time
+        rows = [np.array(v, np.float64) for v in (image, station, attitude, moments)]
+        shapes = [(n, 2), (n, 3), (n, 3, 3), (n,)]
+        for what, row, shape in zip(("image", "station", "attitude", "time"), rows, shapes, strict=True):
             if row.shape != shape:
                 raise ValueError(f"rays: {what} must be {shape} for {n} points, found {row.shape}")
             bad = np.flatnonzero(~np.isfinite(row.reshape(n, -1)).all(axis=1))
@@ -111,24 +166,28 @@ class Rays:
                 raise ValueError(f"rays: {what} of ray {bad[0]} is not finite; leave out what was not measured")
         if len(np.unique(which)) != n:
             raise ValueError("rays: a point appears twice in one line")
-        return cls(which.astype(np.intp), *rows)
+        places, stations, attitudes, times = rows
+        return cls(which.astype(np.intp), places, stations, attitudes, None if time is None else times)
 
     def taken(self, keep: ArrayLike) -> Rays:
         """Some of the rays, by mask or index."""
         where = np.asarray(keep)
-        return Rays(self.point[where], self.image[where], self.station[where], self.attitude[where])
+        time, spread = (None if v is None else v[where] for v in (self.time, self.spread))
+        return Rays(self.point[where], self.image[where], self.station[where], self.attitude[where], time, spread)
 
 
 @dataclass(frozen=True, eq=False)
 class Partials:
     """Derivatives of `misclosure`, (n, 2, 3): interior by f, x0, y0; bias by roll, pitch, yaw; ground by the point
-    (by the station: its negative); attitude by a small turn of the measured attitude about the body's axes.
+    (by the station: its negative); attitude by a small turn of the measured attitude about the body's axes; drift,
+    (n, 2, 4), by d_alpha, d_beta, d_gamma, d_f.
     """
 
     interior: Array
     bias: Array
     ground: Array
     attitude: Array
+    drift: Array
 
 
 def look_rotation(look: float) -> Array:
@@ -147,9 +206,9 @@ def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset
 
     ground: (n, 3) of each ray's point, ITRS. bias: (3,) radians. offset: (3,) of the station, ITRS, metres.
     """
-    f, x0, y0 = camera.interior
+    f, (x0, y0) = camera.focal_length, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
-    seen = (q @ bias_rotation(bias) - camera.position) @ camera.to_body
+    seen = (q @ bias_rotation(bias) - camera.position) @ camera.axes
     x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
     square = x * x + y * y
     grown = 1.0 + square * (camera.k1 + camera.k2 * square)
@@ -162,10 +221,11 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     Raises:
         ValueError: a ground point behind a camera.
     """
-    f, x0, y0 = camera.interior
+    f, (x0, y0) = camera.focal_length, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     turn = bias_rotation(bias)
-    a, b, c = ((q @ turn - camera.position) @ camera.to_body).T
+    mounted = (q @ turn - camera.position) @ camera.to_body
+    a, b, c = (mounted @ camera._turned()).T
     if np.any(c <= 0):
         raise ValueError("three-line model: a ground point lies behind a camera")
     x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
@@ -177,7 +237,7 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     interior = np.stack([np.stack([a / c, b / c], axis=-1), by_x, by_y], axis=-1)
     zero = np.zeros_like(c)
     image = f * np.stack([np.stack([1 / c, zero, -a / c**2], -1), np.stack([zero, 1 / c, -b / c**2], -1)], axis=1)
-    to_body = image @ camera.to_body.T  # by the point in the body frame of the true attitude
+    to_body = image @ camera.axes.T  # by the point in the body frame of the true attitude
     roll, pitch, yaw = bias
     turned = []
     for axis in range(3):
@@ -186,11 +246,13 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
         turned.append(q @ (chain[0] @ chain[1] @ chain[2]))
     to_measured = to_body @ turn.T  # by the point in the body frame of the measured attitude
     spun = np.stack([np.cross(q, axis) for axis in np.eye(3)], axis=-1)
+    swung = np.stack([mounted @ camera._turned(k) for k in range(3)], axis=-1)
     return Partials(
         interior=interior,
         bias=to_body @ np.stack(turned, axis=-1),
         ground=to_measured @ np.swapaxes(rays.attitude, 1, 2),
         attitude=to_measured @ spun,
+        drift=np.concatenate([image @ swung, interior[:, :, :1]], axis=2),
     )
 
 

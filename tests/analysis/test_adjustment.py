@@ -10,9 +10,10 @@ from scipy import stats
 from analysis.orbit.adjustment import adjust
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, Unknowns
 from analysis.orbit.forward_intersection import check_errors, intersect
-from analysis.orbit.normal_equations import Weights, assemble
+from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import Gauge, RankError
 from analysis.orbit.residual_weights import REJECT
+from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.stepwise import stepwise
 from tests.analysis.test_three_line_model import (
     ARCSEC,
@@ -116,8 +117,9 @@ def test_covariance_is_that_of_the_full_system():
     found = adjust([field], LABORATORY, NOISE, gauge=HOLD_XY)
     parameters = Parameters.of([field], LABORATORY, Unknowns())
     weights = Weights(np.ones(36), {"image": 1.0})
-    ground = [found.ground["Beijing"]]
-    at = assemble([field], LABORATORY, parameters, found.values, ground, NOISE, (), weights)
+    state = State(found.values, (found.ground["Beijing"],), np.zeros(0))
+    shared = SharedNoise.of([field], NOISE)
+    at = assemble([field], LABORATORY, parameters, state, NOISE, (), weights, shared)
     design = np.hstack([at.design.toarray(), at.design_point.toarray()])
     normal = design.T @ design
     normal[12:, 12:] += at.control_weight.toarray()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise
@@ -91,16 +92,22 @@ def field_points(rng, count, node, relief=2000.0, half=26e3, plane=False):
     return direction * (6378137.0 * (1 - sine**2 / 298.257) + height)[:, None]
 
 
-def observe(points, node, true_cameras, bias=(0, 0, 0), offset=(0, 0, 0)):
-    """Exact exposure times and image places of points: Newton on the angle between look and point."""
+def observe(points, node, true_cameras, bias=(0, 0, 0), offset=(0, 0, 0), drift=None):
+    """Exact exposure times and image places of points: Newton on the angle between look and point.
+
+    drift: line -> d_alpha, d_beta, d_gamma, d_f.
+    """
     turn = Rotation.from_euler("XYZ", bias).as_matrix()
     times, places = {}, {}
     for line, camera in true_cameras.items():
+        d_alpha, d_beta, d_gamma, d_f = (drift or {}).get(line, np.zeros(4))
+        mount = mounting(line) @ Rotation.from_euler("XYZ", [d_beta, d_alpha, d_gamma]).as_matrix()
+        camera = camera.with_interior(camera.interior + np.array([d_f, 0.0, 0.0]))
 
-        def gap(time, y, line=line, camera=camera):
+        def gap(time, y, line=line, camera=camera, mount=mount):
             station, attitude = orbit(node, time)
             station = station + offset + np.einsum("nij,j->ni", attitude, turn @ camera.position)
-            seen = np.einsum("nji,nj->ni", attitude @ turn, points - station) @ mounting(line)
+            seen = np.einsum("nji,nj->ni", attitude @ turn, points - station) @ mount
             there = look(line, y, camera) @ mounting(line)
             return seen[:, :2] / seen[:, 2:] - there[:, :2] / there[:, 2:]
 
@@ -118,19 +125,36 @@ def observe(points, node, true_cameras, bias=(0, 0, 0), offset=(0, 0, 0)):
 
 
 def make_rays(seen, rng=None, noise=None):
-    """Rays of a pass as they are measured: x, y and the attitude and station of each exposure with their noise."""
+    """Rays of a pass as they are measured: x, y and the attitude and station of each exposure with their noise.
+
+    It is drawn for each exposure, or for each reading and joined by SciPy's spline where the noise has intervals.
+    """
     noise = noise or Noise(0.0)
     rays = {}
+    every = np.concatenate(list(seen.time.values()))
+    shared = {}
+    if rng is not None:
+        shared = {
+            t.group: spline(rng, t.sigma, t.interval, every.min(), every.max()) for t in noise.terms if t.interval
+        }
     for line, time in seen.time.items():
         station, attitude = orbit(seen.node, time)
         image = np.column_stack([np.zeros_like(time), seen.y[line]])
         if rng is not None:
             image = image + noise.image * rng.standard_normal(image.shape)
-            station = station + noise.station * rng.standard_normal(station.shape)
-            turns = Rotation.from_rotvec(noise.attitude * rng.standard_normal(station.shape))
-            attitude = attitude @ turns.as_matrix()
-        rays[line] = Rays.of(np.arange(len(time)), image, station, attitude)
+            turn = np.zeros_like(station)
+            for term in noise.terms:
+                error = shared[term.group](time) if term.interval else term.sigma * rng.standard_normal(station.shape)
+                turn, station = (turn + error, station) if term.kind == "attitude" else (turn, station + error)
+            attitude = attitude @ Rotation.from_rotvec(turn).as_matrix()
+        rays[line] = Rays.of(np.arange(len(time)), image, station, attitude, time)
     return rays
+
+
+def spline(rng, sigma, interval, first, last):
+    """Independent values at whole multiples of the interval, with eight to spare, joined as by a user of the data."""
+    time = interval * np.arange(np.floor(first / interval) - 8, np.ceil(last / interval) + 9)
+    return CubicSpline(time, sigma * rng.standard_normal((len(time), 3)))
 
 
 BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC
@@ -171,9 +195,12 @@ def test_bias_is_a_sequence_of_turns():
 @pytest.mark.parametrize("line", LOOKS)
 def test_partials_are_those_of_a_complex_step(line):
     """The step has no truncation: what is left is rounding of the closed forms, 1e-13 of the largest entry."""
-    camera = replace(cameras()[line], k1=20.0, k2=3e4)  # far larger than real, or the terms would hide in rounding
+    # far larger than real, or the terms would hide in rounding
+    camera = replace(cameras()[line], k1=20.0, k2=3e4, drift=np.array([0.02, -0.03, 0.05, 0.01]))
     rays, small = make_rays(SEEN)[line], 1e-40
     by = partials(camera, rays, SEEN.points, BIAS, OFFSET)
+    stretched = camera.drifted(camera.drift + 1j * small * np.eye(4)[3])
+    close(by.drift[:, :, 3], misclosure(stretched, rays, SEEN.points, BIAS, OFFSET).imag / small)
     for k in range(3):
         unit = 1j * small * np.eye(3)[k]
         stepped = misclosure(replace(camera, interior=camera.interior + unit), rays, SEEN.points, BIAS, OFFSET)
@@ -181,9 +208,31 @@ def test_partials_are_those_of_a_complex_step(line):
         close(by.bias[:, :, k], misclosure(camera, rays, SEEN.points, BIAS + unit, OFFSET).imag / small)
         close(by.ground[:, :, k], misclosure(camera, rays, SEEN.points + unit, BIAS, OFFSET).imag / small)
         close(-by.ground[:, :, k], misclosure(camera, rays, SEEN.points, BIAS, OFFSET + unit).imag / small)
+        drifted = camera.drifted(camera.drift + 1j * small * np.eye(4)[k])
+        close(by.drift[:, :, k], misclosure(drifted, rays, SEEN.points, BIAS, OFFSET).imag / small)
         cross = np.cross(np.eye(3), np.eye(3)[k])
         turned = replace(rays, attitude=rays.attitude @ (np.eye(3) + 1j * small * cross))
         close(by.attitude[:, :, k], misclosure(camera, turned, SEEN.points, BIAS, OFFSET).imag / small)
+
+
+def test_drift_has_the_signs_of_the_conventions():
+    """d_alpha turns the line of sight about +Y, toward +X; d_beta about +X, toward -Y; d_gamma the line about +Z."""
+    camera = replace(cameras()["nadir"], to_body=np.eye(3))
+    sight = camera.interior[1:] + np.array([[0.0, 0.0], [0.0, 0.03]])
+    angle = 1e-6
+    (middle,) = (camera.drifted([angle, 0, 0, 0]).directions(sight[:1]) - camera.directions(sight[:1])) / angle
+    assert middle == pytest.approx([1, 0, 0], abs=1e-5)
+    (middle,) = (camera.drifted([0, angle, 0, 0]).directions(sight[:1]) - camera.directions(sight[:1])) / angle
+    assert middle == pytest.approx([0, -1, 0], abs=1e-5)
+    middle, end = (camera.drifted([0, 0, angle, 0]).directions(sight) - camera.directions(sight)) / angle
+    assert middle == pytest.approx([0, 0, 0], abs=1e-5)
+    # an image at +y looks toward -Y; turned about Z it swings toward +X
+    assert end == pytest.approx([0.03 / np.hypot(0.65, 0.03), 0, 0], abs=1e-5)
+    looks = camera.drifted([0, 0, 0, 1e-3]).directions(sight)
+    assert np.abs(looks[1, 1]) < np.abs(camera.directions(sight)[1, 1])  # longer f, smaller angle
+    assert camera.drifted(np.ones(4)).drifted(np.zeros(4)).axes == pytest.approx(np.eye(3))
+    with pytest.raises(ValueError, match="a drift is"):
+        camera.drifted(np.zeros(3))
 
 
 def close(found, expected):

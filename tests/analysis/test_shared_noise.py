@@ -1,0 +1,218 @@
+"""Noise of readings that image points share: its covariance against SciPy's spline, and campaigns whose sigmas hold."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.interpolate import CubicSpline
+
+from analysis.orbit.adjustment import adjust
+from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
+from analysis.orbit.forward_intersection import intersect
+from analysis.orbit.normal_equations import State, Weights, assemble
+from analysis.orbit.shared_noise import SharedNoise, reading_variance
+from analysis.orbit.three_line_model import Partials, Rays
+from tests.analysis.test_adjustment import (
+    BIAS,
+    HOLD_X,
+    LABORATORY,
+    OFFSETS,
+    ORBIT,
+    SEVEN_NODES,
+    TRUTH,
+    measured,
+    priors,
+    seen,
+)
+from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, orbit
+
+NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC, 0.05, attitude_interval=0.125, station_interval=1.0)
+
+
+def flight(count, nodes=SEVEN_NODES):
+    return [seen(10 + i, count, node=node) for i, node in enumerate(nodes)]
+
+
+def campaign(views, rng, noise=NOISE):
+    """Fields with shared noise, their true offsets."""
+    fields, truth = [], dict(TRUTH)
+    for i, view in enumerate(views):
+        offset = ORBIT * rng.standard_normal(3)
+        name, axes = f"F{i}", orbit(view.node, np.zeros(1))[1][0]
+        fields.append(measured(view, rng, noise, offset=axes @ offset, name=name))
+        truth |= {f"{name} {n}": v for n, v in zip(("roll", "pitch", "yaw"), BIAS, strict=True)}
+        truth |= {f"{name} offset {n}": v for n, v in zip(("along", "across", "down"), offset, strict=True)}
+    return fields, truth
+
+
+def untimed(fields):
+    return [replace(f, rays={k: replace(r, time=None) for k, r in f.rays.items()}) for f in fields]
+
+
+def solve(fields, noise=NOISE, **options):
+    names = [f.name for f in fields]
+    return adjust(fields, LABORATORY, noise, unknowns=OFFSETS, priors=priors(*names), gauge=HOLD_X, **options)
+
+
+def square(found, truth):
+    """Mahalanobis square of the parameters, and how many."""
+    free = np.array([n not in HOLD_X.held for n in found.names])
+    error = (found.values - np.array([truth[n] for n in found.names]))[free]
+    scale = np.sqrt(np.diag(found.covariance))[free]
+    unit = found.covariance[np.ix_(free, free)] / scale / scale[:, None]
+    return error / scale @ np.linalg.solve(unit, error / scale), len(error)
+
+
+def test_covariance_of_points_is_that_of_the_spline():
+    """SciPy's spline is linear in the readings, so its matrix gives the covariance; its ends, 60 readings away, leave
+    0.27^60. A gap of 30 readings cuts the unknowns into two stretches, of correlation 1e-16."""
+    moments = np.concatenate([np.linspace(0.03, 1.9, 23), np.linspace(6.11, 6.3, 5)])
+    knots = 0.125 * np.arange(-60, 120)
+    by_reading = CubicSpline(knots, np.eye(len(knots)))(moments)
+    count = len(moments)
+    rays = Rays.of(
+        np.arange(count), np.zeros((count, 2)), np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)), moments
+    )
+    field = CalibrationField(
+        "one", {"nadir": rays}, np.zeros((count, 3)), np.zeros((count, 3, 3)), np.ones(count, bool)
+    )
+    shared = SharedNoise.of([field], Noise(PITCH, 2.0, attitude_interval=0.125))
+    turn = np.zeros((count, 2, 3))
+    turn[:, 0, 1] = 1.0  # x by pitch alone
+    none = np.zeros((count, 2, 3))
+    rows = shared.rows("one", "nadir", np.tile(np.eye(2), (count, 1, 1)), Partials(none, none, none, turn, none))[::2]
+    found = rows @ np.linalg.inv(shared.precision.toarray()) @ rows.T
+    expected = 4.0 * by_reading @ by_reading.T
+    assert found == pytest.approx(expected, abs=1e-9)
+    assert 4.0 * reading_variance(moments, 0.125) == pytest.approx(np.diag(expected), abs=1e-9)
+    assert reading_variance(np.array([0.0, 0.0625]), 0.125) == pytest.approx([1.0, 0.76], abs=0.01)
+
+
+def test_corrections_at_any_time_are_those_of_the_rays():
+    fields, _ = campaign(flight(8, SEVEN_NODES[:1]), np.random.default_rng(1))
+    shared = SharedNoise.of(fields, NOISE)
+    values = np.random.default_rng(2).standard_normal(shared.size)
+    for line, rays in fields[0].rays.items():
+        direct = shared.corrected("F0", line, rays, values)
+        other = shared.corrected_at("F0", rays, values)
+        assert np.array_equal(direct.station, other.station)
+        assert np.array_equal(direct.attitude, other.attitude)
+        assert np.abs(direct.station - rays.station).max() > 0.01
+
+
+def test_sigmas_are_right_where_points_share_noise():
+    """12 campaigns of two fields; two-sided false alarm 1e-3 each for parameters and residuals.
+
+    Counted as independent, the same points seem to tell more of the principal points than they do.
+    """
+    rng, views = np.random.default_rng(21), flight(40, SEVEN_NODES[:2])
+    total = np.zeros(2)
+    fit = np.zeros(2)
+    for _ in range(12):
+        fields, truth = campaign(views, rng)
+        found = solve(fields)
+        total += square(found, truth)
+        fit += (found.chi_square, found.degrees_of_freedom)
+    assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
+    assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
+    assert sum(found.redundancy.values()) == pytest.approx(found.degrees_of_freedom, abs=1e-6)
+    alone = solve(untimed(fields))
+    assert found.sigma["forward x"] > 1.05 * alone.sigma["forward x"]
+
+
+@pytest.mark.slow
+def test_sigmas_are_right_in_a_hundred_campaigns_of_seven_fields():
+    """Two-sided false alarm 1e-3 each. Independent noise is refused: by the residuals, whose variance between readings
+    is 0.76 to 1 of that at a reading, and by the parameters."""
+    rng, views = np.random.default_rng(22), flight(60)
+    total, fit, wrong = np.zeros(2), np.zeros(2), np.zeros(2)
+    for _ in range(100):
+        fields, truth = campaign(views, rng)
+        found, alone = solve(fields), solve(untimed(fields))
+        total += square(found, truth)
+        wrong += square(alone, truth)
+        fit += (found.chi_square, found.degrees_of_freedom)
+    assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
+    assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
+    assert stats.chi2.sf(*wrong) < 5e-4
+
+
+def test_seven_fields_are_quick():
+    fields, _ = campaign(flight(60), np.random.default_rng(23))
+    spent = []
+    for _ in range(2):
+        start = time.perf_counter()
+        solve(fields)
+        spent.append(time.perf_counter() - start)
+    assert min(spent) < 2.0
+
+
+def test_sparse_elimination_is_the_dense_covariance_of_all_image_points():
+    """The same system with the full covariance of image points, and ground points as unknowns. Sigmas to 1e-5: the
+    weakest combination has a strength of 3e-3, so that rounding of 1e-16 counts 1e5 times, twice."""
+    fields, _ = campaign(flight(12, SEVEN_NODES[:1]), np.random.default_rng(24))
+    found = solve(fields)
+    shared = SharedNoise.of(fields, NOISE)
+    parameters = Parameters.of(fields, LABORATORY, OFFSETS)
+    weights = Weights(np.ones(36), {"image": 1.0})
+    state = State(found.values, (found.ground["F0"],), np.zeros(shared.size))
+    at = assemble(fields, LABORATORY, parameters, state, NOISE, (), weights, shared)
+    rows = at.design_shared.toarray()
+    spread = np.eye(72) + rows @ np.linalg.inv(shared.precision.toarray()) @ rows.T
+    design = np.hstack([at.design.toarray(), at.design_point.toarray()])
+    normal = design.T @ np.linalg.solve(spread, design)
+    count = len(found.names)
+    normal[count:, count:] += at.control_weight.toarray()
+    for i, name in enumerate(found.names):
+        normal[i, i] += (ORBIT**-2) * ("offset" in name)
+    kept = [i for i in range(len(normal)) if i >= count or found.names[i] not in HOLD_X.held]
+    size = 1 / np.sqrt(np.diag(normal)[kept])
+    inverse = size[:, None] * np.linalg.inv(size[:, None] * normal[np.ix_(kept, kept)] * size) * size
+    sigma = np.sqrt(np.diag(inverse))
+    free = [i for i in kept if i < count]
+    assert np.sqrt(np.diag(found.covariance))[free] == pytest.approx(sigma[: len(free)], rel=1e-5)
+    points = np.sqrt(found.ground_covariance["F0"][:, [0, 1, 2], [0, 1, 2]]).ravel()
+    assert points == pytest.approx(sigma[len(free) :], rel=1e-5)
+
+
+def test_wrong_matches_and_wrong_sigmas_are_found_among_shared_noise():
+    """Attitude twice as noisy as claimed: its factor comes out as 4, image and control as 1, to 4.5 sigmas of
+    sqrt(2 / redundancy), twice that variance for what groups take from each other. Five matches are 30 px off."""
+    rng, views = np.random.default_rng(25), flight(60, SEVEN_NODES[:2])
+    fields, _ = campaign(views, rng, replace(NOISE, attitude=1.0 * ARCSEC))
+    found = solve(fields, variance_components=True)
+    for group, factor in (("image", 1.0), ("attitude", 4.0), ("control", 1.0)):
+        assert found.factors[group] == pytest.approx(factor, rel=4.5 * np.sqrt(4 / found.redundancy[group]))
+    fields, truth = campaign(views, rng)
+    rays = fields[1].rays["aft"]
+    rays.image[:5] += 30 * PITCH
+    found = solve(fields, robust="igg")
+    assert np.all(found.weight["F1"]["aft"][:5] == 0)
+    assert sum(int(np.sum(w == 0)) for one in found.weight.values() for w in one.values()) <= 5 + 3
+    assert stats.chi2.sf(*square(found, truth)) > 1e-5
+
+
+def test_single_points_have_the_variance_of_the_interpolated_attitude():
+    """Forward intersection of 400 points, each by itself: mean Mahalanobis square 3. Neighbours share errors, a pass of
+    7 s has 56 readings on each line: as if of 56 independent points at least, 5 sigmas."""
+    rng = np.random.default_rng(26)
+    view = seen(30, 400, bias=(0.0, 0.0, 0.0))
+    noise = replace(NOISE, image=0.05 * PITCH)
+    found = intersect(make_rays(view, rng, noise), cameras(), noise)
+    error = found.ground - view.points
+    mean = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance), error).mean()
+    assert mean == pytest.approx(3.0, abs=5 * np.sqrt(6 / 56))
+
+
+def test_bad_noise_is_told():
+    fields, _ = campaign(flight(12, SEVEN_NODES[:1]), np.random.default_rng(27))
+    with pytest.raises(CalibrationError, match="intervals must be finite and positive"):
+        solve(fields, replace(NOISE, attitude_interval=0.0))
+    with pytest.raises(CalibrationError, match="no other negative"):
+        solve(fields, replace(NOISE, attitude=-1.0))
+    row = fields[0].rays["nadir"]
+    moments = np.where(np.arange(12) == 2, np.nan, row.time)
+    with pytest.raises(ValueError, match="time of ray 2 is not finite"):
+        Rays.of(row.point, row.image, row.station, row.attitude, moments)

@@ -1,0 +1,160 @@
+"""A pass adjusted on its tie points, without control: exactness, sigmas, datum, and how much it gains."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.orbit.calibration_parameters import CalibrationError, Noise
+from analysis.orbit.forward_intersection import check_errors, intersect
+from analysis.orbit.strip_adjustment import adjust_strip
+from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, make_rays, observe, orbit
+
+BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC
+NODE = 2.4
+WHITE = Noise(0.3 * PITCH, 0.5 * ARCSEC, 0.05, attitude_interval=0.125, station_interval=1.0)
+SLOW = replace(WHITE, slow_attitude=5.0 * ARCSEC, slow_interval=10.0)
+
+
+def strip(seed, count, seconds):
+    """Exact pass over points that the nadir line sees within `seconds`."""
+    rng = np.random.default_rng(seed)
+    station, attitude = orbit(NODE, seconds * rng.uniform(-0.5, 0.5, count))
+    direction = station / np.linalg.norm(station, axis=1, keepdims=True)
+    direction = direction + rng.uniform(-25e3, 25e3, count)[:, None] * attitude[:, :, 1] / 6371e3
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    height = rng.uniform(0.0, 2000.0, count)
+    points = direction * (6378137.0 * (1 - direction[:, 2] ** 2 / 298.257) + height)[:, None]
+    return observe(points, NODE, cameras(), BIAS)
+
+
+def adjusted(rays, noise, **options):
+    return adjust_strip(rays, cameras(), noise, bias=BIAS, **options)
+
+
+def alone(rays, noise):
+    return intersect(rays, cameras(), noise, bias=BIAS)
+
+
+def test_exact_rays_are_left_alone():
+    """1e-15 m of rounding in an image of 0.3 px is 1e-9 of a sigma; coordinates of 6.4e6 m are rounded to 1e-9 m."""
+    view = strip(1, 60, 7.0)
+    found = adjusted(make_rays(view), SLOW)
+    assert np.abs(found.ground - view.points).max() < 1e-6
+    assert found.chi_square < 1e-12
+    for group, sigma in (("attitude", SLOW.attitude), ("slow attitude", SLOW.slow_attitude), ("station", SLOW.station)):
+        assert np.abs(found.corrections[group].value).max() < 1e-6 * sigma
+    assert {"attitude", "slow attitude", "station"} == set(found.corrections)
+
+
+def test_sigmas_are_right():
+    """40 passes: the errors of one point of each, and the residuals of all; two-sided false alarm 1e-3 each."""
+    rng, view, total, fit, readings = np.random.default_rng(2), strip(2, 40, 3.0), np.zeros(2), np.zeros(2), []
+    for k in range(40):
+        found = adjusted(make_rays(view, rng, SLOW), SLOW)
+        error = found.ground[k] - view.points[k]
+        total += (error @ np.linalg.solve(found.covariance[k], error), 3)
+        fit += (found.chi_square, found.degrees_of_freedom)
+        readings.append(found.corrections["attitude"].sigma)
+    assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
+    assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
+    # what is left of a reading is never more than the prior's sigma
+    assert np.max(readings) <= 0.5 * ARCSEC * (1 + 1e-9)
+
+
+def test_corrections_take_the_errors_out_of_other_rays():
+    """Ties from half of the points, the others intersected from corrected rays: both keep the same slow errors.
+
+    Heights of 500 points from one set of slow errors: 0.3 px of the others count 1.5 m of image noise, of some 10 m.
+    """
+    view, squares = strip(3, 1000, 20.0), []
+    for seed in range(3):
+        rays = make_rays(view, np.random.default_rng(30 + seed), SLOW)
+        found = adjusted({k: r.taken(np.arange(1000) < 500) for k, r in rays.items()}, SLOW)
+        others = {k: r.taken(np.arange(1000) >= 500) for k, r in rays.items()}
+        others = {k: replace(r, point=r.point - 500) for k, r in others.items()}
+        before = check_errors(alone(others, SLOW).ground, view.points[500:])
+        after = check_errors(alone({k: found.corrected(r) for k, r in others.items()}, SLOW).ground, view.points[500:])
+        tied = check_errors(found.ground[:500], view.points[:500])
+        assert np.hypot(after.plan_rms, after.height_rms) == pytest.approx(
+            np.hypot(tied.plan_rms, tied.height_rms), rel=0.1
+        )
+        squares.append([e.plan_rms**2 + e.height_rms**2 for e in (before, after)])
+    assert np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0]) < 0.9
+    with pytest.raises(CalibrationError, match="no times"):
+        found.corrected(replace(rays["aft"], time=None))
+
+
+@pytest.mark.parametrize(("noise", "least", "most"), [(WHITE, 0.02, 0.15), (SLOW, 0.2, 0.9)])
+def test_gain_in_height_is_large_for_slow_errors_only(noise, least, most):
+    """The gain that the covariances predict, and the one that is met over five passes.
+
+    White readings of 0.5 arcsec and 0.3 px: almost all of the error is what all rays of a place have in common. Errors
+    of a place are common to its neighbours, within one reading (480 in five passes) or one slow error (10): 4 sigmas.
+    """
+    rng, view = np.random.default_rng(4), strip(4, 450, 12.0)
+    squares, expected = [], []
+    up = view.points / np.linalg.norm(view.points, axis=1, keepdims=True)
+    for _ in range(5):
+        rays = make_rays(view, rng, noise)
+        before, after = alone(rays, noise), adjusted(rays, noise)
+        squares.append([check_errors(g.ground, view.points).height_rms ** 2 for g in (before, after)])
+        heights = [np.einsum("ni,nij,nj->n", up, g.covariance, up).mean() for g in (before, after)]
+        expected.append(heights)
+    ratio = np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0])
+    predicted = np.sqrt(np.mean(expected, axis=0)[1] / np.mean(expected, axis=0)[0])
+    assert 1 - most < predicted < 1 - least
+    independent = 480 if noise is WHITE else 10
+    assert np.sqrt(np.mean(squares, axis=0)) == pytest.approx(
+        np.sqrt(np.mean(expected, axis=0)), rel=4 * np.sqrt(0.5 / independent)
+    )
+    assert ratio < 1.0
+
+
+def test_the_datum_keeps_its_prior():
+    """A common roll is left to the prior to some per cent, ends of the pass apart; a common pitch is told."""
+    found = adjusted(make_rays(strip(5, 600, 15.0), np.random.default_rng(5), SLOW), SLOW)
+    told = {d.name: d.after / d.before for d in found.datum}
+    assert set(told) == {"roll", "pitch", "yaw", "roll rate", "pitch rate", "yaw rate"}
+    assert max(told.values()) <= 1.0
+    assert told["roll"] > 0.85
+    assert told["yaw"] > 0.85
+    assert told["pitch"] < 0.75
+    before = {d.name: d.before for d in found.datum}
+    # three separate looks of about 15 s, each sees slow errors at 10 s: two or three independent ones for each
+    assert 5 * ARCSEC / np.sqrt(9) < before["roll"] < 5 * ARCSEC / np.sqrt(3)
+
+
+def test_wrong_matches_are_left_out():
+    rng, view = np.random.default_rng(6), strip(6, 150, 7.0)
+    rays = make_rays(view, rng, WHITE)
+    rays["nadir"].image[:4] += 20 * PITCH
+    found = adjusted(rays, WHITE, robust="igg")
+    assert np.all(found.weight["nadir"][:4] == 0)
+    # three rays of a point often cannot tell which one is wrong, the whole point goes then; of the other 438 image
+    # points 1 in 10 000 lies beyond the limit: more than two are a false alarm of 1e-5
+    assert sum(int(np.sum(w[4:] == 0)) for w in found.weight.values()) <= 2
+    assert np.isfinite(found.ground[4:]).mean() > 0.98
+    # 4 m in height, 1 sigma, where all three rays are left; 600 coordinates stay within 5 of that
+    assert np.nanmax(np.linalg.norm(found.ground - view.points, axis=1)) < 20
+    plain = adjusted(rays, WHITE)
+    assert plain.p_value < 1e-10
+    assert np.linalg.norm(plain.ground - view.points, axis=1)[:4].max() > 20
+
+
+def test_points_of_one_line_and_bad_input():
+    rays = make_rays(strip(7, 30, 5.0), np.random.default_rng(7), WHITE)
+    some = {k: r.taken(r.point != 3) if k != "aft" else r for k, r in rays.items()}
+    found = adjusted(some, WHITE)
+    assert np.isnan(found.ground[3]).all()
+    assert np.isfinite(np.delete(found.ground, 3, axis=0)).all()
+    assert found.weight["aft"][3] == 0
+    assert np.isnan(found.residual["aft"][3]).all()
+    assert found.degrees_of_freedom == 2 * 29 * 3 - 3 * 29
+    with pytest.raises(CalibrationError, match="needs the times"):
+        adjusted(rays, Noise(PITCH, ARCSEC))
+    with pytest.raises(CalibrationError, match="needs the times"):
+        adjusted({k: replace(r, time=None) for k, r in rays.items()}, WHITE)
+    with pytest.raises(CalibrationError, match="robust must be"):
+        adjusted(rays, WHITE, robust="tukey")
