@@ -18,6 +18,8 @@ from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.orbit_angle import OrbitAngleSpec
 from scenes.orbit_calibration import OrbitCalibrationSpec
+from scenes.orbit_scene import LineImageSpec
+from scenes.orbit_simulate import OrbitSimulateSpec
 from scenes.spec import Spec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.translate import validate
@@ -144,9 +146,35 @@ def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | N
     return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
 
 
-def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec) -> Path:
+def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec) -> Path:
     """The file of the payload of a test in orbit. Raises InputError if there is none."""
     return _find(PAYLOADS, test.camera, test, ("camera",))
+
+
+def find_orbit_camera(test: OrbitAngleSpec) -> Path:
+    """The file of the payload or instrument of a test in orbit. Raises InputError if there is none."""
+    reference, file = test.camera, test.source.file
+    for folder in (PAYLOADS, INSTRUMENTS):
+        if _candidate(folder, reference, Path(file).parent if file else Path()) is not None:
+            return _find(folder, reference, test, ("camera",))
+    payloads, instruments = library_names(PAYLOADS), library_names(INSTRUMENTS)
+    allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
+    meant = nearest(reference, (*payloads, *instruments))
+    problem = "no such name in payloads or instruments"
+    raise test.error(problem, ("camera",), found=reference, allowed=allowed, suggestion=meant)
+
+
+def load_line_detectors(camera: ThreeLineCameraSpec) -> dict[str, DetectorSpec]:
+    """Data sheets of a payload's line CCDs, by the name that the image sections give. Raises InputError as
+    `load_instrument`.
+    """
+    sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
+    sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
+    return {
+        image.detector: load_detector(_find(DETECTORS, image.detector, camera, (*key, "detector")))
+        for key, image in sections
+        if image is not None
+    }
 
 
 def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:

@@ -1,20 +1,21 @@
-"""The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it, and with the
-camera that it refers to.
-"""
+"""The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
 
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from scenes.errors import Problem
+from scenes.job import PerturbationSpec
 from scenes.orbit_spec import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.quantity import Quantity, Vector, Wavelength
-from scenes.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
-from scenes.three_line_camera import Misalignment
+from scenes.spec import Name, Named, Number, Paths, Reference, Seed, Spec, Text, Whole
 from scenes.units import DISTANCE, LENGTH, MOMENT, format_quantity
 
 LINES = ("forward", "nadir", "aft")
-"""Lines that a camera must have: alpha lies between the first two, beta between the last two."""
+"""The three lines of paper 000."""
+PAPER_ANGLES = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
+"""Its angles: name -> the two lines that it lies between."""
 LEAST_POINTS = 3
 
 Moment = Annotated[float, Quantity(MOMENT, largest="240 h")]
@@ -28,12 +29,43 @@ Passes = Annotated[Whole, Field(ge=2, le=5000)]
 Flag = Annotated[bool, Field(strict=True)]
 
 
+def _turn(value: Any) -> Any:
+    """`[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
+    return {"rotate": value} if isinstance(value, list) else value
+
+
+Change = Annotated[PerturbationSpec, BeforeValidator(_turn)]
+
+
+def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:
+    if angles is not None and not angles:
+        raise Problem("no angles", "an empty mapping", "alpha: [forward, nadir], or nothing for the usual ones")
+    for name, (first, second) in (angles or {}).items():
+        if first == second:
+            problem = "a line makes no angle with itself"
+            raise Problem(problem, f"{first} twice", "two different lines", within=(name,))
+    return angles
+
+
+Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
+
+
+def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
+    """Angles of a camera whose test names none: the paper's, or that of a camera of two lines; None for others."""
+    if set(LINES) <= set(lines):
+        return PAPER_ANGLES
+    return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
+
+
 class StripsSpec(Spec):
     """Ground points on what each line sees at the moment of exposure, evenly spaced along the line.
 
+    Places are pixels, counted from 0, of the camera's usual line: one with the payload's own number of pixels, or an
+    instrument's first line. On a line with more or fewer pixels they stand at the same share of its length.
+
     Attributes:
         points: on each strip, three or more.
-        first: place of the first point on the line, counted in pixels from 0.
+        first: place of the first point on the line.
         last: place of the last point.
     """
 
@@ -102,14 +134,17 @@ class AngleErrorsSpec(Spec):
 
 
 class OrbitAngleSpec(Spec):
-    """The intersection angles of a three-line camera from one moment's ground points.
+    """The intersection angles of a camera of two or more lines from one moment's ground points.
 
     Attributes:
         name: as the file is called.
         description: for people.
-        camera: name in scenes/orbit or path of a file, with lines forward, nadir and aft.
-        changes: line -> how it has turned since the laboratory, rotation vector in body axes, radians; the analysis
-            does not know it.
+        camera: name in scenes/payloads or scenes/instruments, or path of a file of either sort. The lines of a payload
+            are ideal projections, those of an instrument are traced, one for each of its cameras.
+        angles: name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir, aft]
+            where the camera has these lines, or alpha between the lines of a camera that has two.
+        changes: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
+            vector in body axes, for an instrument node path -> perturbation as in a job.
         earth: its rotation.
         orbit: true orbit.
         attitude: true attitude.
@@ -125,7 +160,8 @@ class OrbitAngleSpec(Spec):
     name: Name
     description: Text = ""
     camera: Reference
-    changes: Named[Misalignment] = Field(default_factory=dict, validate_default=True)
+    angles: Angles = None
+    changes: Paths[Change] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
     orbit: OrbitSpec
     attitude: AttitudeSpec = AttitudeSpec()

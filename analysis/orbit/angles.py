@@ -1,16 +1,20 @@
 """Intersection angles of line cameras from the planes in which they photograph (paper 000, eqs. 6-7).
 
 alpha is the angle between the forward and the nadir plane, beta between the nadir and the aft plane; both acute and
-positive. The paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and swallows angles below
+positive. Any other pair of lines, such as the nadir and a high-resolution line, has an angle in the same way. The
+paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and swallows angles below
 1e-8 rad (`arccos_rounding`), so the value used here is atan2(|a x b|, |a . b|), good to rounding at every angle.
 
 The sigmas come from first-order propagation. All planes pass through one station, whose error they share, and alpha
 and beta share the nadir plane, so their errors are correlated: the result is a joint covariance.
 
-Two angles bear the name. The planes give the **dihedral** angle. The **look** angle lies between the lines of sight of
-the lines' centres. They are equal when the CCD lines are parallel and start at the same place across the track; a
+Three angles bear the name. The planes give the **dihedral** angle. The **look** angle lies between the lines of sight
+of the lines' centres. They are equal when the CCD lines are parallel and start at the same place across the track; a
 line turned by k about its own line of sight makes cos(dihedral) = cos(k) cos(look), a dihedral angle larger by
-k^2 / (2 tan(look)).
+k^2 / (2 tan(look)). Both are unsigned, so that for nearly parallel lines k and the offset across the track decide what
+they are, and noise folds them at zero. The **along-track** angle is the turn about the lines' direction that takes one
+central ray to the other: signed, zero for lines that look the same way, and not folded. It is the part that makes
+heights, and for lines far apart the look angle.
 """
 
 from __future__ import annotations
@@ -24,14 +28,19 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.orbit.planes import PlaneFit, Station, Strip
 
 __all__ = [
+    "AlongTrackAngles",
     "AngleError",
+    "LineFrame",
     "PlaneAngles",
+    "along_track_angle",
+    "along_track_angles",
     "angles_between",
     "arccos_rounding",
     "central_ray",
     "dihedral_angle",
     "height_error",
     "intersection_angles",
+    "line_frame",
     "look_angle",
     "off_axis_angle",
 ]
@@ -52,14 +61,14 @@ class PlaneAngles:
     values: (m,) acute angles by atan2, radians. printed: (m,) the same by the paper's arccos.
     covariance: (m, m) rad^2, points and station.
     gradient: (m, k, 3) derivative of each angle with respect to the unit normals of the k planes.
-    folded: some angle is below three sigmas; its sigma then says little, for an angle cannot be negative.
+    folded: (m,) the angle is below three sigmas; its sigma then says little, for it cannot be negative.
     """
 
     values: Array
     printed: Array
     covariance: Array
     gradient: Array
-    folded: bool
+    folded: NDArray[np.bool_]
 
     @property
     def sigma(self) -> Array:
@@ -93,11 +102,17 @@ def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]])
         side = np.copysign(1.0, dot)
         gradient[row, i] = -(side * b - abs(dot) * a) / sine
         gradient[row, j] = -(side * a - abs(dot) * b) / sine
+    covariance = _propagated(gradient, planes)
+    folded = values < _FOLDED * np.sqrt(np.diag(covariance))
+    return PlaneAngles(values, printed, covariance, gradient, folded)
+
+
+def _propagated(gradient: Array, planes: Sequence[PlaneFit]) -> Array:
+    """(m, m) covariance of what depends on the planes' normals by `gradient` (m, k, 3)."""
     points = np.array([plane.point_covariance for plane in planes])
     shared = np.einsum("mki,kij->mj", gradient, np.array([plane.station_gain for plane in planes]))
-    covariance = np.einsum("mki,kij,lkj->ml", gradient, points, gradient) + shared @ first.station.covariance @ shared.T
-    folded = bool(np.any(values < _FOLDED * np.sqrt(np.diag(covariance))))
-    return PlaneAngles(values, printed, covariance, gradient, folded)
+    own = np.einsum("mki,kij,lkj->ml", gradient, points, gradient)
+    return np.asarray(own + shared @ planes[0].station.covariance @ shared.T)
 
 
 def intersection_angles(forward: PlaneFit, nadir: PlaneFit, aft: PlaneFit) -> PlaneAngles:
@@ -142,6 +157,37 @@ def central_ray(plane: PlaneFit, tangent: ArrayLike) -> Array:
     tangent: (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel number
         and the interior orientation; either sense of counting. Raises AngleError for bad tangents.
     """
+    return line_frame(plane, tangent).central
+
+
+@dataclass(frozen=True, eq=False)
+class LineFrame:
+    """Where one line looks; unit vectors (3,).
+
+    central: along the line of sight of its centre. side: along the line, the way in which the tangents rise; square
+        to `central`. plane: the fit. variance: of the central ray out of the plane, rad^2, beside the plane's own.
+    """
+
+    central: Array
+    side: Array
+    plane: PlaneFit
+    variance: float
+
+    @property
+    def forward(self) -> Array:
+        """Side x central, which looks ahead where the tangents rise to the right of the track."""
+        return np.asarray(np.cross(self.side, self.central))
+
+
+def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFrame:
+    """The line of sight of a CCD line's centre and the line's direction, from the plane and the interior orientation.
+
+    tangent: as for `central_ray`.
+    bend: how far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
+        sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
+
+    Raises AngleError for bad tangents.
+    """
     if plane.method == "printed":
         raise AngleError("central ray: the printed plane does not contain its points")
     station: Station = plane.station
@@ -164,7 +210,75 @@ def central_ray(plane: PlaneFit, tangent: ArrayLike) -> Array:
     # a point's angle is good to its sigma over its distance
     weight = np.sum(arm**2, axis=1) / np.trace(strip.covariance, axis1=1, axis2=2)
     turn = float(np.sum(weight * (seen - np.copysign(1.0, slope) * interior)) / np.sum(weight))
-    return np.asarray(np.cos(turn) * middle + np.sin(turn) * side)
+    central = np.cos(turn) * middle + np.sin(turn) * side
+    side = np.copysign(1.0, slope) * np.cross(plane.normal, central)
+    if bend <= 0.0 or not np.any(spread):
+        return LineFrame(central, side, plane, 0.0)
+    off, variance = _off_plane(plane, arm, interior, bend)
+    return LineFrame(np.cos(off) * central + np.sin(off) * plane.normal, side, plane, variance)
+
+
+def _off_plane(plane: PlaneFit, arm: Array, interior: Array, bend: float) -> tuple[float, float]:
+    """Angle of the central ray out of the plane when the line may be bent, and what its variance grows by."""
+    distance = np.linalg.norm(arm, axis=1)
+    spread = np.sqrt(np.einsum("i,nij,j->n", plane.normal, plane.strip.covariance, plane.normal)) / distance
+    columns = np.column_stack([np.cos(interior), np.sin(interior), (interior / np.abs(interior).max()) ** 2])
+    design = columns / spread[:, None]
+    square = design.T @ design
+    rigid = np.linalg.inv(square[:2, :2])[0, 0]
+    square[2, 2] += bend**-2
+    inverse = np.linalg.inv(square)
+    off = inverse @ design.T @ (plane.residual / distance / spread)
+    return float(off[0]), float(inverse[0, 0] - rigid)
+
+
+@dataclass(frozen=True, eq=False)
+class AlongTrackAngles:
+    """Signed angles along the track between pairs of lines. values: (m,) radians. covariance: (m, m) rad^2."""
+
+    values: Array
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """(m,) radians."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayLike, side_b: ArrayLike) -> float:
+    """Turn about the mean direction of two lines that takes the second's central ray to the first's, radians.
+
+    Unit vectors (3,). Positive where the first looks ahead of the second, sides pointing to the right of the track.
+    Raises AngleError for lines that run in opposite directions.
+    """
+    first, second = np.asarray(central_a, np.float64), np.asarray(central_b, np.float64)
+    axis = np.asarray(side_a, np.float64) + np.asarray(side_b, np.float64)
+    length = float(np.linalg.norm(axis))
+    if length < 1.0:
+        raise AngleError("along-track angle: the lines run in opposite directions; are pixels counted alike?")
+    axis = axis / length
+    return float(np.arctan2(axis @ np.cross(second, first), first @ second - (first @ axis) * (second @ axis)))
+
+
+def along_track_angles(lines: Sequence[LineFrame], pairs: Sequence[tuple[int, int]]) -> AlongTrackAngles:
+    """Signed angles between pairs of lines seen from one station, with their joint covariance.
+
+    A plane that turns about its line's direction moves its central ray by as much; turns within a plane count only by
+    the angle between the two lines, and are left out of the covariance. pairs: indices into `lines`. Raises AngleError.
+    """
+    gradient = np.zeros((len(pairs), len(lines), 3))
+    values, sign = np.empty(len(pairs)), np.zeros((len(pairs), len(lines)))
+    for row, (i, j) in enumerate(pairs):
+        a, b = lines[i], lines[j]
+        values[row] = along_track_angle(a.central, a.side, b.central, b.side)
+        for k, way in ((i, 1.0), (j, -1.0)):
+            line = lines[k]
+            # the normal that looks ahead turns away from the central ray when the plane turns ahead
+            gradient[row, k] = -way * line.central * np.copysign(1.0, line.plane.normal @ line.forward)
+            sign[row, k] = way
+    own = np.array([line.variance for line in lines])
+    covariance = _propagated(gradient, [line.plane for line in lines]) + (sign * own) @ sign.T
+    return AlongTrackAngles(values, covariance)
 
 
 def height_error(

@@ -1,20 +1,25 @@
-"""Space resection of a three-line camera: attitude and intersection angles from one moment's ground points together.
+"""Space resection of a camera of two or more lines: attitude and angles from one moment's ground points together.
 
 The photogrammetric method that paper 000 compares its planes with. Each point p has a place on its CCD line, hence a
 known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y along the line, Z toward the scene.
-Line k hangs in the body at the look angle +alpha (forward), 0 (nadir) or -beta (aft), a rotation about the body's Y:
+Line k hangs in the body at the look angle look_k, a rotation about the body's Y, positive forward; one line, the
+reference, at zero. Its projection centre stands at c_k in the line's frame:
 
-    (tx, ty, 1) ~ Ry(look_k)^T R^T (p - O).
+    (tx, ty, 1) ~ Ry(look_k)^T R^T (p - O) - c_k.
 
 Unknown are the rotation R from the body to the ground's frame (three turns: roll, pitch, yaw about the body's X, Y, Z),
-alpha and beta, and where the station is not exact its correction, held by its covariance. Gauss-Newton with analytic
+the look angles, and where the station is not exact its correction, held by its covariance. Gauss-Newton with analytic
 partials; the point's covariance is carried into the image and added to the image's own. Unlike the planes, the
 resection uses where along the line a point lies, and one attitude for all lines.
+
+What it assumes: the interior orientation is still the laboratory's, and since then lines have turned against each
+other in pitch only. One line in roll or yaw against the rest shows in the chi-square, not in an unknown. Two lines, one
+angle, are enough: each alone tells roll, yaw and its own pitch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,14 +29,13 @@ from scipy.stats import chi2
 
 from analysis.orbit.planes import Station, Strip
 
-__all__ = ["LINES", "ObservedLine", "Resection", "ResectionError", "resect"]
+__all__ = ["ObservedLine", "Resection", "ResectionError", "resect"]
 
 Array = NDArray[np.float64]
-LINES = ("forward", "nadir", "aft")
-_NAMES = ("roll", "pitch", "yaw", "alpha", "beta")
+_ATTITUDE = ("roll", "pitch", "yaw")
 _STATION = ("station x", "station y", "station z")
-# Derivative of a line's look angle with respect to alpha and beta.
-_LOOK = {"forward": (1.0, 0.0), "nadir": (0.0, 0.0), "aft": (0.0, -1.0)}
+# A look angle farther than this from the laboratory's, radians, is a mistake and not a change: 1 deg.
+_GROSS = 0.0175
 # Columns of unit length that combine to less than this part of the largest singular value are dependent. Partials in
 # float64 hold 1e-15; three good strips and a station known only from them stay above 5e-3.
 _RANK = 1e-9
@@ -53,15 +57,27 @@ class ObservedLine:
 
     tangent: (n, 2) tangents (tx across, ty along the line) of the points' directions in the line's frame; tx is what
     the line's distortion makes of it, 0 for a straight line. sigma: of both tangents, image measurement alone.
+    look: the laboratory's look angle, radians; NaN where it is not known. It is no observation: results are only
+    checked against it. offset: (n, 3) metres, projection centre of each point in the line's frame, from the station.
     """
 
     strip: Strip
     tangent: Array
     sigma: float
+    look: float
+    offset: Array
 
     @classmethod
-    def of(cls, strip: Strip, tangent: ArrayLike, sigma: float = 0.0) -> ObservedLine:
-        """tangent: (n,) along the line, or (n, 2). Raises ResectionError for bad input."""
+    def of(
+        cls,
+        strip: Strip,
+        tangent: ArrayLike,
+        sigma: float = 0.0,
+        *,
+        look: float = float("nan"),
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> ObservedLine:
+        """tangent: (n,) along the line, or (n, 2). offset: (n, 3) or (3,). Raises ResectionError for bad input."""
         given = np.array(tangent, np.float64)
         if given.ndim == 1:
             given = np.column_stack([np.zeros_like(given), given])
@@ -71,23 +87,25 @@ class ObservedLine:
             )
         if not (np.isfinite(sigma) and sigma >= 0):
             raise ResectionError(f"resection: sigma of the tangents must be finite and not negative, found {sigma}")
-        return cls(strip, given, float(sigma))
+        place = np.asarray(offset, np.float64)
+        if place.shape not in ((3,), (len(given), 3)) or not np.all(np.isfinite(place)):
+            raise ResectionError(f"resection: offset must be (3,) or ({len(given)}, 3), finite, found {place.shape}")
+        return cls(strip, given, float(sigma), float(look), np.broadcast_to(place, (len(given), 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Resection:
     """Solution of a space resection.
 
-    attitude: (3, 3) body to the ground's frame. alpha, beta: look angles of forward and aft against nadir, radians,
-        positive; NaN where the line was not given. station: (3,) adjusted, metres.
+    attitude: (3, 3) body to the ground's frame. looks: line -> look angle against the reference line, radians, positive
+        forward; 0 for the reference. station: (3,) adjusted, metres.
     names: of the unknowns that were solved for. covariance: in their order; rad^2, and m^2 for the station.
     residual: line -> (n, 2) predicted minus given tangents. chi_square, degrees_of_freedom: of all residuals and the
         station's correction. condition: of the weighted partials with unit columns. iterations: Gauss-Newton steps.
     """
 
     attitude: Array
-    alpha: float
-    beta: float
+    looks: Mapping[str, float]
     station: Array
     names: tuple[str, ...]
     covariance: Array
@@ -107,37 +125,56 @@ class Resection:
         """Standard deviation of each unknown, radians or metres."""
         return dict(zip(self.names, (float(s) for s in np.sqrt(np.diag(self.covariance))), strict=True))
 
-    @property
-    def angle_covariance(self) -> Array:
-        """(2, 2) of alpha and beta, rad^2. Raises ResectionError when one of them was not solved for."""
-        if not {"alpha", "beta"} <= set(self.names):
-            raise ResectionError("resection: alpha and beta were not both solved for")
-        where = [self.names.index("alpha"), self.names.index("beta")]
-        return np.asarray(self.covariance[np.ix_(where, where)])
+    def angles(self, pairs: Sequence[tuple[str, str]]) -> Array:
+        """(m,) look of the first line minus that of the second, radians. ResectionError for a missing line."""
+        self._known(pairs)
+        return np.array([self.looks[a] - self.looks[b] for a, b in pairs])
+
+    def angle_covariance(self, pairs: Sequence[tuple[str, str]]) -> Array:
+        """(m, m) of `angles`, rad^2. ResectionError for a missing line."""
+        self._known(pairs)
+        root = np.zeros((len(pairs), len(self.names)))
+        for row, pair in zip(root, pairs, strict=True):
+            for line, sign in zip(pair, (1.0, -1.0), strict=True):
+                if (name := f"{line} look") in self.names:
+                    row[self.names.index(name)] = sign
+        return np.asarray(root @ self.covariance @ root.T)
+
+    def axes(self, line: str) -> Array:
+        """(3, 3) from the line's frame, at its look angle, to the ground's."""
+        return np.asarray(self.attitude @ _pitched(self.looks[line]))
+
+    def _known(self, pairs: Sequence[tuple[str, str]]) -> None:
+        if missing := sorted({line for pair in pairs for line in pair} - set(self.looks)):
+            raise ResectionError(f"resection: no {' and no '.join(missing)} line among {', '.join(self.looks)}")
 
 
-def resect(station: Station, lines: Mapping[str, ObservedLine], *, iterations: int = 20) -> Resection:
+def resect(
+    station: Station, lines: Mapping[str, ObservedLine], *, reference: str | None = None, iterations: int = 20
+) -> Resection:
     """Attitude, look angles and station from the points of one moment.
 
     station: its covariance must be zero (exact, not solved for) or positive definite.
-    lines: by name, "nadir" and one or both of "forward" and "aft".
+    lines: by name. reference: the line whose look angle is zero; None for "nadir", or else the first.
     Raises ResectionError, naming the combination, when the points leave an unknown open; when a look angle comes out
-        on the wrong side (lines exchanged, or tangents counted from the wrong end); and when it does not converge.
+        far from the laboratory's (lines exchanged, or tangents counted from the wrong end); and when it does not
+        converge.
     """
-    unknown = set(lines) - set(LINES)
-    if unknown or not lines:
-        raise ResectionError(f"resection: lines must be named {', '.join(LINES)}, found {sorted(lines)}")
+    if not lines:
+        raise ResectionError("resection: no lines")
+    zero = reference or ("nadir" if "nadir" in lines else next(iter(lines)))
+    if zero not in lines:
+        raise ResectionError(f"resection: the reference {zero!r} is none of the lines {', '.join(lines)}")
     for name, line in lines.items():
         if len(line.strip.points) < 1:
             raise ResectionError(f"resection: the {name} line has no points")
-    names = [n for n in _NAMES if n not in ("alpha", "beta")]
-    names += [n for n, line in (("alpha", "forward"), ("beta", "aft")) if line in lines]
+    names = [*_ATTITUDE, *(f"{name} look" for name in lines if name != zero)]
     free = bool(np.any(station.covariance))
     if free:
         if np.linalg.eigvalsh(station.covariance)[0] <= 0:
             raise ResectionError("resection: the station's covariance must be zero or positive definite")
         names += _STATION
-    attitude, looks = _start(station, lines)
+    attitude, looks = _start(station, lines, zero)
     place = station.position.copy()
     prior = np.linalg.inv(np.linalg.cholesky(station.covariance)) if free else np.empty((0, 3))
     held = np.zeros((len(prior), len(names)))
@@ -159,25 +196,25 @@ def resect(station: Station, lines: Mapping[str, ObservedLine], *, iterations: i
         _check_rank(design, length, names)
         step = -np.linalg.lstsq(design / length, miss, rcond=None)[0] / length
         attitude = attitude @ Rotation.from_rotvec(step[:3]).as_matrix()
-        for k, name in enumerate(names):
-            if name in looks:
-                looks[name] += float(step[k])
+        for name in looks:
+            if name != zero:
+                looks[name] += float(step[names.index(f"{name} look")])
         if free:
             place = place + step[-3:]
         size = float(np.max(np.abs(step * length)))
-    for name in looks:
-        if name in names and looks[name] <= 0:
+    for name, look in looks.items():
+        expected = lines[name].look - lines[zero].look
+        if abs(look - expected) > _GROSS:
             raise ResectionError(
-                f"resection: {name} came out as {np.degrees(looks[name]):.4g} deg; are lines exchanged, or are pixels"
-                " counted from the other end?"
+                f"resection: {name} looks {np.degrees(look):.4g} deg ahead of {zero}, in the laboratory"
+                f" {np.degrees(expected):.4g}; are lines exchanged, or are pixels counted from the other end?"
             )
     design, miss, residual = system()
     length = np.linalg.norm(design, axis=0)
     inverse = np.linalg.pinv(design / length) / length[:, None]
     return Resection(
         attitude=attitude,
-        alpha=looks["alpha"] if "forward" in lines else float("nan"),
-        beta=looks["beta"] if "aft" in lines else float("nan"),
+        looks=looks,
         station=place,
         names=tuple(names),
         covariance=inverse @ inverse.T,
@@ -194,12 +231,11 @@ def _system(
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Whitened partials (M, P), whitened misclosures (M,), and the plain residuals of each line."""
     rows, misses, plain = [], [], {}
-    for name in (n for n in LINES if n in lines):
-        line = lines[name]
-        signs = _LOOK[name]
-        tilt = Rotation.from_rotvec([0.0, signs[0] * looks["alpha"] + signs[1] * looks["beta"], 0.0]).as_matrix()
+    for name, line in lines.items():
+        tilt = _pitched(looks[name])
         body = (line.strip.points - place) @ attitude
-        seen = body @ tilt
+        arm = body @ tilt
+        seen = arm - line.offset
         if np.any(seen[:, 2] <= 0):
             raise ResectionError(f"resection: points of the {name} line lie behind the camera")
         x, y, z = seen.T
@@ -207,15 +243,12 @@ def _system(
         image = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], axis=1)
         # R exp(w) turns the direction by -w x body; a look angle turns it by -(Y x seen)
         turn = np.stack([np.cross(body, axis) for axis in np.eye(3)], axis=-1)
-        pitch = np.stack([-z, zero, x], axis=-1)
+        pitch = np.stack([-arm[:, 2], zero, arm[:, 0]], axis=-1)
         to_line = tilt.T @ attitude.T
-        columns = np.empty((len(z), 2, len(names)))
+        columns = np.zeros((len(z), 2, len(names)))
         columns[:, :, :3] = image @ (tilt.T @ turn)
-        for k, n in enumerate(names):
-            if n == "alpha":
-                columns[:, :, k] = signs[0] * np.einsum("nij,nj->ni", image, pitch)
-            elif n == "beta":
-                columns[:, :, k] = signs[1] * np.einsum("nij,nj->ni", image, pitch)
+        if (unknown := f"{name} look") in names:
+            columns[:, :, names.index(unknown)] = np.einsum("nij,nj->ni", image, pitch)
         if names[-1] == _STATION[-1]:
             columns[:, :, -3:] = -image @ to_line
         miss = np.stack([x / z, y / z], axis=-1) - line.tangent
@@ -228,10 +261,15 @@ def _system(
     return np.vstack(rows), np.concatenate(misses), plain
 
 
-def _start(station: Station, lines: Mapping[str, ObservedLine]) -> tuple[Array, dict[str, float]]:
-    """Attitude from the nadir line's directions (or another's), look angles from the mean directions of the others."""
+def _pitched(look: float) -> Array:
+    """From the frame of a line at a look angle to the body."""
+    return np.asarray(Rotation.from_rotvec([0.0, look, 0.0]).as_matrix())
+
+
+def _start(station: Station, lines: Mapping[str, ObservedLine], zero: str) -> tuple[Array, dict[str, float]]:
+    """Attitude from the reference line's directions (or another's), look angles from mean directions."""
     spread = {name: float(np.ptp(line.tangent[:, 1])) for name, line in lines.items()}
-    base = "nadir" if spread.get("nadir", 0.0) > 0 else max(spread, key=lambda name: spread[name])
+    base = zero if spread[zero] > 0 else max(spread, key=lambda name: spread[name])
     if spread[base] <= 0:
         raise ResectionError("resection: no line has two points at different places along it; yaw has no start value")
 
@@ -244,12 +282,13 @@ def _start(station: Station, lines: Mapping[str, ObservedLine]) -> tuple[Array, 
     inside, outside = directions(base)
     u, _, vt = np.linalg.svd(outside.T @ inside)
     attitude = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    looks = {"alpha": 0.0, "beta": 0.0}
-    for name, key, sign in (("forward", "alpha", 1.0), ("aft", "beta", -1.0)):
-        if name in lines and name != base:
-            middle = directions(name)[1].mean(axis=0) @ attitude
-            looks[key] = float(sign * np.arctan2(middle[0], middle[2]))
-    return attitude, looks
+    looks = {}
+    for name in lines:
+        inner, outer = (side.mean(axis=0) for side in directions(name))
+        seen = outer @ attitude
+        looks[name] = float(np.arctan2(seen[0], seen[2]) - np.arctan2(inner[0], inner[2]))
+    start = looks[zero]
+    return attitude @ _pitched(start), {name: 0.0 if name == zero else look - start for name, look in looks.items()}
 
 
 def _check_rank(design: Array, length: Array, names: list[str]) -> None:

@@ -1,7 +1,7 @@
 """How the intersection angles answer to errors of the station and of the ground points (paper 000, Figs. 3-5).
 
 One thing at a time, the station or all points of one strip, is moved along one axis of the frame by 0-10 m. The change
-of alpha and beta comes by exact recomputation and by the linear derivative. `STATEMENTS` holds what the paper's text
+of the angles comes by exact recomputation and by the linear derivative. `STATEMENTS` holds what the paper's text
 says of its figures, as data; `judge` holds a statement against a table. The paper's words have no numbers: "far more"
 is taken as at least twice, "nearly the same" as within a quarter, "little" as at most a quarter of the largest.
 The figures' ordinate is resection minus planes, which falls where the angle rises; the text speaks of the angle itself,
@@ -10,7 +10,7 @@ and so do the statements here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -27,18 +27,18 @@ Kind = Literal["increases", "decreases", "largest", "far_larger", "close", "litt
 AXES = ("x", "y", "z")
 _ARCSEC = np.pi / 648000
 _FAR, _CLOSE, _LITTLE = 2.0, 1.25, 0.25
-_PAIRS = ((0, 1), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Answer of both angles to a move of one thing along one axis.
+    """Answer of m dihedral angles to a move of one thing along one axis.
 
-    what: "station", "forward", "nadir" or "aft" (its points). axis: "x", "y" or "z". amount: (k,) metres.
-    change: (2, k) of alpha and beta by recomputation, radians. slope: (2,) linear derivatives at zero, rad/m.
-    curvature: (2,) relative change of the slope from 0 to the largest amount, signed; NaN where the slope is zero.
+    angles: their names. what: "station", or the line whose points move. axis: "x", "y" or "z". amount: (k,) metres.
+    change: (m, k) by recomputation, radians. slope: (m,) linear derivatives at zero, rad/m.
+    curvature: (m,) relative change of the slope from 0 to the largest amount, signed; NaN where the slope is zero.
     """
 
+    angles: tuple[str, ...]
     what: str
     axis: str
     amount: Array
@@ -48,13 +48,15 @@ class Sensitivity:
 
     def to_dict(self) -> dict[str, Any]:
         """what, axis, and the linear answer to 10 m in arcseconds."""
-        alpha, beta = (float(s) * 10.0 / _ARCSEC + 0.0 for s in self.slope)
-        return {
-            "what": self.what,
-            "axis": self.axis,
-            "alpha_arcsec_per_10m": alpha,
-            "beta_arcsec_per_10m": beta,
+        answers = {
+            f"{name}_arcsec_per_10m": float(s) * 10.0 / _ARCSEC + 0.0
+            for name, s in zip(self.angles, self.slope, strict=True)
         }
+        return {"what": self.what, "axis": self.axis, **answers}
+
+    def slope_of(self, angle: str) -> float:
+        """Linear derivative of one angle, rad/m. ValueError if it is none of `angles`."""
+        return float(self.slope[self.angles.index(angle)])
 
 
 @dataclass(frozen=True)
@@ -86,33 +88,36 @@ class Judgement:
 
 def sensitivity(
     station: Station,
-    forward: Strip,
-    nadir: Strip,
-    aft: Strip,
+    strips: Mapping[str, Strip],
+    pairs: Mapping[str, tuple[str, str]],
     *,
     method: Method = "tls",
     amounts: ArrayLike | None = None,
 ) -> tuple[Sensitivity, ...]:
-    """Twelve rows: station, forward, nadir, aft points, each along x, y, z of the coordinates' frame.
+    """Rows for the station and the points of each strip, each along x, y, z of the coordinates' frame.
 
+    strips: line -> its points. pairs: angle -> the two lines that it lies between.
     amounts: (k,) metres, first 0; 0 to 10 m in steps of 1 m by default. Raises PlaneError and AngleError.
     """
     steps = np.linspace(0.0, 10.0, 11) if amounts is None else np.asarray(amounts, np.float64)
     if steps.ndim != 1 or len(steps) < 3 or steps[0] != 0 or not np.all(np.diff(steps) > 0):
         raise ValueError("sensitivity: amounts must be three or more rising numbers, the first of them 0")
-    strips = {"forward": forward, "nadir": nadir, "aft": aft}
+    order = list(strips)
+    index = [(order.index(a), order.index(b)) for a, b in pairs.values()]
     fits = [fit_plane(station, strip, method) for strip in strips.values()]
-    start = angles_between(fits, _PAIRS)
+    start = angles_between(fits, index)
     rows = []
     for what in ("station", *strips):
-        moved = list(range(3)) if what == "station" else [list(strips).index(what)]
+        moved = list(range(len(order))) if what == "station" else [order.index(what)]
         sign = 1.0 if what == "station" else -1.0
         derivative = sign * np.einsum("mki,kij->mj", start.gradient[:, moved], _station_gains(fits, moved))
         for k, axis in enumerate(AXES):
             shifts = steps[:, None] * np.eye(3)[k]
-            values = [_angles(station, strips, fits, what, shift, method) for shift in shifts]
+            values = [angles_between(_moved(station, strips, fits, what, s, method), index).values for s in shifts]
             change = np.array(values).T - start.values[:, None]
-            rows.append(Sensitivity(what, axis, steps, change, derivative[:, k], _curvature(steps, change)))
+            rows.append(
+                Sensitivity(tuple(pairs), what, axis, steps, change, derivative[:, k], _curvature(steps, change))
+            )
     return tuple(rows)
 
 
@@ -120,23 +125,21 @@ def _station_gains(fits: list[PlaneFit], which: list[int]) -> Array:
     return np.array([fits[k].station_gain for k in which])
 
 
-def _angles(
-    station: Station, strips: dict[str, Strip], fits: list[PlaneFit], what: str, shift: Array, method: Method
-) -> Array:
-    """alpha, beta after a move; only what moved is fitted anew."""
+def _moved(
+    station: Station, strips: Mapping[str, Strip], fits: list[PlaneFit], what: str, shift: Array, method: Method
+) -> list[PlaneFit]:
+    """The planes after a move; only what moved is fitted anew."""
     if what == "station":
         place = Station(station.position + shift, station.covariance)
-        planes = [fit_plane(place, strip, method) for strip in strips.values()]
-    else:
-        planes = [
-            fit_plane(station, strip.shifted(shift), method) if name == what else fit
-            for (name, strip), fit in zip(strips.items(), fits, strict=True)
-        ]
-    return angles_between(planes, _PAIRS).values
+        return [fit_plane(place, strip, method) for strip in strips.values()]
+    return [
+        fit_plane(station, strip.shifted(shift), method) if name == what else fit
+        for (name, strip), fit in zip(strips.items(), fits, strict=True)
+    ]
 
 
 def _curvature(steps: Array, change: Array) -> Array:
-    """(2,) second-order part of a parabola through the change: how much its slope grows over the range, relative."""
+    """(m,) second-order part of a parabola through the change: how much its slope grows over the range, relative."""
     unit = steps / steps[-1]
     design = np.column_stack([unit, unit**2])
     first, second = np.linalg.lstsq(design, change.T, rcond=None)[0]
@@ -144,10 +147,9 @@ def _curvature(steps: Array, change: Array) -> Array:
 
 
 def judge(statement: Statement, table: Sequence[Sensitivity]) -> Judgement:
-    """Whether a statement of the paper holds in a table."""
-    index = {"alpha": 0, "beta": 1}[statement.angle]
+    """Whether a statement of the paper holds in a table with alpha and beta of forward, nadir and aft."""
     rows = {row.axis: row for row in table if row.what == statement.what}
-    slope = {axis: float(rows[axis].slope[index]) * 10.0 / _ARCSEC for axis in AXES}
+    slope = {axis: rows[axis].slope_of(statement.angle) * 10.0 / _ARCSEC for axis in AXES}
     chosen = [slope[axis] for axis in statement.axes]
     size = [abs(v) for v in chosen]
     rest = max((abs(slope[axis]) for axis in statement.others), default=float("nan"))
@@ -166,11 +168,12 @@ def judge(statement: Statement, table: Sequence[Sensitivity]) -> Judgement:
         ratio = max(size) / rest
         holds = ratio <= _LITTLE
     elif statement.kind == "steepens":
-        numbers = {axis: float(rows[axis].curvature[index]) for axis in statement.axes}
+        at = rows["x"].angles.index(statement.angle)
+        numbers = {axis: float(rows[axis].curvature[at]) for axis in statement.axes}
         ratio = min(numbers.values())
         holds = ratio > 0
     else:
-        holds = all(float(rows[a].slope[0]) * float(rows[a].slope[1]) < 0 for a in statement.axes)
+        holds = all(rows[a].slope_of("alpha") * rows[a].slope_of("beta") < 0 for a in statement.axes)
     return Judgement(statement, holds, numbers, ratio)
 
 

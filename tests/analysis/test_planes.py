@@ -147,7 +147,7 @@ def test_look_angles_without_errors(method):
     angles = intersection_angles(*fits(SCENE, method))
     assert np.abs(angles.values - LOOK).max() < 1e-8 * ARCSEC
     assert np.abs(angles.printed - LOOK).max() < 1e-8 * ARCSEC
-    assert not angles.folded
+    assert not np.any(angles.folded)
 
 
 def test_printed_equation_turns_every_plane_by_half_a_turn_about_z():

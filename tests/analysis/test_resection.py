@@ -1,5 +1,7 @@
 """Space resection of three lines against the synthetic pass of test_planes, whose rays are turned by OpenCV."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -8,13 +10,19 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Station, Strip
 from analysis.orbit.resection import ObservedLine, ResectionError, resect
-from tests.analysis.test_planes import ARCSEC, DEG, LOOK, SCENE, bounds, descending_pass, fits, noisy
+from tests.analysis.test_planes import ARCSEC, DEG, LINES, LOOK, SCENE, bounds, descending_pass, fits, noisy, rotation
 
 FALSE_ALARM = 1e-6
 
 
+PAIRS = (("forward", "nadir"), ("nadir", "aft"))
+NAMES = ("roll", "pitch", "yaw", "forward look", "aft look")
+
+
 def observed(scene, noise=1.5, sigma=0.0, lines=("forward", "nadir", "aft")):
-    return {k: ObservedLine.of(Strip.of(scene.points[k], noise), scene.tangents[k], sigma) for k in lines}
+    return {
+        k: ObservedLine.of(Strip.of(scene.points[k], noise), scene.tangents[k], sigma, look=LINES[k]) for k in lines
+    }
 
 
 def turn_error(result, body):
@@ -26,7 +34,7 @@ def turn_error(result, body):
 def test_exact_geometry_is_recovered(sigma_station):
     """Coordinates of 7e6 m are rounded to 1e-9 m, seen from 500 km 4e-10 arcsec per point."""
     result = resect(Station.of(SCENE.station, sigma_station), observed(SCENE))
-    assert np.abs(np.array([result.alpha, result.beta]) - LOOK).max() < 1e-8 * ARCSEC
+    assert np.abs(result.angles(PAIRS) - LOOK).max() < 1e-8 * ARCSEC
     # roll and pitch share their error with a free station coordinate
     assert np.abs(turn_error(result, SCENE.body)).max() < 1e-7 * ARCSEC
     assert result.station == pytest.approx(SCENE.station, abs=1e-6)
@@ -38,9 +46,9 @@ def test_exact_geometry_is_recovered(sigma_station):
 def test_unequal_look_angles_and_distortion():
     """Look angles of a two-line camera and 3 deg: each line's own. A curved line has tangents across, too."""
     scene = descending_pass(looks={"forward": 26 * DEG, "nadir": -5 * DEG, "aft": -8 * DEG})
-    result = resect(Station.of(scene.station), observed(scene))
-    assert result.alpha == pytest.approx(31 * DEG, abs=1e-13)
-    assert result.beta == pytest.approx(3 * DEG, abs=1e-13)
+    lines = {k: ObservedLine.of(Strip.of(p, 1.5), scene.tangents[k]) for k, p in scene.points.items()}
+    result = resect(Station.of(scene.station), lines)
+    assert result.angles(PAIRS) == pytest.approx([31 * DEG, 3 * DEG], abs=1e-13)
     # a line turned by 1 deg about its line of sight: tx = -ty' sin(1 deg), ty = ty' cos(1 deg)
     turned = descending_pass(twist=1 * DEG)
     lines = observed(turned)
@@ -48,7 +56,7 @@ def test_unequal_look_angles_and_distortion():
     seen = np.column_stack([-np.sin(DEG) * w, np.cos(DEG) * w])
     lines["forward"] = ObservedLine.of(lines["forward"].strip, seen)
     result = resect(Station.of(turned.station), lines)
-    assert result.alpha == pytest.approx(LOOK, abs=1e-13)
+    assert result.looks["forward"] == pytest.approx(LOOK, abs=1e-13)
     assert result.chi_square < 1e-10
 
 
@@ -67,14 +75,19 @@ def test_covariance_is_that_of_a_numerical_jacobian():
                 moved[index] += sign * step
                 lines[name] = ObservedLine.of(Strip.of(moved, 2.0), scene.tangents[name])
                 result = resect(station, lines)
-                change.append(np.concatenate([turn_error(result, scene.body), [result.alpha, result.beta]]))
+                looks = [result.looks["forward"], result.looks["aft"]]
+                change.append(np.concatenate([turn_error(result, scene.body), looks]))
             slope = (change[0] - change[1]) / (2 * step)
             total += 4.0 * np.outer(slope, slope)
     # the step's third order is (10 / 5e5)^2; weights that move with the points 10 / 5e5 of the off-diagonal terms
     scale = np.sqrt(np.outer(np.diag(total), np.diag(total)))
     assert np.abs((base.covariance - total) / scale).max() < 1e-5
-    assert base.names == ("roll", "pitch", "yaw", "alpha", "beta")
-    assert base.sigma["alpha"] == pytest.approx(np.sqrt(total[3, 3]), rel=1e-5)
+    assert base.names == NAMES
+    assert base.sigma["forward look"] == pytest.approx(np.sqrt(total[3, 3]), rel=1e-5)
+    # alpha is the forward look, beta minus the aft one, and their difference from forward to aft
+    part, signs = total[3:, 3:], np.array([[1.0, 0.0], [0.0, -1.0], [1.0, -1.0]])
+    found = base.angle_covariance((*PAIRS, ("forward", "aft")))
+    assert found == pytest.approx(signs @ part @ signs.T, rel=1e-4)
 
 
 @pytest.mark.parametrize(("sigma_station", "sigma_image"), [(0.0, 0.0), (1.0, 3e-6)])
@@ -89,7 +102,9 @@ def test_scatter_agrees_with_covariance(sigma_station, sigma_image):
             inside = np.column_stack([np.zeros(20), scene.tangents[name]]) + sigma_image * rng.standard_normal((20, 2))
             lines[name] = ObservedLine.of(Strip.of(points, 1.5), inside, sigma_image)
         result = resect(Station.of(scene.station, sigma_station), lines)
-        error = np.concatenate([turn_error(result, SCENE.body), [result.alpha - LOOK, result.beta - LOOK]])
+        error = np.concatenate(
+            [turn_error(result, SCENE.body), [result.looks["forward"] - LOOK, result.looks["aft"] + LOOK]]
+        )
         if sigma_station:
             error = np.concatenate([error, result.station - SCENE.station])
         total += error @ np.linalg.solve(result.covariance, error)
@@ -110,21 +125,25 @@ def test_planes_and_resection_differ_within_their_sigmas():
         scene = noisy(SCENE, rng, 1.5, 0.5)
         planes = intersection_angles(*fits(scene, noise=1.5, sigma_station=0.5))
         result = resect(Station.of(scene.station, 0.5), observed(scene))
-        differences.append(planes.values - [result.alpha, result.beta])
+        differences.append(planes.values - result.angles(PAIRS))
         sigmas.append(planes.sigma)
         # the stiffer model cannot be less certain
-        assert np.all(np.diag(result.angle_covariance) < np.diag(planes.covariance) * (1 + 1e-9))
+        assert np.all(np.diag(result.angle_covariance(PAIRS)) < np.diag(planes.covariance) * (1 + 1e-9))
     assert np.std(differences) < 0.5 * np.mean(sigmas)
     assert np.std(differences) < 0.2 * ARCSEC
 
 
 def test_what_the_points_cannot_tell_is_named():
     station = Station.of(SCENE.station)
-    with pytest.raises(ResectionError, match=r"cannot tell: .*pitch.*alpha.*beta") as caught:
-        resect(station, observed(SCENE, lines=("forward", "aft")))
-    # pitch forward, alpha smaller and beta larger by the same: no point moves
-    vector = caught.value.null_vectors[0]
-    assert vector / vector[1] == pytest.approx([0, 1, 0, -1, 1], abs=1e-6)
+    # two points of a line at one place but for 1e-12: yaw moves them as pitch does
+    tangent, arm = np.array([0.05, 0.05 + 1e-12]), SCENE.points["nadir"][0] - SCENE.station
+    twice = np.array([arm, arm * (1.0 + 1e-9)]) + SCENE.station
+    with pytest.raises(ResectionError, match=r"cannot tell: .*yaw") as caught:
+        resect(station, {"nadir": ObservedLine.of(Strip.of(twice, 1.0), tangent)})
+    vector = dict(zip(NAMES[:3], caught.value.null_vectors[0], strict=True))
+    # a turn about the line of sight itself, 0.05 to the right of the vertical
+    assert abs(vector["roll"]) < 0.2
+    assert vector["yaw"] == pytest.approx(1.0)
     # one point per line
     few = {k: ObservedLine.of(Strip.of(p[:1], 1.0), SCENE.tangents[k][:1]) for k, p in SCENE.points.items()}
     with pytest.raises(ResectionError, match="no line has two points at different places"):
@@ -132,26 +151,62 @@ def test_what_the_points_cannot_tell_is_named():
     nadir = observed(SCENE, lines=("nadir",))
     alone = resect(station, nadir)
     assert alone.names == ("roll", "pitch", "yaw")
-    assert np.isnan(alone.alpha)
-    with pytest.raises(ResectionError, match="not both"):
-        _ = alone.angle_covariance
-    pair = resect(station, observed(SCENE, lines=("forward", "nadir")))
-    assert pair.alpha == pytest.approx(LOOK, abs=1e-13)
-    assert np.isnan(pair.beta)
+    for method in (alone.angles, alone.angle_covariance):
+        with pytest.raises(ResectionError, match="no aft and no forward line among nadir"):
+            method((("forward", "aft"),))
+
+
+@pytest.mark.parametrize("pair", [("forward", "nadir"), ("forward", "aft"), ("aft", "nadir")])
+def test_two_lines_tell_their_angle(pair):
+    """One angle, four unknowns; which of the lines is the reference changes neither the angle nor its sigma."""
+    station, lines = Station.of(SCENE.station, 0.5), observed(SCENE, lines=pair)
+    first, second = (resect(station, lines, reference=name) for name in pair)
+    expected = LINES[pair[0]] - LINES[pair[1]]
+    for result, reference in ((first, pair[0]), (second, pair[1])):
+        assert result.looks[reference] == 0.0
+        assert len(result.names) == 7
+        assert result.angles((pair,))[0] == pytest.approx(expected, abs=1e-8 * ARCSEC)
+        assert result.angles((pair[::-1],))[0] == pytest.approx(-expected, abs=1e-8 * ARCSEC)
+    assert first.angle_covariance((pair,)) == pytest.approx(second.angle_covariance((pair,)), rel=1e-6)
+    assert second.attitude == pytest.approx(
+        first.attitude @ rotation([0, LINES[pair[1]] - LINES[pair[0]], 0]), abs=1e-9
+    )
+
+
+def test_projection_centres_beside_the_station():
+    """Cameras 1.4 m before and behind the station, each pixel with its own: 0.6 arcsec each if they are left out."""
+    scene = descending_pass(looks={"forward": 26 * DEG, "backward": -5 * DEG})
+    rng, lines, bare = np.random.default_rng(3), {}, {}
+    for name, look in (("forward", 26 * DEG), ("backward", -5 * DEG)):
+        axes = scene.body @ rotation([0, look, 0])
+        middle = np.array([np.copysign(1.4, look), 0.0, 0.2])
+        offset = middle + rng.uniform(-0.1, 0.1, (20, 3))
+        strip = Strip.of(scene.points[name] + offset @ axes.T, 1.5)
+        lines[name] = ObservedLine.of(strip, scene.tangents[name], look=look, offset=offset)
+        bare[name] = ObservedLine.of(strip, scene.tangents[name])
+    pair = (("forward", "backward"),)
+    found, wrong = (resect(Station.of(scene.station), given, reference="backward") for given in (lines, bare))
+    assert found.angles(pair)[0] == pytest.approx(31 * DEG, abs=1e-8 * ARCSEC)
+    assert found.chi_square < 1e-10
+    assert found.axes("forward") == pytest.approx(scene.body @ rotation([0, 26 * DEG, 0]), abs=1e-12)
+    assert abs(wrong.angles(pair)[0] - 31 * DEG) > 0.5 * ARCSEC
 
 
 def test_bad_input():
     station = Station.of(SCENE.station)
     lines = observed(SCENE)
-    swapped = {"forward": lines["aft"], "nadir": lines["nadir"], "aft": lines["forward"]}
+    swapped = {
+        k: replace(lines[other], look=LINES[k])
+        for k, other in (("forward", "aft"), ("nadir", "nadir"), ("aft", "forward"))
+    }
     with pytest.raises(ResectionError, match="lines exchanged"):
         resect(station, swapped)
-    mirrored = {k: ObservedLine.of(v.strip, -v.tangent[:, 1]) for k, v in lines.items()}
+    mirrored = {k: replace(v, tangent=-v.tangent) for k, v in lines.items()}
     with pytest.raises(ResectionError, match="counted from the other end"):
         resect(station, mirrored)
-    with pytest.raises(ResectionError, match="must be named"):
-        resect(station, {"left": lines["nadir"]})
-    with pytest.raises(ResectionError, match="must be named"):
+    with pytest.raises(ResectionError, match="reference 'left' is none of the lines forward, nadir, aft"):
+        resect(station, lines, reference="left")
+    with pytest.raises(ResectionError, match="no lines"):
         resect(station, {})
     with pytest.raises(ResectionError, match="positive definite"):
         resect(Station.of(SCENE.station, np.diag([1.0, 1.0, 0.0])), lines)
@@ -160,5 +215,8 @@ def test_bad_input():
     for tangent in (np.full(20, np.nan), np.zeros(3), np.zeros((20, 3))):
         with pytest.raises(ResectionError, match="tangents"):
             ObservedLine.of(lines["nadir"].strip, tangent)
+    for offset in (np.zeros(2), np.zeros((3, 3)), [np.nan, 0.0, 0.0]):
+        with pytest.raises(ResectionError, match="offset"):
+            ObservedLine.of(lines["nadir"].strip, SCENE.tangents["nadir"], offset=offset)
     with pytest.raises(ResectionError, match="sigma"):
         ObservedLine.of(lines["nadir"].strip, SCENE.tangents["nadir"], -1.0)

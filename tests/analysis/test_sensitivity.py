@@ -10,10 +10,12 @@ from analysis.orbit.sensitivity import STATEMENTS, judge, sensitivity
 from tests.analysis.test_planes import ARCSEC, DEG, LOOK, SCENE, descending_pass, noisy, rotation
 
 AXES = "xyz"
+PAIRS = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
 
 
 def table(scene=SCENE, method="tls", **options):
-    return sensitivity(Station.of(scene.station, 0.5), *scene.strips(1.5), method=method, **options)
+    strips = dict(zip(scene.points, scene.strips(1.5), strict=True))
+    return sensitivity(Station.of(scene.station, 0.5), strips, PAIRS, method=method, **options)
 
 
 ROWS = {(row.what, row.axis): row for row in table()}
@@ -99,7 +101,8 @@ def test_statements_can_fail():
     """The southern hemisphere, and forward and aft points exchanged, contradict the paper."""
     rows = table(descending_pass(lat=-40 * DEG))
     assert not all(judge(s, rows).holds for s in STATEMENTS if s.kind in ("increases", "decreases"))
-    swapped = sensitivity(Station.of(SCENE.station, 0.5), *SCENE.strips(1.5)[::-1])
+    exchanged = dict(zip(SCENE.points, SCENE.strips(1.5)[::-1], strict=True))
+    swapped = sensitivity(Station.of(SCENE.station, 0.5), exchanged, PAIRS)
     failed = {statement.kind for statement in STATEMENTS if not judge(statement, swapped).holds}
     assert failed >= {"increases", "decreases", "largest", "far_larger"}
 
@@ -110,6 +113,16 @@ def test_rows_for_the_result():
     assert set(row) == {"what", "axis", "alpha_arcsec_per_10m", "beta_arcsec_per_10m"}
     assert row["alpha_arcsec_per_10m"] == pytest.approx(ROWS["nadir", "y"].change[0, -1] / ARCSEC, rel=1e-3)
     assert ROWS["nadir", "y"].amount[-1] == 10.0
+
+
+def test_any_lines_and_angles():
+    """Two lines and one angle have the same numbers as among three; a third line that no angle needs is no matter."""
+    strips = dict(zip(SCENE.points, SCENE.strips(1.5), strict=True))
+    two = {name: strips[name] for name in ("aft", "nadir")}
+    for given in (two, strips):
+        for row in sensitivity(Station.of(SCENE.station, 0.5), given, {"off_axis": ("aft", "nadir")}):
+            assert set(row.to_dict()) == {"what", "axis", "off_axis_arcsec_per_10m"}
+            assert row.slope_of("off_axis") == pytest.approx(ROWS[row.what, row.axis].slope_of("beta"), abs=1e-20)
 
 
 @pytest.mark.parametrize("amounts", [[0, 1], [1, 2, 3], [0, 2, 1], [0, 1, np.nan], np.zeros((3, 3))])

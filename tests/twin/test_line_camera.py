@@ -18,7 +18,14 @@ from scenes.spec import Spec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.translate import validate
 from scenes.yaml_file import dump_yaml, parse_yaml
-from twin.orbit.line_camera import dihedral_angle, line_cameras, line_normal, look_angle, traced_line_cameras
+from twin.orbit.line_camera import (
+    along_track_angle,
+    dihedral_angle,
+    line_cameras,
+    line_normal,
+    look_angle,
+    traced_line_cameras,
+)
 
 ARCSEC = math.radians(1.0 / 3600.0)
 TH1 = load_three_line_camera("th1")
@@ -31,13 +38,17 @@ def payload(**lines) -> ThreeLineCameraSpec:
 
 
 def test_the_file() -> None:
-    assert list(TH1.lines) == ["forward", "nadir", "aft"]
-    assert TH1.pixels == 12000
-    for line, degrees in zip(TH1.lines.values(), (25, 0, -25), strict=True):
-        assert line.focal_length / TH1.pitch == pytest.approx(1e5, rel=1e-12)
+    assert list(TH1.lines) == ["forward", "nadir", "aft", "high_resolution", "multispectral"]
+    ground = {"high_resolution": 2.0, "multispectral": 10.0}
+    for (name, line), degrees in zip(TH1.lines.items(), (25, 0, -25, 2, 0), strict=True):
+        pixels, pitch = TH1.pixels_of(name), TH1.pitch_of(name)
+        pixel = ground.get(name, 5.0)
+        assert 500e3 * pitch / line.focal_length == pytest.approx(pixel, rel=1e-12)
+        assert pixels * pixel == pytest.approx(60e3)
         assert math.degrees(line.look) == pytest.approx(degrees, abs=1e-12)
-        half = 0.5 * TH1.pixels * TH1.pitch
-        assert abs(line.k1) * half**3 < 0.5 * TH1.pitch  # as the file says
+        half = 0.5 * pixels * pitch
+        assert abs(line.k1) * half**3 < 0.5 * pitch  # as the file says
+        assert line_cameras(TH1)[name].pixels == pixels
     again: Spec = validate(ThreeLineCameraSpec, parse_yaml(dump_yaml(TH1.plain())))
     assert again == TH1
 
@@ -57,20 +68,21 @@ def test_a_wrong_file_is_told_by_line() -> None:
 def test_ideal_lines_obey_collinearity(name: str) -> None:
     """The look, projected through the lens onto the real image plane, and the image corrected for distortion agree."""
     line, camera = TH1.lines[name], line_cameras(TH1)[name]
-    pixel = np.array([-0.5, 0.0, 17.3, 5999.5, 9000.0, 11999.5])
+    last, pitch = TH1.pixels_of(name) - 1.0, TH1.pitch_of(name)
+    pixel = np.array([-0.5, 0.0, 17.3, 0.5 * last, 0.75 * last, last + 0.5])
     mounted = Rotation.from_euler("Y", line.look) * Rotation.from_rotvec(line.rotate)
     x, y, z = mounted.inv().apply(camera.look(pixel)).T
     assert np.all(z > 0.99)
-    place = np.stack([np.zeros_like(pixel), (pixel - 5999.5) * 6.5e-6], axis=-1) - np.array(line.principal_point)
+    place = np.stack([np.zeros_like(pixel), (pixel - 0.5 * last) * pitch], axis=-1) - np.array(line.principal_point)
     corrected = place * (1.0 + line.k1 * np.sum(place**2, axis=-1, keepdims=True))
-    # rounding of a length of 0.65 m
-    np.testing.assert_allclose(-line.focal_length * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=1e-15)
+    # rounding of a length of 0.65 to 1.6 m
+    np.testing.assert_allclose(-line.focal_length * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=3e-15)
 
 
 def test_first_pixel_sees_the_right_and_forward_is_ahead() -> None:
     cameras = line_cameras(TH1)
     for camera in cameras.values():
-        ends = camera.look(np.array([0.0, 11999.0]))
+        ends = camera.look(np.array([0.0, camera.pixels - 1.0]))
         assert ends[0, 1] > 0.05
         assert ends[1, 1] < -0.05
     assert cameras["forward"].look(np.array([6000.0]))[0, 0] > 0.42
@@ -185,6 +197,18 @@ def test_a_turn_within_the_plane_changes_the_look_but_not_the_planes() -> None:
     )
     assert dihedral_angle(*cameras.values()) == pytest.approx(a, abs=1e-13)
     assert look_angle(*cameras.values()) == pytest.approx(math.acos(math.cos(a) * math.cos(w)), abs=1e-14)
+
+
+def test_the_angle_along_the_track() -> None:
+    """The turn about Y alone, with its sign, whatever the roll and the turn about the look: to second order, which is
+    the roll (5 arcmin) squared times the angle."""
+    a = math.radians(2.0)
+    spec = payload(nadir={"look": "0 deg"}, ahead={"look": "2 deg", "rotate": ["5 arcmin", "0 deg", "10 arcmin"]})
+    nadir, ahead = line_cameras(spec).values()
+    assert along_track_angle(ahead, nadir) == pytest.approx(a, rel=5e-6)
+    assert along_track_angle(nadir, ahead) == -along_track_angle(ahead, nadir)
+    assert look_angle(ahead, nadir) > 1.0008 * a
+    assert dihedral_angle(ahead, nadir) > 1.003 * a
 
 
 def test_normals_point_forward_and_a_bent_line_has_a_best_plane() -> None:

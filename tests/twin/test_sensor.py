@@ -170,7 +170,7 @@ def test_aberration_against_erfa() -> None:
         np.testing.assert_allclose(aberrated(expected, -velocity), direction, rtol=0, atol=2e-15)
 
 
-@pytest.mark.parametrize("name", list(TH1))
+@pytest.mark.parametrize("name", ["forward", "nadir", "aft"])
 def test_aberration_on_the_ground(name: str) -> None:
     """What is seen lies forward of where it is, by v/c = 25 urad: the true ground point is behind, by 13 m at nadir."""
     off, on = (sensor(TH1[name], e).ground(5000.0, 5999.5)[0] for e in (NO_EFFECTS, LightEffects(False, True, False)))
@@ -262,7 +262,7 @@ def test_the_standard_atmosphere() -> None:
     np.testing.assert_allclose(shift[1:] / shift[0], np.array([701.08, 226.32, 120.45]) / 1013.25, rtol=2e-3)
 
 
-@pytest.mark.parametrize("name", list(TH1))
+@pytest.mark.parametrize("name", ["forward", "nadir", "aft"])
 def test_refraction_on_the_ground(name: str) -> None:
     """The ray comes in steeper: the point is nearer to the satellite's nadir by 1.5 m at 25 degrees, no higher."""
     model = sensor(TH1[name], LightEffects(False, False, True))

@@ -2,38 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from analysis.orbit.sensitivity import STATEMENTS, judge
-from twin.orbit.angle_analysis import ANGLES, ARCSEC, AngleRun, Scatter, resected, true_angles
+from twin.orbit.angle_analysis import ARCSEC, AngleRun, Scatter, values_of
 
 PRINTED_DIFFERENCE_ARCSEC = {"alpha": 0.44, "beta": 1.53}
 """Resection and planes, paper 000, Table 1."""
 
 
 def to_dict(run: AngleRun, seed: int) -> dict[str, Any]:
-    """The numbers of a test as plain data; what could not be computed is None."""
-    estimate, flight = run.estimate, run.flight
-    section = estimate.resection
-    sigma = [section.sigma[name] for name in ANGLES]
+    """The numbers of a test as plain data; what could not be computed is None. Angles' keys begin with their names."""
+    estimate, flight, names = run.estimate, run.flight, run.names
+
+    def degrees(values: Iterable[float]) -> dict[str, float | None]:
+        return {f"{name}_deg": _number(np.degrees(v)) for name, v in zip(names, values, strict=True)}
+
+    def sigmas(values: Iterable[float]) -> dict[str, float | None]:
+        return {f"{name}_sigma_arcsec": _number(v / ARCSEC) for name, v in zip(names, values, strict=True)}
+
+    def arcsec(values: Iterable[float]) -> dict[str, float | None]:
+        return {name: _number(v / ARCSEC) for name, v in zip(names, values, strict=True)}
+
     return {
         "seed": seed,
         "time_s": flight.spec.time,
+        "angles": {name: list(pair) for name, pair in flight.pairs.items()},
         "planes": {
-            method: {**_degrees(angles.values), **_sigmas(angles.sigma)} for method, angles in estimate.angles.items()
+            method: {**degrees(angles.values), **sigmas(angles.sigma)} for method, angles in estimate.angles.items()
         },
-        "look": _degrees(estimate.look),
-        "resection": {**_degrees(resected(section)), **_sigmas(sigma), "p_value": section.p_value},
+        "folded": {name: bool(f) for name, f in zip(names, estimate.angles["tls"].folded, strict=True)},
+        "look": degrees(estimate.look),
+        "along_track": {**degrees(estimate.along.values), **sigmas(estimate.along.sigma)},
+        "resection": {
+            **degrees(run.resected),
+            **sigmas(run.resected_sigma),
+            "p_value": estimate.resection.p_value,
+        },
         "truth": {
-            "look": _degrees(true_angles(flight.look)),
-            "dihedral": _degrees(true_angles(flight.dihedral)),
+            "look": degrees(flight.look.values()),
+            "dihedral": degrees(flight.dihedral.values()),
+            "along_track": degrees(flight.along_track.values()),
         },
-        "difference_arcsec": _arcsec(run.difference),
-        "difference_sigma_arcsec": _arcsec(run.difference_sigma),
-        "difference_printed_arcsec": dict(PRINTED_DIFFERENCE_ARCSEC),
+        "change_arcsec": {
+            "ground": arcsec(run.change),
+            "truth": arcsec(values_of(flight.look) - values_of(flight.laboratory_look)),
+            "trace": {name: _number(v / ARCSEC) for name, v in flight.trace.items()},
+        },
+        "difference_arcsec": arcsec(run.difference),
+        "difference_sigma_arcsec": arcsec(run.difference_sigma),
+        "difference_printed_arcsec": dict(PRINTED_DIFFERENCE_ARCSEC) if run.of_paper else {},
         "sensitivity": [row.to_dict() for row in run.table],
         "statements": [
             {
@@ -43,18 +64,18 @@ def to_dict(run: AngleRun, seed: int) -> dict[str, Any]:
                 "ratio": _number(j.ratio),
                 "numbers": {axis: _number(v) for axis, v in j.numbers.items()},
             }
-            for j in (judge(statement, run.table) for statement in STATEMENTS)
+            for j in (judge(statement, run.table) for statement in STATEMENTS if run.of_paper)
         ],
         "effects": [
-            {"what": row.what, "bias_arcsec": _arcsec(row.bias), "corrected_arcsec": _arcsec(row.left)}
+            {"what": row.what, "bias_arcsec": arcsec(row.bias), "corrected_arcsec": arcsec(row.left)}
             for row in run.effects
         ],
         "frames": [
             {
                 "frame": row.frame,
                 "method": row.method,
-                **_degrees(row.values),
-                **_sigmas(row.sigma),
+                **degrees(row.values),
+                **sigmas(row.sigma),
                 "least_normal_z": row.steepest,
                 "near_vertical": row.warned,
             }
@@ -62,32 +83,20 @@ def to_dict(run: AngleRun, seed: int) -> dict[str, Any]:
         ],
         "scatter": {
             "passes": len(run.planes.values),
-            "planes": _scatter(run.planes),
-            "resection": _scatter(run.resection),
+            "planes": _scatter(names, run.planes),
+            "along_track": _scatter(names, run.along),
+            "resection": _scatter(names, run.resection),
         },
         "height_m_per_arcsec": dict(run.height),
     }
 
 
-def _scatter(scatter: Scatter) -> dict[str, Any]:
+def _scatter(names: Sequence[str], scatter: Scatter) -> dict[str, Any]:
+    rows = {"bias": scatter.bias, "spread": scatter.spread, "sigma": scatter.sigma}
     return {
-        "bias_arcsec": _arcsec(scatter.bias),
-        "spread_arcsec": _arcsec(scatter.spread),
-        "sigma_arcsec": _arcsec(scatter.sigma),
-        "p_value": {name: float(p) for name, p in zip(ANGLES, scatter.tail, strict=True)},
+        **{f"{key}_arcsec": dict(zip(names, (row / ARCSEC).tolist(), strict=True)) for key, row in rows.items()},
+        "p_value": dict(zip(names, scatter.tail.tolist(), strict=True)),
     }
-
-
-def _degrees(values: Iterable[float]) -> dict[str, float | None]:
-    return {f"{name}_deg": _number(np.degrees(v)) for name, v in zip(ANGLES, values, strict=True)}
-
-
-def _sigmas(values: Iterable[float]) -> dict[str, float | None]:
-    return {f"{name}_sigma_arcsec": _number(v / ARCSEC) for name, v in zip(ANGLES, values, strict=True)}
-
-
-def _arcsec(values: Iterable[float]) -> dict[str, float | None]:
-    return {name: _number(v / ARCSEC) for name, v in zip(ANGLES, values, strict=True)}
 
 
 def _number(value: float) -> float | None:

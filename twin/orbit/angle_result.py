@@ -7,17 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.backend import Backend
-from scenes.units import ANGLE, LENGTH, format_quantity
+from scenes.job import DEFAULT_PIVOT, PerturbationSpec
+from scenes.units import LENGTH, format_quantity
 from twin.artefact import Cell, Table
-from twin.orbit.angle_analysis import ANGLES, ARCSEC, AngleRun, resected, run_passes, true_angles
+from twin.orbit.angle_analysis import ARCSEC, AngleRun, run_passes, values_of
+from twin.orbit.angle_figure import signs
 from twin.orbit.angle_json import PRINTED_DIFFERENCE_ARCSEC, to_dict
-from twin.orbit.angle_sections import sections
+from twin.orbit.angle_sections import listed, sections
 from twin.report.numbers import fixed
 from twin.trial.result import Advance, LabResult
 
 if TYPE_CHECKING:
     from scenes.orbit_setup import AngleSetup
 
+SIGHTED = "lines of sight in the tls planes"
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",
     "corrected": "planes, eq. 5 with the right sign",
@@ -26,26 +29,16 @@ METHOD_NAMES = {
 
 
 def run_angle(setup: AngleSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Simulate a pass and put the result together; nothing is traced, so that the backend is not used."""
-    return angle_result(run_passes(setup, seed, advance), setup, seed)
+    """Simulate a pass and put the result together; the backend traces the lines of an instrument."""
+    return angle_result(run_passes(setup, seed, advance, backend), setup, seed)
 
 
 def angle_result(run: AngleRun, setup: AngleSetup, seed: int) -> LabResult:
     """Numbers, table and report of an intersection angle test."""
-    flight = run.flight
-    found, sigma = run.estimate.angles["tls"].values, run.estimate.angles["tls"].sigma
-    off = (found - true_angles(flight.dihedral)) / ARCSEC
-    difference = run.difference / ARCSEC
-    lead = (
-        f"α = {np.degrees(found[0]):.6f}° and β = {np.degrees(found[1]):.6f}° with sigmas of {sigma[0] / ARCSEC:.2f}″ "
-        f"and {sigma[1] / ARCSEC:.2f}″ by planes, {fixed(off[0], 2)}″ and {fixed(off[1], 2)}″ from the truth. "
-        f"Planes minus resection: {fixed(difference[0], 3)}″ and {fixed(difference[1], 3)}″; the paper prints "
-        f"{PRINTED_DIFFERENCE_ARCSEC['alpha']}″ and {PRINTED_DIFFERENCE_ARCSEC['beta']}″.",
-    )
     return LabResult(
         "angle",
         "Intersection angles from ground points",
-        lead,
+        _lead(run),
         _facts(setup),
         to_dict(run, seed),
         _methods(run),
@@ -54,43 +47,76 @@ def angle_result(run: AngleRun, setup: AngleSetup, seed: int) -> LabResult:
     )
 
 
+def _lead(run: AngleRun) -> tuple[str, ...]:
+    names, flight, few = signs(run.names), run.flight, run.narrow
+    tls, along = run.estimate.angles["tls"], run.estimate.along
+    truth = np.where(few, values_of(flight.along_track), values_of(flight.dihedral))
+    found, sigma = np.where(few, along.values, tls.values), np.where(few, along.sigma, tls.sigma) / ARCSEC
+    off, difference = (found - truth) / ARCSEC, run.difference / ARCSEC
+    lead = []
+    for which, by in ((np.flatnonzero(~few), "by planes"), (np.flatnonzero(few), "along the track, by planes")):
+        if not len(which):
+            continue
+        said = (
+            f"{listed([f'{names[k]} = {np.degrees(found[k]):.6f}°' for k in which])} with "
+            f"{'a sigma' if len(which) == 1 else 'sigmas'} of {listed([f'{sigma[k]:.2f}″' for k in which])} {by}, "
+            f"{listed([f'{fixed(off[k], 2)}″' for k in which])} from the truth. "
+            f"Planes minus resection: {listed([f'{fixed(difference[k], 3)}″' for k in which])}"
+        )
+        if run.of_paper and by == "by planes":
+            printed = PRINTED_DIFFERENCE_ARCSEC
+            said += f"; the paper prints {printed['alpha']}″ and {printed['beta']}″"
+        lead.append(f"{said}.")
+    if flight.trace:
+        (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC
+        at = run.names.index(name)
+        sigma_1 = along.sigma[at] / ARCSEC
+        lead.append(
+            f"Since the laboratory {names[at]} has changed by {fixed(change[at], 2)}″ ± {sigma_1:.2f}″ as seen from "
+            f"the ground; the trace of the instrument says {fixed(true / ARCSEC, 3)}″."
+        )
+    return tuple(lead)
+
+
 def _methods(run: AngleRun) -> Table:
-    truth, estimate = run.flight, run.estimate
-    look, dihedral = true_angles(truth.look), true_angles(truth.dihedral)
-    section = estimate.resection
-    sigma = np.array([section.sigma[name] for name in ANGLES])
-    rows: list[tuple[Cell, ...]] = [
-        (METHOD_NAMES[method], "dihedral", *_pairs(angles.values, angles.sigma, dihedral))
-        for method, angles in estimate.angles.items()
-    ]
-    tls = estimate.angles["tls"]
-    rows.append(("lines of sight in the tls planes", "look", *_pairs(estimate.look, tls.sigma, look)))
-    rows.append(("resection", "look", *_pairs(resected(section), sigma, look)))
-    for name, true in (("dihedral", dihedral), ("look", look)):
-        alpha, beta = (float(v) for v in np.degrees(true))
-        rows.append(("true camera", name, alpha, None, None, beta, None, None))
-    heads = ("method", "angle", "α, deg", "σ, arcsec", "− truth, arcsec", "β, deg", "σ, arcsec", "− truth, arcsec")
+    truth, estimate, names = run.flight, run.estimate, signs(run.names)
+    look, dihedral, along = (values_of(a) for a in (truth.look, truth.dihedral, truth.along_track))
+    rows: list[tuple[Cell, ...]] = []
+    for k, name in enumerate(names):
+        for method, angles in estimate.angles.items():
+            said = " (folded)" if angles.folded[k] else ""
+            rows.append(
+                (name, METHOD_NAMES[method], f"dihedral{said}", *_row(angles.values, angles.sigma, dihedral, k))
+            )
+        # across the track the sigma is another one
+        mostly = abs(along[k]) > 0.99 * look[k]
+        sighted = _row(estimate.look, estimate.along.sigma, look, k)
+        rows.append((name, SIGHTED, "look", sighted[0], sighted[1] if mostly else None, sighted[2]))
+        rows.append((name, SIGHTED, "along track", *_row(estimate.along.values, estimate.along.sigma, along, k)))
+        rows.append((name, "resection", "along track", *_row(run.resected, run.resected_sigma, along, k)))
+        for kind, true in (("dihedral", dihedral), ("look", look), ("along track", along)):
+            rows.append((name, "true camera", kind, float(np.degrees(true[k])), None, None))
     return Table(
         "methods",
         "Angles by each method",
-        "Dihedral: between the planes of the lines. Look: between the lines of sight of the lines' centres. Each is "
-        "compared with its own truth; the resection's angle is one of pitch, which differs from the look by less than "
-        "0.01 arcsec where the lines of sight begin within 20 arcsec of each other across the track. The planes are "
-        "fitted in the Earth-fixed frame.",
-        heads,
+        "Dihedral: between the planes of the lines. Look: between the lines of sight of the lines' centres. Along "
+        "track: the look's signed part along the track, positive where the first line looks ahead of the second. Each "
+        "is compared with its own truth. The resection's angle is one of pitch in the body, which differs from the "
+        "angle along the track by less than 0.01 arcsec where the lines of sight begin within 20 arcsec of each other "
+        "across the track. The planes are fitted in the Earth-fixed frame. Folded: below three sigmas, where an "
+        "unsigned angle is pushed up by its noise.",
+        ("", "method", "angle", "deg", "σ, arcsec", "− truth, arcsec"),
         rows,
-        (None, None, 7, 3, 3, 7, 3, 3),
+        (None, None, None, 7, 3, 3),
     )
 
 
-def _pairs(values: np.ndarray, sigma: np.ndarray, truth: np.ndarray) -> tuple[float, ...]:
-    return tuple(
-        float(v) for k in range(2) for v in (np.degrees(values[k]), sigma[k] / ARCSEC, (values[k] - truth[k]) / ARCSEC)
-    )
+def _row(values: np.ndarray, sigma: np.ndarray, truth: np.ndarray, k: int) -> tuple[float, ...]:
+    return float(np.degrees(values[k])), float(sigma[k] / ARCSEC), float((values[k] - truth[k]) / ARCSEC)
 
 
 def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
-    test, camera = setup.test, setup.camera
+    test = setup.test
     passing, errors, effects = test.orbit.passing, test.errors, test.effects
     orbit = f"epoch {test.orbit.epoch}"
     if passing is not None:
@@ -100,15 +126,18 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
         )
     on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
     state = ("corrected" if effects.corrected else "not corrected") + " in the analysis" if on else ""
-    turned = "; ".join(
-        f"{name} [{', '.join(format_quantity(v, ANGLE) for v in turn)}]" for name, turn in test.changes.items()
+    changed = "; ".join(f"{name} {_told(change)}" for name, change in test.changes.items())
+    described = (setup.camera or setup.instrument).description  # type: ignore[union-attr]
+    pairs = "; ".join(
+        f"{sign} between {a} and {b}" for sign, (a, b) in zip(signs(setup.angles), setup.angles.values(), strict=True)
     )
     datum = ", ".join(
         f"{format_quantity(v, LENGTH)} {to}" for v, to in zip(errors.datum, ("east", "north", "up"), strict=True)
     )
     return (
-        ("Camera", f"{camera.name}, {camera.description}"),
-        ("Turned since the laboratory", turned or "nothing"),
+        ("Camera", f"{setup.camera_name}, {described}"),
+        ("Angles", pairs.replace("_", " ")),
+        ("Changed since the laboratory", changed or "nothing"),
         ("Orbit", orbit),
         ("Exposure", f"{test.time:g} s from the epoch"),
         ("Points", f"{test.strips.points} on each strip, pixels {test.strips.first:g} to {test.strips.last:g}"),
@@ -126,6 +155,19 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
     )
 
 
+def _told(change: PerturbationSpec) -> str:
+    """What happens to a line or a node, in the file's words."""
+    plain = change.plain()
+    said = []
+    for action in change.uses():
+        value = plain[action]
+        items = value.items() if isinstance(value, dict) else [("", value)]
+        parts = (f"{key} [{', '.join(v)}]" if isinstance(v, list) else f"{key} {v}" for key, v in items)
+        about = f" about {change.pivot}" if action == "rotate" and change.pivot != DEFAULT_PIVOT else ""
+        said.append(f"{action} {', '.join(part.strip() for part in parts)}{about}")
+    return ", ".join(said) if said else "unchanged"
+
+
 def _warnings(run: AngleRun) -> tuple[str, ...]:
     spec, found = run.flight.spec, []
     left = [e for e in ("light_time", "aberration", "refraction") if getattr(spec.effects, e)]
@@ -136,6 +178,12 @@ def _warnings(run: AngleRun) -> tuple[str, ...]:
         )
     if any(spec.errors.datum):
         found.append("the points share a shift that no sigma contains and no residual shows; see the table of effects")
+    folded = [n for n, f in zip(signs(run.names), run.estimate.angles["tls"].folded, strict=True) if f]
+    if folded:
+        found.append(
+            f"the planes of {listed(folded)} are parallel within their noise: the unsigned dihedral angle folds at "
+            "zero; use the angle along the track, which has a sign"
+        )
     if run.estimate.resection.p_value < 1e-3:
         found.append(
             f"the resection does not fit: a chi-square as large has a chance of {run.estimate.resection.p_value:.1g}; "

@@ -1,5 +1,5 @@
 """One moment of a pass, as it truly is and as it is measured: the station, and ground points on the strips that the
-three lines see (paper 000, section 1).
+lines see (paper 000, section 1).
 
 The measurement has the errors that the paper discusses: of the orbit at the station, and of the ground points from
 matching and aerial triangulation. Beside the coordinates the analysis gets what the laboratory measured of each line
@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.orbit.planes import Station, Strip
 from optics.frozen_map import FrozenMap
-from optics.rotation import about_axis, rotation_matrix
-from scenes.orbit_angle import LINES
+from optics.rotation import about_axis
+from twin.orbit.angle_camera import AngleCamera
 from twin.orbit.attitude import Attitude
 from twin.orbit.earth import Earth, east_north_up
 from twin.orbit.light_effects import (
@@ -28,7 +28,7 @@ from twin.orbit.light_effects import (
     turned_with_earth,
     unrefracted,
 )
-from twin.orbit.line_camera import LineCamera, dihedral_angle, line_cameras, line_normal, look_angle
+from twin.orbit.line_camera import LineCamera, along_track_angle, dihedral_angle, line_normal, look_angle
 from twin.orbit.orbit import propagate
 from twin.orbit.sensor import Sensor
 from twin.orbit.trajectory import Trajectory
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
     from scenes.orbit_angle import OrbitAngleSpec
     from scenes.orbit_setup import AngleSetup
 
-PAIRS = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
-"""Angle -> the two lines that it lies between."""
 _LINE_TIME = 1e-3
 """Seconds; of an image of one line only its middle is used."""
 _LEAST_SIGMA = 1e-3
 """Metres. Points without errors are given this sigma, for an adjustment needs weights."""
+_LEAST_CONVERGENCE = np.radians(1.0)
+"""Rays that meet at a smaller angle give no heights: one arcsecond would be half a kilometre and more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,19 @@ class Measurement:
         tangent: line -> laboratory's tangents of the points' directions from the line's centre, across the line and
             along it, (n, 2); X forward, Y to the right.
         along: line -> tangent of the angle of each point from the line's centre along the line, (n,).
+        look: line -> laboratory's angle of the line's centre from the body's Z about its Y, radians.
+        offset: line -> laboratory's projection centre of each point, in the axes of its tangents, (n, 3), metres.
+        bow: line -> what a direction needs, in the axes of its tangents, to lie in one plane with the line's centre and
+            its middle direction, (n, 3): the image of a mirror camera's line is bent.
     """
 
     station: Station
     strips: Mapping[str, Strip]
     tangent: Mapping[str, np.ndarray]
     along: Mapping[str, np.ndarray]
+    look: Mapping[str, float]
+    offset: Mapping[str, np.ndarray]
+    bow: Mapping[str, np.ndarray]
 
     def in_frame(self, axes: np.ndarray, origin: np.ndarray) -> Measurement:
         """The same in another frame; axes: its axes as rows in the present one, (3, 3), origin: (3,)."""
@@ -83,7 +90,9 @@ class AnglePass:
         trajectory: true orbit and attitude.
         laboratory: line -> camera as it was measured before launch.
         cameras: line -> camera as it is.
-        pixel: places of the points on every line, (n,).
+        pairs: angle -> the two lines that it lies between.
+        trace: angle -> its change by `twin.truth.trace_truth`, radians; empty where no trace of two cameras tells it.
+        pixel: line -> places of its points, (n,).
         height: line -> heights of its points above the ellipsoid, (n,).
     """
 
@@ -92,8 +101,20 @@ class AnglePass:
     trajectory: Trajectory
     laboratory: Mapping[str, LineCamera]
     cameras: Mapping[str, LineCamera]
-    pixel: np.ndarray
+    pairs: Mapping[str, tuple[str, str]]
+    trace: Mapping[str, float]
+    pixel: Mapping[str, np.ndarray]
     height: Mapping[str, np.ndarray]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Those that angles are measured of, in the order of the camera's file."""
+        return tuple(self.pixel)
+
+    @property
+    def reference(self) -> str:
+        """The line whose look is zero in a resection: the second of the first angle."""
+        return next(iter(self.pairs.values()))[1]
 
     @property
     def station(self) -> np.ndarray:
@@ -114,23 +135,36 @@ class AnglePass:
     @property
     def look(self) -> dict[str, float]:
         """True angles between the lines of sight of the lines' centres, radians."""
-        return {name: look_angle(*(self.cameras[k] for k in pair)) for name, pair in PAIRS.items()}
+        return {name: look_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def laboratory_look(self) -> dict[str, float]:
+        """The same before launch."""
+        return {name: look_angle(self.laboratory[a], self.laboratory[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def along_track(self) -> dict[str, float]:
+        """Their signed part along the track, positive where the first line looks ahead of the second, radians."""
+        return {name: along_track_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
 
     @property
     def dihedral(self) -> dict[str, float]:
-        """True angles between the planes of the lines, radians."""
-        return {name: dihedral_angle(*(self.cameras[k] for k in pair)) for name, pair in PAIRS.items()}
+        """True angles between the planes of the lines where the points are, radians."""
+        return {
+            name: dihedral_angle(self.cameras[a], self.cameras[b], (self.pixel[a], self.pixel[b]))
+            for name, (a, b) in self.pairs.items()
+        }
 
     @property
-    def nadir_point(self) -> np.ndarray:
-        """What the nadir line's centre sees, (3,); origin of the local level frame."""
-        middle = np.array([0.5 * (self.cameras["nadir"].pixels - 1)])
-        return self._sensor("nadir", NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
+    def middle_point(self) -> np.ndarray:
+        """What the reference line's centre sees, (3,); origin of the local level frame."""
+        middle = np.array([0.5 * (self.cameras[self.reference].pixels - 1)])
+        return self._sensor(self.reference, NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
 
     @property
     def local(self) -> np.ndarray:
-        """Axes of the local level frame as rows: east, north, up at `nadir_point`, (3, 3)."""
-        lon, lat, _ = self.earth.geodetic(self.nadir_point)
+        """Axes of the local level frame as rows: east, north, up at `middle_point`, (3, 3)."""
+        lon, lat, _ = self.earth.geodetic(self.middle_point)
         return east_north_up(lon, lat)
 
     @property
@@ -139,9 +173,9 @@ class AnglePass:
         return np.asarray(self.trajectory.orbital_to_itrs(self.spec.time).T)
 
     @property
-    def nadir_line(self) -> np.ndarray:
-        """Axes of the nadir line as rows: normal of its plane, along the line, line of sight of its middle, (3, 3)."""
-        camera = self.cameras["nadir"]
+    def line_axes(self) -> np.ndarray:
+        """Axes of the reference line as rows: normal of its plane, along the line, its middle's look, (3, 3)."""
+        camera = self.cameras[self.reference]
         x = line_normal(camera)
         z = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
         z = z - (z @ x) * x
@@ -155,7 +189,8 @@ class AnglePass:
             BenchError: a look misses the Earth, or the time is too near the end of the orbit.
         """
         points = {
-            name: self._sensor(name, effects).ground(np.zeros(1), self.pixel, self.height[name]) for name in LINES
+            name: self._sensor(name, effects).ground(np.zeros(1), self.pixel[name], self.height[name])
+            for name in self.lines
         }
         if not all(np.all(np.isfinite(p)) for p in points.values()):
             raise BenchError("a look misses the Earth", ("attitude",), "an attitude in which all lines see the ground")
@@ -176,47 +211,51 @@ class AnglePass:
             corrected: effects that are taken out of the points.
             datum: shift of all points, east, north, up, metres; None for the file's.
         """
-        errors, count = self.spec.errors, len(self.pixel)
-        noise = np.zeros((1 + len(LINES) * count, 3))
+        errors, lines = self.spec.errors, self.lines
+        noise = np.zeros((1 + sum(len(points[name]) for name in lines), 3))
         if seed is not None:
             noise = np.random.default_rng(seed).standard_normal(noise.shape)
         place = self.station + errors.station * noise[0]
         shift = np.array(errors.datum if datum is None else datum) @ self.local
-        found = np.concatenate([points[name] for name in LINES]) + shift + errors.points * noise[1:]
+        found = np.concatenate([points[name] for name in lines]) + shift + errors.points * noise[1:]
         if corrected.light_time or corrected.aberration or corrected.refraction:
             found = without_effects(found, place, self.velocity, self.earth, corrected)
         sigma = max(errors.points, _LEAST_SIGMA)
-        strips = {name: Strip.of(p, sigma) for name, p in zip(LINES, np.split(found, len(LINES)), strict=True)}
-        tangents = {name: interior_tangents(self.laboratory[name], self.pixel) for name in LINES}
+        strips = {name: Strip.of(p, sigma) for name, p in zip(lines, np.split(found, len(lines)), strict=True)}
+        inside = {name: interior(self.laboratory[name], self.pixel[name]) for name in lines}
         return Measurement(
             Station.of(place, errors.station),
             strips,
-            {name: both for name, (both, _) in tangents.items()},
-            {name: along for name, (_, along) in tangents.items()},
+            **{key: {name: one[key] for name, one in inside.items()} for key in INTERIOR},
         )
 
     def height_per_arcsec(self) -> dict[str, float | None]:
         """How far a wrong angle of one arcsecond moves heights that are intersected from its two lines, metres.
 
-        The point below the nadir line's centre is looked up in the other line's image, that line is then turned by 1
-        arcsec about the body's Y, and the two rays are intersected; None where the orbit is too short for the other
-        line to see the point. No effects on the light.
+        The point that the reference line's centre sees (or that of the second line, where the reference is not one of
+        them) is looked up in the other line's image, that line is then turned by 1 arcsec about the body's Y, and the
+        two rays are intersected; None where the orbit is too short for the other line to see the point, and for lines
+        so nearly parallel that they make no heights. No effects on the light.
         """
-        point = self.nadir_point
-        first = self._ray("nadir", point, 0.0)
         out: dict[str, float | None] = {}
-        for angle, (a, b) in PAIRS.items():
-            other = a if b == "nadir" else b
+        look = self.look
+        for angle, (a, b) in self.pairs.items():
+            out[angle] = None
+            if look[angle] < _LEAST_CONVERGENCE:
+                continue
+            base, other = (a, b) if a == self.reference else (b, a)
+            middle = np.array([0.5 * (self.cameras[base].pixels - 1)])
+            point = self._sensor(base, NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
+            first = self._ray(base, point, 0.0)
             rays = [self._ray(other, point, turn) for turn in (0.0, np.radians(1.0 / 3600.0))]
             if first is None or any(ray is None for ray in rays):
-                out[angle] = None
                 continue
             heights = [self.earth.geodetic(_nearest(first, ray))[2] for ray in rays if ray is not None]
             out[angle] = float(abs(heights[1] - heights[0]))
         return out
 
     def _ray(self, name: str, point: np.ndarray, turn: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Station and direction of the look that sees a point, the line turned afterwards; None if none does."""
+        """Projection centre and look of the pixel that sees a point, the line turned afterwards; None if none does."""
         first, last = self.trajectory.first, self.trajectory.last
         lines = int((last - first) / _LINE_TIME) - 1
         sensor = Sensor(
@@ -227,7 +266,8 @@ class AnglePass:
             return None
         seconds = sensor.time(line)[0]
         body = about_axis(1, turn) @ self.cameras[name].look(pixel)[0]
-        return self.trajectory.position(seconds), self.trajectory.body_to_itrs(seconds) @ body
+        axes = self.trajectory.body_to_itrs(seconds)
+        return self.trajectory.position(seconds) + axes @ self.cameras[name].origin(pixel)[0], axes @ body
 
     def _sensor(self, name: str, effects: LightEffects) -> Sensor:
         try:
@@ -236,8 +276,13 @@ class AnglePass:
             raise BenchError(str(error), ("time",), "a time inside the orbit, or a longer orbit") from error
 
 
-def fly(setup: AngleSetup, seed: np.random.SeedSequence) -> AnglePass:
+def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) -> AnglePass:
     """Put the satellite into its orbit and draw the terrain.
+
+    Args:
+        setup: the test.
+        camera: its lines, by `angle_camera`.
+        seed: of the terrain.
 
     Raises:
         BenchError: there is no such orbit.
@@ -248,33 +293,53 @@ def fly(setup: AngleSetup, seed: np.random.SeedSequence) -> AnglePass:
         orbit = propagate(spec.orbit, earth)
     except ValueError as error:
         raise BenchError(str(error), ("orbit",), "an orbit that exists and stays above the ground") from error
-    laboratory = {name: camera for name, camera in line_cameras(setup.camera).items() if name in LINES}
-    cameras = {
-        name: replace(camera, directions=camera.directions @ rotation_matrix(spec.changes.get(name, (0.0,) * 3)).T)
-        for name, camera in laboratory.items()
-    }
-    pixel = np.linspace(spec.strips.first, spec.strips.last, spec.strips.points)
+    used = [name for name in setup.pixels if any(name in pair for pair in setup.angles.values())]
+    share = (np.linspace(spec.strips.first, spec.strips.last, spec.strips.points) + 0.5) / setup.usual_pixels
+    pixel = {name: share * setup.pixels[name] - 0.5 for name in used}
     above = float(earth.geodetic(orbit.itrs(spec.time)[0])[2]) - spec.terrain.height
     height = {
-        name: _terrain(spec, above * _spread(laboratory[name], pixel), np.random.default_rng(stream))
-        for name, stream in zip(LINES, seed.spawn(len(LINES)), strict=True)
+        name: _terrain(spec, above * _spread(camera.laboratory[name], pixel[name]), np.random.default_rng(stream))
+        for name, stream in zip(used, seed.spawn(len(used)), strict=True)
     }
     trajectory = Trajectory(orbit, Attitude.from_spec(spec.attitude))
-    return AnglePass(spec, earth, trajectory, FrozenMap(laboratory), FrozenMap(cameras), pixel, FrozenMap(height))
+    return AnglePass(
+        spec,
+        earth,
+        trajectory,
+        camera.laboratory,
+        camera.cameras,
+        FrozenMap(setup.angles),
+        camera.trace,
+        FrozenMap(pixel),
+        FrozenMap(height),
+    )
 
 
-def interior_tangents(camera: LineCamera, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is known of a line's interior: directions of its pixels (N,) from the direction of its centre.
+INTERIOR = ("tangent", "along", "look", "offset", "bow")
 
-    Returns:
-        Tangents across (forward) and along (to the right) in the body's axes pitched to the centre, (N, 2); tangent of
-        the angle from the centre within the line, positive to the right, (N,).
+
+def interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
+    """What the laboratory knows of a line's pixels (N,): the fields `INTERIOR` of a `Measurement`.
+
+    Tangents count across (forward) and along (to the right) in the body's axes pitched to the line's centre; the angle
+    within the line is positive to the right.
     """
     centre = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
     seen = camera.look(pixel)
-    pitched = seen @ about_axis(1, np.arctan2(centre[0], centre[2]))
+    look = float(np.arctan2(centre[0], centre[2]))
+    pitch = about_axis(1, look)
+    pitched = seen @ pitch
     turn = np.linalg.norm(np.cross(centre, seen), axis=-1) / (seen @ centre)
-    return pitched[:, :2] / pitched[:, 2:], np.copysign(turn, seen[:, 1] - centre[1])
+    normal = line_normal(camera, pixel)
+    normal = normal - (normal @ centre) * centre
+    normal = normal / np.linalg.norm(normal)
+    return {
+        "tangent": pitched[:, :2] / pitched[:, 2:],
+        "along": np.copysign(turn, seen[:, 1] - centre[1]),
+        "look": look,
+        "offset": camera.origin(pixel) @ pitch,
+        "bow": -np.outer(seen @ normal, normal @ pitch),
+    }
 
 
 def without_effects(

@@ -90,7 +90,9 @@ class LineCamera:
 
 def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
     """The lines of a payload of ideal projections with distortion, by name (no approximation)."""
-    return {name: _ideal_line(name, line, spec.pixels, spec.pitch) for name, line in spec.lines.items()}
+    return {
+        name: _ideal_line(name, line, spec.pixels_of(name), spec.pitch_of(name)) for name, line in spec.lines.items()
+    }
 
 
 def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> LineCamera:
@@ -152,20 +154,38 @@ def look_angle(a: LineCamera, b: LineCamera) -> float:
     return _angle(first, second)
 
 
-def dihedral_angle(a: LineCamera, b: LineCamera) -> float:
+def along_track_angle(a: LineCamera, b: LineCamera) -> float:
+    """Turn about the lines' mean direction that takes the middle of b to that of a, radians; + where a looks ahead.
+
+    The part of `look_angle` that makes heights: it has a sign, and lines that look the same way but side by side have
+    none. A line's direction is square to the look of its middle, in its plane.
+    """
+    first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
+    sides = [np.cross(look, line_normal(camera)) for look, camera in ((first, a), (second, b))]
+    axis = sum(side / np.linalg.norm(side) for side in sides)
+    axis = axis / np.linalg.norm(axis)
+    return float(np.arctan2(axis @ np.cross(second, first), first @ second - (first @ axis) * (second @ axis)))
+
+
+def dihedral_angle(
+    a: LineCamera, b: LineCamera, places: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+) -> float:
     """Angle between the planes of two lines, radians, 0 to pi/2.
 
     A line's plane is the one through the station that its looks depart from least (total least squares over the whole
-    line). It is what ground points of the strips give (paper 000, eqs. 1 to 7), and differs from `look_angle` when the
-    lines are not parallel.
+    line, or over the pixels `places`, each (N,)). It is what ground points of the strips give (paper 000, eqs. 1 to 7),
+    and differs from `look_angle` when the lines are not parallel.
     """
-    angle = _angle(line_normal(a), line_normal(b))
+    angle = _angle(*(line_normal(camera, place) for camera, place in zip((a, b), places, strict=True)))
     return min(angle, np.pi - angle)
 
 
-def line_normal(camera: LineCamera) -> np.ndarray:
-    """Unit normal of a line's best plane through the station, body frame, (3,), on the forward side (+X)."""
-    looks = camera.look(np.linspace(0.0, camera.pixels - 1.0, _PLANE_POINTS))
+def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarray:
+    """Unit normal of a line's best plane through the station, body frame, (3,), on the forward side (+X).
+
+    pixel: (N,) places that the plane is fitted to; None for the whole line.
+    """
+    looks = camera.look(np.linspace(0.0, camera.pixels - 1.0, _PLANE_POINTS) if pixel is None else pixel)
     # the singular vector itself, not that of the normal equations: half of the digits would be lost there
     normal = np.linalg.svd(looks, full_matrices=False)[2][-1]
     return normal if normal[0] > 0.0 else -normal
