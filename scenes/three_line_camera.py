@@ -11,6 +11,7 @@ from pydantic import AfterValidator, Field
 
 from scenes.errors import Problem
 from scenes.instrument import LookAngle
+from scenes.orbit_scene import LineImageSpec
 from scenes.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.spec import Name, Named, Spec, Text, Whole
 from scenes.units import ANGLE, Kind
@@ -40,6 +41,9 @@ class LineCameraSpec(Spec):
             centre, metres.
         k1: radial distortion of third order, 1/m^2.
         k2: radial distortion of fifth order, 1/m^4.
+        pixels: how many; None for as many as the payload says.
+        pitch: of its pixels, metres; None for the payload's.
+        image: how it forms and records its image; None for the payload's.
     """
 
     look: LookAngle
@@ -49,6 +53,9 @@ class LineCameraSpec(Spec):
     principal_point: Vector2 = (0.0, 0.0)
     k1: Distortion3 = 0.0
     k2: Distortion5 = 0.0
+    pixels: LongestLine | None = None
+    pitch: PositiveLength | None = None
+    image: LineImageSpec | None = None
 
 
 def _some_lines(lines: Named[LineCameraSpec]) -> Named[LineCameraSpec]:
@@ -63,9 +70,11 @@ class ThreeLineCameraSpec(Spec):
     Attributes:
         name: as the file is called.
         description: for people.
-        pixels: of each line; pixel 0 is at its -y end.
-        pitch: of the pixels, metres.
-        lines: by name, in the order in which they see a point on the ground; normally forward, nadir and aft.
+        pixels: of each line that does not say its own; pixel 0 is at its -y end.
+        pitch: of their pixels, metres.
+        lines: by name; normally forward, nadir and aft, in the order in which they see a point on the ground, then
+            others such as a high-resolution and a multispectral one.
+        image: how lines that do not say it themselves form and record their images; only rendering needs it.
     """
 
     name: Name
@@ -73,3 +82,16 @@ class ThreeLineCameraSpec(Spec):
     pixels: LongestLine
     pitch: PositiveLength
     lines: Annotated[Named[LineCameraSpec], AfterValidator(_some_lines)]
+    image: LineImageSpec | None = None
+
+    def pixels_of(self, line: str) -> int:
+        """How many pixels a line has. KeyError if there is no such line."""
+        return self.lines[line].pixels or self.pixels
+
+    def pitch_of(self, line: str) -> float:
+        """Pitch of a line's pixels, metres. KeyError if there is no such line."""
+        return self.lines[line].pitch or self.pitch
+
+    def image_of(self, line: str) -> LineImageSpec | None:
+        """How a line forms its image; None if neither it nor the payload says so. KeyError if there is no such line."""
+        return self.lines[line].image or self.image

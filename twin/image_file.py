@@ -12,6 +12,8 @@ SPOT_STRETCH = 30.0
 """Steepness of an asinh stretch that shows faint diffraction rings beside a spot's core."""
 
 ENLARGE = 4
+LARGEST_ENLARGED = 600
+"""Rows or columns from which a picture is shown as large as it is."""
 
 
 def tiff(frames: np.ndarray) -> bytes:
@@ -29,7 +31,8 @@ def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndar
     level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)
     if stretch:
         level = np.arcsinh(stretch * level) / np.arcsinh(stretch)
-    return np.kron(np.uint8(np.rint(255.0 * level)), np.ones((ENLARGE, ENLARGE), np.uint8))
+    factor = ENLARGE if max(mean.shape) < LARGEST_ENLARGED else 1
+    return np.kron(np.uint8(np.rint(255.0 * level)), np.ones((factor, factor), np.uint8))
 
 
 def preview_png(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> bytes:

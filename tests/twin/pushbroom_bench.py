@@ -1,0 +1,52 @@
+"""A pass of th1 over 40 N 116 E for tests of its images, and grounds by formulas."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from scenes.load import load_detector, load_three_line_camera
+from scenes.orbit_spec import OrbitSpec
+from twin.orbit.attitude import Attitude
+from twin.orbit.earth import Earth
+from twin.orbit.line_camera import line_cameras
+from twin.orbit.line_optics import LineOptics
+from twin.orbit.orbit import propagate
+from twin.orbit.patch import ImagedLine, imaged_lines
+from twin.orbit.sensor import Sensor
+from twin.orbit.simulate_test import optics_of
+from twin.orbit.trajectory import Trajectory
+
+LINES = ("forward", "nadir", "aft")
+LINE_TIME = 0.7e-3
+PLACE = (np.radians(116.0), np.radians(40.0))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Apparent reflectance by a formula."""
+
+    formula: Callable
+
+    def __call__(self, east, north):
+        return self.formula(east, north)
+
+
+@cache
+def lines() -> dict[str, ImagedLine]:
+    """The three lines with light time, aberration and refraction; the user knows them exactly."""
+    earth = Earth()
+    passing = {"longitude": "116 deg", "latitude": "40 deg", "altitude": "500 km"}
+    spec = {"epoch": "2011-03-05T03:05:00Z", "before": "45 s", "after": "45 s", "passing": passing}
+    orbit = propagate(OrbitSpec.model_validate(spec), earth)
+    trajectory = Trajectory(orbit, Attitude(yaw_steering=True, offset=(1e-4, -1.7e-4, 7e-5)))
+    count = int(90.0 / LINE_TIME) - 1
+    cameras = line_cameras(load_three_line_camera("th1"))
+    sensors = {k: Sensor(cameras[k], trajectory, earth, LINE_TIME, -45.0 + 0.5 * LINE_TIME, count) for k in LINES}
+    return imaged_lines(sensors, sensors, optics(), np.random.SeedSequence(1))
+
+
+@cache
+def optics() -> dict[str, LineOptics]:
+    return optics_of(load_three_line_camera("th1"), LINES, LINE_TIME, {"th1_line": load_detector("th1_line")})

@@ -1,0 +1,279 @@
+"""Rendered images: places by the sensor's own inverse, grey values by hand, sharpness by a slanted edge."""
+
+import numpy as np
+import pytest
+from scipy import constants
+from scipy.special import erf
+from scipy.stats import chi2
+
+from analysis.mtf.slanted_edge import measure_edge
+from scenes.orbit_scene import ControlSpec, GroundSpec, TerrainSpec
+from tests.twin.pushbroom_bench import LINES, PLACE, Ground, lines, optics
+from twin.orbit.ground_frame import GroundFrame
+from twin.orbit.line_optics import ImageMotion
+from twin.orbit.look_map import SteepTerrainError
+from twin.orbit.patch import PatchError, fly_patch, window_of
+from twin.orbit.pushbroom import MARGIN, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
+from twin.orbit.terrain import Terrain
+
+FRAME = GroundFrame(*PLACE)
+ROUGH = TerrainSpec.model_validate({"kind": "fractal", "relief": "80 m", "height": "600 m", "exponent": 2.0})
+SIGMA = 2.5
+"""Metres. A mark of half a pixel: the terrain's curvature under it (slopes change by 0.4 in 30 m, times 0.5 for the
+look) moves its centroid by 0.5 x 0.4/30 x 0.5 x sigma^2 = 2 cm, 0.004 pixels, at most."""
+SIDE = 320
+REACH = MARGIN + 4
+
+
+def rough() -> Terrain:
+    return Terrain.fractal(ROUGH, 3000.0, np.random.SeedSequence(5))
+
+
+def marks() -> tuple[np.ndarray, np.ndarray]:
+    """Places of nine marks, so far apart that no point spread function reaches the next, metres."""
+    random = np.random.default_rng(3)
+    east, north = (v.ravel() for v in np.meshgrid([-330.0, 0.0, 330.0], [-330.0, 0.0, 330.0]))
+    return east + random.uniform(-20.0, 20.0, 9), north + random.uniform(-20.0, 20.0, 9)
+
+
+def spots(east: np.ndarray, north: np.ndarray) -> Ground:
+    def formula(e, n):
+        out = np.zeros(np.shape(e))
+        for a, b in zip(east, north, strict=True):
+            square = (e - a) ** 2 + (n - b) ** 2
+            near = square < (8.0 * SIGMA) ** 2
+            out[near] += np.exp(-0.5 * square[near] / SIGMA**2)
+        return out
+
+    return Ground(formula)
+
+
+def photograph(name: str, terrain: Terrain, ground: Ground, side: int = SIDE, window: Window | None = None):
+    one = lines()[name]
+    height = float(terrain.height(np.zeros(1), np.zeros(1))[0])
+    window = window or window_of(name, one.sensor, FRAME, height, (side, side))
+    return render_patch(one.sensor, one.optics, PushbroomScene(FRAME, terrain, ground), window)
+
+
+def centroid(image: np.ndarray, row: float, column: float) -> tuple[float, float]:
+    """Of what lies within the reach of a point spread function from a place; it holds all of it."""
+    r, c = round(row), round(column)
+    part = image[r - REACH : r + REACH + 1, c - REACH : c + REACH + 1]
+    assert part.shape == (2 * REACH + 1,) * 2
+    place = np.arange(-REACH, REACH + 1)
+    total = part.sum()
+    return r + float(part.sum(axis=1) @ place / total), c + float(part.sum(axis=0) @ place / total)
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_marks_lie_where_the_sensor_says(name: str) -> None:
+    """Known places on rough terrain, all effects on, found in the noise-free image to 0.01 pixels."""
+    terrain, (east, north) = rough(), marks()
+    done = photograph(name, terrain, spots(east, north))
+    points = FRAME.itrs(east, north, terrain.height(east, north))
+    line, pixel = lines()[name].sensor.image(points)
+    away = []
+    for k in range(9):
+        at = line[k] - done.window.first_line, pixel[k] - done.window.first_pixel
+        found = centroid(done.photons, *at)
+        away.append(np.subtract(found, at))
+    assert done.error < 1e-3
+    assert len(away) == 9
+    assert np.abs(away).max() < 0.01
+    # without the terrain the marks would lie elsewhere by many times that
+    level = lines()[name].sensor.image(FRAME.itrs(east, north, 600.0))
+    if name != "nadir":
+        assert np.abs(level[0] - line).max() > 3.0
+
+
+def test_ten_metres_of_height_move_the_forward_image() -> None:
+    """By hand: the look of 25 degrees meets the ground at sin z = (6371 + 500)/6371.6 sin 25; a place that is higher by
+    h is seen where the ground h tan z farther ahead is, which the image reaches later. 2%: the sphere, the attitude."""
+    zenith = np.arcsin((6371.0 + 500.0) / 6371.6 * np.sin(np.radians(25.0)))
+    rows = []
+    for height in (600.0, 610.0):
+        one = lines()["forward"]
+        window = window_of("forward", one.sensor, FRAME, 600.0, (80, 80))
+        done = photograph("forward", Terrain.flat(height), spots(np.zeros(1), np.zeros(1)), window=window)
+        rows.append(centroid(done.photons, 40.0, 40.0)[0])
+    sensor = lines()["forward"].sensor
+    step = sensor.ground(window.middle[0] + np.array([0.0, 1.0]), np.array([6000.0]), 600.0)
+    advance = np.linalg.norm(step[1] - step[0])
+    assert rows[1] - rows[0] == pytest.approx(10.0 * np.tan(zenith) / advance, rel=0.02)
+
+
+def test_an_image_does_not_depend_on_its_window() -> None:
+    """Each pixel's value is its own: single-precision transforms of 1e5 samples leave 1e-6 of the brightest."""
+    terrain = rough()
+    ground = Ground(lambda e, n: 0.2 + 0.1 * np.sin(e / 17.0) * np.cos(n / 23.0))
+    whole = photograph("aft", terrain, ground, 150)
+    part = Window(whole.window.first_line + 31, whole.window.first_pixel + 12, 57, 90)
+    cut = photograph("aft", terrain, ground, window=part)
+    assert cut.photons == pytest.approx(whole.photons[31:88, 12:102], rel=2e-5)
+
+
+def test_grey_ground_has_the_grey_value_of_the_hand() -> None:
+    """The Sun as a black body, Lambert's ground, pi/4 F^2, pixel, time, quantum efficiency and gain; quadrature and the
+    finite point spread function agree to 1e-4, single precision to 1e-6."""
+    name, reflectance = "nadir", 0.21
+    done = photograph(name, Terrain.flat(300.0), Ground(lambda e, n: np.full(np.shape(e), reflectance)), 64)
+    wavelength = np.linspace(510e-9, 690e-9, 2001)
+    x = constants.h * constants.c / (wavelength * constants.k * 5772.0)
+    photons = 2.0 * constants.c / wavelength**4 / np.expm1(x) * (6.957e8 / 1.495978707e11) ** 2
+    radiance = np.trapezoid(photons, wavelength) * reflectance
+    expected = radiance * np.pi / (4.0 * 36.0) * 0.75 * (6.5e-6) ** 2 * 0.7e-3
+    assert done.photons == pytest.approx(np.full((64, 64), expected), rel=1e-4)
+    # sunlight above the air is between 1.4 and 1.9 W/(m^2 nm) everywhere in the band
+    energy = np.trapezoid(photons * constants.h * constants.c / wavelength, wavelength) * np.pi / 180.0
+    assert 1.4 < energy < 1.9
+    grey = lines()[name].optics.ccd.detector.expected_dn(done.photons, 0.7e-3)
+    assert grey.mean() == pytest.approx(20.0 + 0.025 * (0.55 * expected + 14.0), rel=1e-4)
+
+
+def test_noise_follows_the_photon_transfer() -> None:
+    """Variance of a pixel's grey values over frames: K^2 (electrons + read noise^2) + 1/12 for rounding; false alarm
+    1e-6 to either side, at three levels."""
+    ccd, count, checked = optics()["nadir"].ccd, 64, 0
+    for share in (0.05, 0.3, 0.7):
+        photons = np.full((16, 40), share * ccd.detector.full_well_e / ccd.detector.quantum_efficiency)
+        frames = ccd.expose(photons[None], 5000, lines()["nadir"].pattern, count, np.random.SeedSequence(8))[0]
+        variance = frames.astype(float).var(axis=0, ddof=1).mean()
+        electrons = share * ccd.detector.full_well_e + 14.0
+        expected = 0.025**2 * (electrons + 60.0**2) + 1.0 / 12.0
+        freedom = (count - 1) * photons.size
+        assert 1e-6 < chi2.sf(variance / expected * freedom, freedom) < 1.0 - 1e-6
+        checked += 1
+    assert checked == 3
+
+
+@pytest.mark.parametrize(("name", "direction"), [("nadir", "x"), ("nadir", "y"), ("forward", "x"), ("forward", "y")])
+def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: str) -> None:
+    """An edge of 1 m rms softness on level ground, measured from the image's pixels. 0.01: what a slanted edge of 80
+    pixels without noise is good to, and tails that are cut at 24 pixels."""
+    one, side, soft, height = lines()[name], 96, 1.0, 300.0
+    window = window_of(name, one.sensor, FRAME, height, (side, side))
+    line, pixel = window.middle
+    ends = np.array([-1.0, 1.0])
+    # the edge runs along the track (x) or along the line (y), tilted by 5.5 degrees in the image
+    tilt = np.tan(np.radians(5.5))
+    run = (ends, tilt * ends) if direction == "x" else (tilt * ends, ends)
+    points = one.sensor.ground(line + 40.0 * run[0], pixel + 40.0 * run[1], height)
+    (e0, e1), (n0, n1), _ = FRAME.local(points)
+    long = np.hypot(e1 - e0, n1 - n0)
+    normal = np.array([n1 - n0, -(e1 - e0)]) / long
+
+    def formula(e, n):
+        return 0.2 + 0.05 * erf(((e - e0) * normal[0] + (n - n0) * normal[1]) / (np.sqrt(2.0) * soft))
+
+    done = photograph(name, Terrain.flat(height), Ground(formula), window=window)
+    # marks of the image axes on the ground, to take the edge's own softness out
+    edge = measure_edge(np.ascontiguousarray(done.photons), frequency=np.linspace(0.0, 0.5, 26))
+    assert edge.axis == direction
+    assert np.degrees(abs(edge.angle)) == pytest.approx(5.5, abs=0.3)
+    f = edge.frequency
+    square = np.cos(edge.angle), np.sin(edge.angle)
+    # normal of column = position + tan(angle) row is (cos, -sin) in (column, row)
+    along, across = (square[0], -square[1]) if direction == "x" else (-square[1], square[0])
+    axes = one.sensor.ground(line + np.array([0.0, 1.0, 0.0]), pixel + np.array([0.0, 0.0, 1.0]), height)
+    east, north, _ = FRAME.local(axes)
+    jacobian = np.array([[east[2] - east[0], east[1] - east[0]], [north[2] - north[0], north[1] - north[0]]])
+    step = abs(float(normal @ jacobian @ np.array([along, across])))
+    own = np.exp(-2.0 * (np.pi * soft * f / step) ** 2)
+    expected = one.optics.transfer(f * along, f * across, done.motion) * own
+    assert np.abs(edge.mtf - np.abs(expected)).max() < 0.01
+    assert edge.mtf[-1] < 0.35
+
+
+def test_motion_of_an_oblique_image() -> None:
+    """By hand: on the ground a pixel of the forward line is 1/cos z longer along the track than across, and a line's
+    time moves the satellite's view by as much as at nadir; 1%."""
+    sensor, zenith = lines()["forward"].sensor, np.arcsin((6371.0 + 500.0) / 6371.3 * np.sin(np.radians(25.0)))
+    window = window_of("forward", sensor, FRAME, 300.0, (100, 100))
+    motion = ImageMotion.of(sensor, *window.middle, 300.0)
+    line, pixel = window.middle
+    points = sensor.ground(line + np.array([0.0, 1.0, 0.0]), pixel + np.array([0.0, 0.0, 1.0]), 300.0)
+    advance, width = (np.linalg.norm(points[k] - points[0]) for k in (1, 2))
+    assert motion.advance == pytest.approx(advance * np.cos(zenith) / width, rel=0.01)
+    assert abs(motion.drift) < 0.01
+    window = window_of("nadir", lines()["nadir"].sensor, FRAME, 300.0, (100, 100))
+    assert ImageMotion.of(lines()["nadir"].sensor, *window.middle, 300.0).advance == pytest.approx(1.0, abs=0.01)
+
+
+def test_steep_terrain_is_refused() -> None:
+    """The forward look lies 27 degrees off the vertical: slopes of 63 degrees hide ground, gentler ones do not."""
+    one = lines()["forward"]
+    east = 10.0 * np.arange(-100, 101)
+    for slope, hidden in ((1.3, False), (2.3, True)):
+        # a saw of slopes along the track, rounded by the spline
+        north = np.abs((east + 1000.0) % 400.0 - 200.0)[:, None] * slope
+        terrain = Terrain.through(600.0 + np.repeat(north, 201, axis=1), (10.0, 10.0), (-1000.0, -1000.0))
+        window = window_of("forward", one.sensor, FRAME, 600.0, (60, 60))
+
+        def looked(terrain: Terrain = terrain, window: Window = window) -> None:
+            looks = look_map(one.sensor, FRAME, terrain, window)
+            require_open(looks, extent_of(looks))
+
+        if hidden:
+            with pytest.raises(SteepTerrainError):
+                looked()
+        else:
+            looked()
+
+
+HILLS = TerrainSpec.model_validate({"kind": "fractal", "relief": "60 m", "height": "600 m", "exponent": 2.3})
+GROUND = GroundSpec(terrain=HILLS)
+
+
+def fly(seed: int, size: tuple[int, int] = (60, 70)):
+    return fly_patch(lines(), PLACE, size, GROUND, ControlSpec(), np.random.SeedSequence(seed))
+
+
+def test_the_seed_decides() -> None:
+    first, again, other = fly(1), fly(1), fly(2)
+    for name in LINES:
+        one = first.images[name]
+        assert (one.frame.dtype, one.frame.shape) == (np.uint16, (60, 70))
+        assert np.array_equal(one.frame, again.images[name].frame)
+        assert not np.array_equal(one.frame, other.images[name].frame)
+    assert np.array_equal(first.control.orthophoto.values, again.control.orthophoto.values)
+    assert np.array_equal(first.control.dem.values, again.control.dem.values)
+
+
+def test_true_points_are_the_inverse() -> None:
+    """The last step of the way to the terrain is 1e-5 m."""
+    patch = fly(1)
+    row, column = np.array([0.0, 13.2, 59.0]), np.array([69.0, 40.7, 0.0])
+    for name in LINES:
+        points = patch.true_point(name, row, column)
+        line, pixel = patch.images[name].sensor.image(points)
+        assert np.stack([line, pixel]) == pytest.approx(np.stack(patch.images[name].image_point(row, column)), abs=1e-4)
+        east, north, height = patch.frame.local(points)
+        assert height == pytest.approx(patch.terrain.height(east, north), abs=1e-4)
+
+
+def test_control_shows_the_same_ground() -> None:
+    """The nadir image, taken to the orthophoto's grid by the true geometry, is like the orthophoto: half of the texture
+    is fields, of which 15% differ, the light differs as well, and the image is coarser."""
+    patch = fly(4, (160, 160))
+    image, photo = patch.images["nadir"], patch.control.orthophoto
+    row, column = (v.ravel().astype(float) for v in np.meshgrid(np.arange(10, 150), np.arange(10, 150), indexing="ij"))
+    east, north, _ = patch.frame.local(patch.true_point("nadir", row, column))
+    at = [np.rint(v).astype(int) for v in photo.row_column(east, north)]
+    seen = image.frame[row.astype(int), column.astype(int)].astype(float)
+    here = np.corrcoef(seen, photo.values[at[0], at[1]])[0, 1]
+    aside = np.corrcoef(seen, photo.values[at[0] + 25, at[1]])[0, 1]
+    assert here > 0.6
+    assert aside < here - 0.2
+
+
+def test_what_cannot_be_imaged() -> None:
+    spec, control, seed = GROUND, ControlSpec(), np.random.SeedSequence(1)
+    cases = [
+        ((PLACE[0] + 0.02, PLACE[1]), (60, 60), "place"),
+        ((PLACE[0], PLACE[1] + 0.12), (60, 60), "span"),
+        (PLACE, (60, 11990), "size"),
+    ]
+    for place, size, part in cases:
+        with pytest.raises(PatchError) as caught:
+            fly_patch(lines(), place, size, spec, control, seed)
+        assert caught.value.part == part, str(caught.value)

@@ -1,0 +1,209 @@
+"""The image of the ground that a moving line records: transfer function from the ground's image coordinates to pixels,
+and photons from reflectance.
+
+Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a place
+crosses the line it moves by `advance` pixels from one line to the next, less than one where the lens looks obliquely,
+and by `drift` pixels along it. With the focal plane's transfer function T(fx, fy) (cycles/m along the line and along
+the track) an image sampled at lines and pixels thus has
+
+    H(pixel, line) = T(pixel/p, -(line + drift pixel)/(advance p)) x smear(line).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from scipy import constants, fft
+
+from optics.pupil_function import PupilFunction, circular_pupil
+from optics.transfer import TransferTable
+from optics.zernike import cartesian_terms
+from scenes.band import BandSpec
+from twin.line_ccd import LineCcd, band_wavelengths
+from twin.orbit.sensor import Sensor
+
+if TYPE_CHECKING:
+    from scenes.detector import DetectorSpec
+    from scenes.orbit_scene import LineImageSpec
+
+SUN_TEMPERATURE = 5772.0
+"""K (IAU 2015 Resolution B3, nominal effective temperature)."""
+SUN_RADIUS = 6.957e8
+"""Metres (IAU 2015 Resolution B3)."""
+
+_TAPER = 0.75
+"""Share of the margin from which the point spread function is faded out to zero at the margin's end."""
+
+
+@dataclass(frozen=True)
+class ImageMotion:
+    """How the image of the ground moves over the line, per line.
+
+    Attributes:
+        advance: across the line, pixels, positive.
+        drift: along the line, pixels.
+    """
+
+    advance: float
+    drift: float
+
+    @classmethod
+    def of(cls, sensor: Sensor, line: float, pixel: float, height: float) -> ImageMotion:
+        """At a place of an image, for ground of a height (metres), by the directions of one ground point from before to
+        after its line. Light effects shift both alike and change nothing at 1e-5.
+        """
+        camera, step = sensor.camera, min(1.0, 0.5 * sensor.lines - 0.5)
+        middle = float(np.clip(line, step - 0.5, sensor.lines - 0.5 - step))
+        point = sensor.ground(np.array([middle]), np.array([pixel]), height)
+        seconds = sensor.time(np.array([middle - step, middle + step]))
+        to_itrs = sensor.trajectory.body_to_itrs(seconds)
+        way = point - sensor.trajectory.position(seconds)
+        direction = np.einsum("nij,ni->nj", to_itrs, way / np.linalg.norm(way, axis=-1, keepdims=True))
+        change = (direction[1] - direction[0]) / (2.0 * step)
+        look, slope = (v[0] for v in camera.look_and_slope(np.array([pixel])))
+        rate = float(np.linalg.norm(slope))
+        across = np.cross(look, slope / rate)
+        # at a field angle w a pixel is seen under p cos^2 w / f along the line and p cos w / f across it
+        cosine = float(look @ camera.look(np.array([0.5 * (camera.pixels - 1)]))[0])
+        return cls(abs(float(change @ across)) / rate * cosine, float(change @ slope) / rate**2)
+
+
+@dataclass(frozen=True, eq=False)
+class LineOptics:
+    """A line's lens and CCD.
+
+    Attributes:
+        ccd: the line CCD.
+        pupil: of the lens, the same all over the line.
+        f_number: of the lens.
+        transmission: of the lens.
+    """
+
+    ccd: LineCcd
+    pupil: PupilFunction
+    f_number: float
+    transmission: float
+
+    @classmethod
+    def from_specs(
+        cls, image: LineImageSpec, pixels: int, pitch: float, line_time: float, sheet: DetectorSpec
+    ) -> LineOptics:
+        """From what the files say.
+
+        Args:
+            image: image side of the line.
+            pixels: of the line.
+            pitch: of the pixels, metres.
+            line_time: from one line to the next, seconds.
+            sheet: of the CCD.
+        """
+        band = BandSpec.model_construct(
+            offset=0.0,
+            pixels=pixels,
+            pitch=pitch,
+            spectrum=image.spectrum,
+            detector=image.detector,
+            diffusion=image.diffusion,
+            tdi=image.tdi.model_copy(update={"line_time": line_time}),
+        )
+        pupil = circular_pupil(image.f_number, _eikonal({int(k[1:]): v for k, v in image.wavefront.items()}))
+        return cls(LineCcd.from_specs(band, sheet), pupil, image.f_number, image.transmission)
+
+    @property
+    def photons_per_reflectance(self) -> float:
+        """Photons on a pixel over all stages from ground of apparent reflectance 1: the Sun as a black body at 1 au, a
+        Lambertian ground, and pi/(4 F^2) of its radiance on the pixel.
+        """
+        first, last = self.ccd.band.spectrum
+        wavelength, weight = band_wavelengths(self.ccd.band)
+        radiance = _black_body_photons(wavelength) * (SUN_RADIUS / constants.au) ** 2
+        band = float(weight @ radiance) * (last - first)
+        tdi, pitch = self.ccd.band.tdi, self.ccd.band.pitch
+        seconds = tdi.stages * tdi.open_share * tdi.line_time
+        return band * np.pi / (4.0 * self.f_number**2) * self.transmission * pitch**2 * seconds
+
+    def transfer(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> np.ndarray:
+        """Real transfer function at frequencies along the line, cycles/pixel, and along the track, cycles/line; shapes
+        that broadcast. The pupil is even, so that there is no phase.
+        """
+        out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(pixel), np.shape(line)))
+        for factor in self.factors(pixel, line, motion).values():
+            out = out * factor
+        return out
+
+    def factors(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> dict[str, np.ndarray]:
+        """The parts of `transfer`: ``lens``, ``pixel``, ``diffusion``; ``step``: the image moves on while the charge
+        stands; ``stages``: image and charge drift apart over the stages, by the rate's error and because the image does
+        not advance by a pixel in a line's time.
+        """
+        band = self.ccd.band
+        fx = pixel / band.pitch
+        fy = -(line + motion.drift * pixel) / (motion.advance * band.pitch)
+        from_ccd = self.ccd.factors(fx, fy)
+        tdi = band.tdi
+        slip = (line + (1.0 + tdi.rate_error) * band.pitch * fy) / tdi.phases
+        return {
+            "lens": np.asarray(self._table(fx, fy).real),
+            "pixel": from_ccd["pixel"],
+            "diffusion": from_ccd["diffusion"],
+            "step": np.sinc(tdi.open_share / tdi.phases * line),
+            "stages": _mean_of_steps(slip, tdi.stages * tdi.phases) if tdi.stages > 1 else np.ones_like(slip),
+        }
+
+    def kernel(self, oversampling: int, margin: int, motion: ImageMotion) -> np.ndarray:
+        """Point spread function on `oversampling` samples per line and pixel, float64, of unit sum.
+
+        It is zero from `margin` pixels and lines on, faded out before: so an image does not depend on how it is cut
+        into parts. What a diffraction pattern has farther out (0.3% at F/6 and 24 pixels) is left out.
+
+        Returns:
+            Square, the middle sample is the pixel's centre.
+        """
+        half = margin * oversampling
+        count = fft.next_fast_len(4 * half)
+        frequency = fft.fftfreq(count, 1.0 / oversampling)
+        values = fft.fftshift(fft.ifft2(self.transfer(frequency[None, :], frequency[:, None], motion)).real)
+        cut = slice(count // 2 - half, count // 2 + half + 1)
+        place = np.abs(np.arange(-half, half + 1)) / half
+        fade = 0.5 + 0.5 * np.cos(np.pi * np.clip((place - _TAPER) / (1.0 - _TAPER), 0.0, 1.0))
+        spread = values[cut, cut] * fade[:, None] * fade
+        return np.asarray(spread / spread.sum())
+
+    @cached_property
+    def _table(self) -> TransferTable:
+        wavelength, weight = band_wavelengths(self.ccd.band)
+        return TransferTable.build(self.pupil, wavelength, weight * _black_body_photons(wavelength))
+
+
+def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
+    """Wavefront by Zernike terms as coefficients of products of Chebyshev's polynomials."""
+    if not terms:
+        return None
+    monomials = [(a, b, size * c) for index, size in terms.items() for a, b, c in cartesian_terms(index)]
+    degree = max(a + b for a, b, _ in monomials)
+    power = np.zeros((degree + 1, degree + 1))
+    for a, b, c in monomials:
+        power[a, b] += c
+    to_chebyshev = np.zeros((degree + 1, degree + 1))
+    for k in range(degree + 1):
+        to_chebyshev[: k + 1, k] = chebyshev.poly2cheb([0.0] * k + [1.0])
+    return np.asarray(to_chebyshev @ power @ to_chebyshev.T)
+
+
+def _black_body_photons(wavelength: np.ndarray) -> np.ndarray:
+    """Radiance of the Sun's surface, photons/(s m^2 sr m); Lambertian ground in its light has this times the Sun's
+    radius over its distance, squared.
+    """
+    x = constants.h * constants.c / (wavelength * constants.k * SUN_TEMPERATURE)
+    return np.asarray(2.0 * constants.c / wavelength**4 / np.expm1(x))
+
+
+def _mean_of_steps(cycles: np.ndarray, count: int) -> np.ndarray:
+    """Mean of exp(2 pi i k cycles) over `count` steps about their middle."""
+    near = np.sinc(cycles)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.abs(near) < 1e-9, 1.0, np.sinc(count * cycles) / near)
