@@ -1,0 +1,302 @@
+"""From the on-board monitor to heights on the ground, end to end, and as a user runs it."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
+from optics.tree import Motion
+from scenes.orbit_setup import MonitorSetup, resolve_monitor
+from tests.twin.commands import files, invoke, refused
+from twin.orbit.line_camera import traced_line_cameras
+from twin.orbit.monitor_analysis import rms, run_monitored
+from twin.trial.result import silent
+from twin.truth import trace_truth
+
+ARCSEC = np.pi / 648000
+FALSE_ALARM = 1e-6
+SMALL = """
+name: small
+instrument: gf7_pair
+reference: 0 min
+interval: 20 min
+repeats: 30
+frames: 2
+course:
+  times: [0 min, 10 min, 20 min, 30 min, 40 min]
+  temperature:
+    base/forward/monitor/left/prism_180:
+      change: [0 K, 0 K, 0 K, 0 K, 0 K]
+      gradient: [[0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m],
+        [0 K/m, 0 K/m, 0 K/m]]
+motion:
+  base/forward: {rotate: [0.4 arcsec, 1.2 arcsec, 0.6 arcsec], period: 94.6 min}
+  base/backward: {rotate: [-0.3 arcsec, -1.2 arcsec, -0.8 arcsec], period: 94.6 min}
+  base/backward/focal_plane: {rotate: [0.3 arcsec, -0.4 arcsec, 2 arcsec], pivot: rear_node, duration: 30 min}
+orbit:
+  epoch: 2021-06-21T02:40:00Z
+  before: 2 min
+  after: 42 min
+  passing: {longitude: 116 deg, latitude: 60 deg}
+ground: {points: 60, first: 1500, last: 31267, height: 500 m, relief: 400 m}
+errors: {image: 0.3}
+seed: 3
+"""
+HOT = "[0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m],\n        [0 K/m, 0 K/m, 0 K/m]]"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "small.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def changed(setup: MonitorSetup, **errors) -> MonitorSetup:
+    test = setup.test
+    update = {"errors": test.errors.model_copy(update=errors)}
+    return setup.model_copy(update={"test": test.model_copy(update=update)})
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory) -> MonitorSetup:
+    return resolve_monitor(write(tmp_path_factory.mktemp("monitor"), SMALL))
+
+
+@pytest.fixture(scope="module")
+def quiet(setup, backend):
+    """No noise at all, no temperatures."""
+    return run_monitored(changed(setup, switched_on=False), backend, 3, silent)
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory, backend):
+    """Noise everywhere, and a prism that warms unevenly at the end."""
+    text = SMALL.replace(
+        HOT, "[2 mK/m, 9 mK/m, 5 mK/m], [4 mK/m, 18 mK/m, 10 mK/m],\n        [8 mK/m, 20 mK/m, 30 mK/m]]"
+    )
+    assert text != SMALL
+    return run_monitored(resolve_monitor(write(tmp_path_factory.mktemp("noisy"), text)), backend, 3, silent)
+
+
+# The correction
+
+
+TURN = 10.0 * ARCSEC
+MOTIONS = {
+    "camera about X": {"base/forward": Motion((TURN, 0.0, 0.0))},
+    "camera about Y": {"base/forward": Motion((0.0, TURN, 0.0))},
+    "camera about Z": {"base/forward": Motion((0.0, 0.0, TURN))},
+    "scaled, but for the line": {"base/forward": Motion(scale=20e-6)},
+    "line along X": {"base/forward/focal_plane": Motion(shift=(50e-6, 0.0, 0.0))},
+    "line along Y": {"base/forward/focal_plane": Motion(shift=(0.0, 50e-6, 0.0))},
+    "line about Z": {"base/forward/focal_plane": Motion((0.0, 0.0, TURN))},
+    "M1 tilted": {"base/forward/M1": Motion((0.5 * ARCSEC, 0.3 * ARCSEC, 0.0), pivot="centre")},
+    "M2 shifted": {"base/forward/M2": Motion(shift=(2e-6, 3e-6, 2e-6))},
+}
+EXACT = 1e-9
+"""Rad, 0.2 mas or 0.5 mm on the ground: products of two of 10 arcsec (2e-9), and 1e-9 of the line itself."""
+
+
+@pytest.mark.parametrize("case", MOTIONS)
+def test_true_parameters_reproduce_the_traced_line(case: str, quiet, backend, gf7_pair) -> None:
+    """Signs and order of the turns, by the trace. A whole camera's turn is in the four parameters entirely. A line that
+    moves in its camera, or one that stays as long while the camera grows, looks through another field, with other
+    distortion: 1% of the change is left at most."""
+    state = MOTIONS[case]
+    change = trace_truth(gf7_pair, backend, [state]).cameras["forward"]
+    values = [float(v[0]) for v in (change.d_alpha, change.d_beta, change.d_gamma, change.d_f)]
+    nominal, true = (traced_line_cameras(gf7_pair, backend, s)["forward"] for s in ({}, state))
+    calibrated = CalibratedLine(
+        nominal.pixels,
+        nominal.directions,
+        nominal.origins,
+        gf7_pair.camera_axes("forward"),
+        change.nominal_distance,
+    )
+    pixel = np.linspace(0.0, nominal.pixels - 1.0, 201)
+    moved = np.linalg.norm(true.look(pixel) - nominal.look(pixel), axis=1).max()
+    left = np.linalg.norm(true.look(pixel) - calibrated.corrected(values).look(pixel), axis=1).max()
+    assert moved > 10.0 * EXACT
+    assert left < (EXACT if case.startswith("camera") else 0.01 * moved + EXACT)
+
+
+def test_intersection_of_two_rays_is_exact_and_knows_its_limits() -> None:
+    """Two stations 100 km apart over a point: by hand."""
+    axes = np.diag([1.0, -1.0, -1.0])  # X forward, Z down
+    line = CalibratedLine(1001, np.array([[0.0, 0.0, 1.0], [0.0, -0.01, 0.0]]), np.zeros((1, 3)), np.eye(3), 5.0)
+    tilt = np.arctan2(100e3, 500e3)
+    turn = np.array([[np.cos(tilt), 0.0, np.sin(tilt)], [0.0, 1.0, 0.0], [-np.sin(tilt), 0.0, np.cos(tilt)]])
+    middle = np.array([500.0])
+    back = Sightings(middle, np.array([[-100e3, 0.0, 500e3]]), (axes @ turn)[None])
+    down = Sightings(middle, np.array([[0.0, 0.0, 500e3]]), axes[None])
+    found = intersect_pair(line, line, back, down)
+    assert found.ground == pytest.approx(np.zeros((1, 3)), abs=1e-8)  # rounding of 500 km
+    assert found.miss == pytest.approx([0.0], abs=1e-8)
+    # the forward ray one arcsec flatter: 1 arcsec x slant range / cos(tilt) over the base-to-height ratio
+    flatter = intersect_pair(line.corrected([ARCSEC, 0.0, 0.0, 0.0]), line, back, down)
+    slant = np.hypot(100e3, 500e3)
+    assert flatter.ground[0, 2] == pytest.approx(ARCSEC * slant / np.cos(tilt) / np.tan(tilt), rel=1e-3)
+    with pytest.raises(IntersectionError, match="parallel"):
+        intersect_pair(line, line, down, down)
+    with pytest.raises(ValueError, match="four finite numbers"):
+        line.corrected([0.0, np.nan, 0.0, 0.0])
+
+
+def test_values_between_measurements() -> None:
+    values = np.array([[0.0, 1.0, 2.0, 3.0], [10.0, 1.0, 0.0, 4.0]])
+    found = between([-1.0, 0.0, 2.5, 10.0, 12.0], [0.0, 10.0], values)
+    assert found[:, 0] == pytest.approx([0.0, 0.0, 2.5, 10.0, 10.0])
+    assert found[2] == pytest.approx([2.5, 1.0, 1.5, 3.25])
+
+
+# What monitoring buys
+
+
+def test_monitoring_takes_out_nearly_all(quiet) -> None:
+    """Without noise and temperatures. The estimator is linear, with the Jacobian of the nominal camera: arcseconds of
+    the focal plane's turn about X and Y, which it does not assume, leave 1e-3 of themselves; 1% of all is asked."""
+    none, monitored = (quiet.cases[name].camera_height_rms for name in ("none", "monitored"))
+    assert none > 5.0
+    assert monitored < 0.01 * none
+    assert rms(quiet.cases["monitored"].camera_plan) < 0.05 * rms(quiet.cases["none"].camera_plan)
+    # exact data by the true cameras: what is left is rounding and the sensor's 1e-7 pixel
+    assert quiet.cases["true"].height_rms < 1e-5
+    # true parameters: second order and what the four cannot say
+    assert quiet.cases["parameters"].camera_height_rms < 2e-3
+
+
+def test_height_without_monitoring_is_the_angle_times_metres_per_arcsec(quiet) -> None:
+    """Traced metres of each camera's turn predict the height to 2%: the latitude changes the altitude by 1%, the scale
+    and d_gamma add millimetres. Of the angle alone it is 5%, for the cameras do not turn by exactly half each."""
+    run, flight = quiet, quiet.flight
+    height = run.cases["none"].camera
+    size = rms(height)
+    told = run.conversion
+    by_camera = -sum(told.traced[n] * flight.truth[n][:, 0] / ARCSEC for n in flight.pair)
+    assert rms(height - by_camera) < 0.02 * size
+    assert rms(height + told.of_angle * run.angle_change / ARCSEC) < 0.05 * size
+    for name in flight.pair:
+        assert told.traced[name] == pytest.approx(
+            told.theory[name], rel=0.01
+        )  # mean of the points, deflection of the up
+        assert abs(told.angle_step[name]) == pytest.approx(1.0, rel=1e-6)
+    # by hand with flat ground, the paper's way
+    flat = 500e3 * ARCSEC * (1.0 + np.tan(np.radians(26.0)) ** 2) / (np.tan(np.radians(26.0)) + np.tan(np.radians(5.0)))
+    assert told.traced["forward"] == pytest.approx(flat, rel=0.2)  # the curved Earth
+
+
+def test_the_monitor_follows_the_angle(quiet) -> None:
+    assert np.ptp(quiet.angle_change) > 2.0 * ARCSEC
+    assert quiet.angle == pytest.approx(quiet.angle_change, abs=0.01 * ARCSEC)
+
+
+def test_longer_intervals_are_worse_and_the_shortest_is_every_time(quiet) -> None:
+    errors = [case.camera_height_rms for case in quiet.intervals.values()]
+    assert list(quiet.intervals) == [600.0, 1200.0, 2400.0]
+    assert errors == sorted(errors)
+    assert errors[0] == quiet.cases["monitored"].camera_height_rms
+    assert quiet.intervals[1200.0].height_rms == quiet.cases["interval"].height_rms
+    # a swing of amplitude A between two measurements a half of them off: A (1 - cos(pi 20 / 94.6)) = 0.21 A at its peak
+    assert errors[1] < 0.25 * np.abs(quiet.cases["none"].camera).max()
+
+
+def test_noise_is_as_large_as_its_sigma(noisy) -> None:
+    """Repeats with everything drawn anew, and every time's own measurement, each against its own sigma, for all share
+    the reference's noise: false alarm 1e-6 each."""
+    seen, free = noisy.scatter, len(noisy.scatter.heights) - 1
+    total = free * (seen.spread / seen.sigma) ** 2
+    assert chi2.ppf(FALSE_ALARM, free) < total < chi2.isf(FALSE_ALARM, free)
+    assert 1e-4 < seen.sigma < 0.01
+    # one time has one draw: 4.9 sigmas
+    assert np.abs(noisy.parts["noise"] / noisy.sigma).max() < 4.9
+
+
+def test_image_noise_is_the_floor(noisy) -> None:
+    """0.3 pixels in both lines, by hand: each moves a point along the track by 0.3 lines of 0.63 m, and the height by
+    the difference over base to height. 300 points: 4% of an RMS, five sigmas; 4% for the altitude."""
+    step = 0.09e-3 * 7.06e3
+    expected = 0.3 * np.sqrt(2.0) * step / noisy.conversion.base_to_height
+    assert noisy.cases["true"].height_rms == pytest.approx(expected, rel=0.25)
+
+
+def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
+    """The trace of the prism alone explains what the monitor is wrong by, and heights with it."""
+    flight, parts = noisy.flight, noisy.parts
+    error = flight.clean["forward"] - flight.truth["forward"]
+    assert np.abs(flight.prisms["forward"][4, 0]) > 0.01 * ARCSEC
+    assert error[:, 0] == pytest.approx(flight.prisms["forward"][:, 0], abs=0.005 * ARCSEC)
+    assert np.abs(flight.prisms["backward"]).max() < 1e-12
+    assert rms(parts["prisms"]) > 5.0 * rms(parts["noise"])
+    left = noisy.cases["monitored"].camera
+    whole = sum(part for name, part in parts.items() if name != "interpolation")
+    assert left == pytest.approx(whole, abs=1e-3)  # products of two arcseconds
+
+
+def test_causes_add_up(noisy) -> None:
+    """Each entry of the file alone, against all together, at the time that is looked at: linear but for products."""
+    flight = noisy.flight
+    for name in flight.pair:
+        true = sum(cause.truth[name] for cause in flight.causes)
+        assert true == pytest.approx(flight.truth[name][flight.worst], abs=1e-3 * ARCSEC)
+
+
+# The command
+
+
+def test_command(tmp_path: Path) -> None:
+    import twin.orbit.__main__ as command
+
+    run = partial(invoke, command.app)
+    path = write(tmp_path, SMALL.replace("repeats: 30", "repeats: 8").replace("points: 60", "points: 10"))
+    result = run("monitor", path, "--out", tmp_path / "run", "--seed", 5, "--json")
+    assert result.exit_code == 0, result.stderr
+    data = json.loads(result.stdout)
+    assert data == json.loads((tmp_path / "run" / "monitor.json").read_text("utf-8"))
+    numbers = ("height_rms_m", "height_worst_m", "plan_rms_m", "metres_per_arcsec", "interval_s")
+    assert all(isinstance(data[key], float) for key in numbers)
+    assert data["height_rms_m"] == data["cases"]["interval"]["height_rms_m"]
+    assert {"none", "monitored", "interval", "parameters", "true"} == set(data["cases"])
+    assert [row["interval_s"] for row in data["intervals"]] == [600.0, 1200.0, 2400.0]
+    count = len(data["times_s"])
+    for name in ("forward", "backward"):
+        camera = data["cameras"][name]
+        assert len(camera["true"]["d_alpha_arcsec"]) == len(camera["monitored"]["d_alpha_arcsec_sigma"]) == count
+    assert len(data["intersection_angle"]["monitored_change_arcsec"]) == count
+    figures = {"angle", "height", "interval", "remainder"}
+    tables = {"cases", "changes-forward", "changes-backward", "intervals", "parts", "causes", "conversion"}
+    expected = {"manifest.json", "config.yaml", "monitor.json", "report.html"}
+    expected |= {f"artefacts/{n}.svg" for n in figures} | {f"artefacts/{n}.csv" for n in tables}
+    assert files(tmp_path / "run") == expected
+    again = run("monitor", tmp_path / "run" / "config.yaml", "--out", tmp_path / "again", "--quiet")
+    assert again.exit_code == 0, again.stderr
+    assert (tmp_path / "again" / "monitor.json").read_bytes() == (tmp_path / "run" / "monitor.json").read_bytes()
+
+
+# what is wrong, key, what to do about it
+BAD = {
+    "node": ("base/backward: {", "base/backwards: {", "motion.base/backwards", ["no such node", "'base/backward'"]),
+    "pivot": ("pivot: rear_node", "pivot: front", "motion.base/backward/focal_plane.pivot", ["no such pivot"]),
+    "too far": ("-1.2 arcsec, -0.8", "-500 arcsec, -0.8", "course", ["keep the beams on the mirrors"]),
+    "interval": ("interval: 20 min", "interval: 50 min", "interval", ["longer than the course"]),
+    "short orbit": ("after: 42 min", "after: 2401 s", "orbit.after", ["a minute before the first and after"]),
+    "no overlap": (
+        "ground: {",
+        "attitude: {offset: [0 deg, 0 deg, 15 deg]}\nground: {",
+        "cameras",
+        ["steering: yaw"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(case: str, tmp_path: Path) -> None:
+    import twin.orbit.__main__ as command
+
+    old, new, key, words = BAD[case]
+    assert SMALL.count(old) == 1
+    path = write(tmp_path, SMALL.replace(old, new))
+    refused(partial(invoke, command.app), "monitor", path, key, words)
