@@ -89,16 +89,17 @@ class NoiseModel:
         """
         if int(frames) != frames or frames < 1:
             raise ValueError(f"noise model: frames must be an integer >= 1, found {frames!r}")
-        variance = np.subtract(mean_signal_dn, self.offset_dn)
-        variance = np.maximum(variance, 0.0)
-        variance = variance * self.gain_dn_per_e
-        variance = variance + self.dark_variance_dn2
-        return variance / frames
+        variance = np.maximum(np.subtract(mean_signal_dn, self.offset_dn), 0.0)
+        variance *= self.gain_dn_per_e / frames
+        variance += self.dark_variance_dn2 / frames
+        return variance
 
     def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
         """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal, DN^2.
 
         Does not fall with the number of frames, and is the same draw in every image of the same pixels.
         """
-        signal = self.prnu * self.light_signal_dn(mean_signal_dn)
-        return signal * signal + self.dsnu_variance_dn2
+        variance = self.prnu * self.light_signal_dn(mean_signal_dn)
+        variance *= variance
+        variance += self.dsnu_variance_dn2
+        return variance

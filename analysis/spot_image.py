@@ -24,7 +24,7 @@ _BIN = 4
 _DETECTION_SIGMAS = 6.0
 _SATURATION_SIGMAS = 4.0
 # Spots measured together: few enough that their arrays stay in the processor's cache.
-_PIECE = 8
+_PIECE = 4
 
 
 def as_images(mean: ArrayLike) -> Array:
@@ -200,17 +200,23 @@ def variance(level: Array, noise: NoiseModel, frames: int, weights: str) -> Arra
     return out
 
 
-def template_model(theta: Array, which: NDArray[np.intp], template: SpotTemplate) -> tuple[Array, Array]:
-    """Model of row, column, flux, background (B, 4): its design (B, 4, P) and grey values (B, P)."""
-    value, d_row, d_column = template.evaluate(theta[:, 0], theta[:, 1], which)
-    count = theta.shape[0]
-    flux = theta[:, 2, None]
-    design = np.empty((count, 4, value[0].size))
-    np.multiply(d_row.reshape(count, -1), flux, out=design[:, 0])
-    np.multiply(d_column.reshape(count, -1), flux, out=design[:, 1])
-    design[:, 2] = value.reshape(count, -1)
-    design[:, 3] = 1.0
-    return design, design[:, 2] * flux + theta[:, 3, None]
+def template_model(
+    theta: Array,
+    which: NDArray[np.intp],
+    template: SpotTemplate,
+    part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
+    out: Array | None = None,
+) -> tuple[Array, Array]:
+    """Model of row, column, flux, background (B, 4): its design (B, 4, P) and grey values (B, P).
+
+    part: as for `SpotTemplate.evaluate`. out: where the design goes, if given.
+    """
+    count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
+    design = np.empty((count, 4, height * width)) if out is None else out
+    template.fill_design(design.reshape(count, 4, height, width), theta, which, part)
+    level = design[:, 2] * theta[:, 2, None]
+    level += theta[:, 3, None]
+    return design, level
 
 
 def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tuple[Array, Array]:

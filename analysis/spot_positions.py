@@ -100,14 +100,15 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
             f"difference covariance: before {before.gain_maps.shape} does not fit after {after.gain_maps.shape}"
         )
     total = after.covariance + np.tile(before.covariance, (count // first, 1, 1))
-    g_before = before.gain_maps.reshape(first, 2, -1).transpose(0, 2, 1)
-    light_before = (noise.prnu * before.light_dn).reshape(first, 1, -1)
+    g_before = before.gain_maps.reshape(first, 2, -1)
+    # one side carries both terms, so that the other one is worked on once per spot
+    lit_before = (g_before * (noise.prnu**2 * before.light_dn.reshape(first, 1, -1))).transpose(0, 2, 1)
+    dark_before = (noise.dsnu_variance_dn2 * g_before).transpose(0, 2, 1)
     g_after = after.gain_maps.reshape(count, 2, -1)
     light_after = after.light_dn.reshape(count, 1, -1)
     # One state at a time keeps the work in the processor's cache; the loop is over states, not over spots.
     for start in range(0, count, first):
         part = slice(start, start + first)
-        weighted = g_after[part] * (light_after[part] * light_before * noise.prnu + noise.dsnu_variance_dn2)
-        cross = weighted @ g_before
+        cross = (g_after[part] * light_after[part]) @ lit_before + g_after[part] @ dark_before
         total[part] -= cross + cross.transpose(0, 2, 1)
     return total

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,19 +39,16 @@ class TemplateRangeError(ValueError):
         self.indices = indices
 
 
-def _tap_polynomials() -> tuple[Array, Array]:
-    """Weights of the six taps as polynomials of the fraction t in [0, 1): (power, tap) for the value and for d/dt."""
+def _tap_polynomials() -> Array:
+    """Weights of the six taps as polynomials of the fraction t in [0, 1): (power, tap)."""
     nodes = np.linspace(0.0, 1.0, _TAPS)
     basis = BSpline.basis_element(np.arange(_TAPS + 1) - _TAPS / 2.0)
     taps = np.arange(_TAPS) - (_TAPS // 2 - 1)
     values = np.nan_to_num(basis(np.clip(nodes[:, None] - taps[None, :], -3.0, 3.0)))
-    value = np.linalg.solve(np.vander(nodes, _TAPS, increasing=True), values)
-    slope = np.zeros_like(value)
-    slope[:-1] = value[1:] * np.arange(1, _TAPS)[:, None]
-    return value, slope
+    return np.linalg.solve(np.vander(nodes, _TAPS, increasing=True), values)
 
 
-_VALUE, _SLOPE = _tap_polynomials()
+_VALUE = _tap_polynomials()
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,14 +179,20 @@ class SpotTemplate:
         return limits[0], limits[1]
 
     def evaluate(
-        self, row: ArrayLike, column: ArrayLike, index: NDArray[np.intp] | None = None
+        self,
+        row: ArrayLike,
+        column: ArrayLike,
+        index: NDArray[np.intp] | None = None,
+        part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     ) -> tuple[Array, Array, Array]:
         """The spot at (row, column), with its derivatives.
 
         row, column: (B,) positions of the spot's centre in detector pixels.
         index: (B,) which of the T shapes; default: spot b has shape b modulo T.
-        Returns value, d value / d row, d value / d column, each (B, H, W); value is the fraction of the flux per
-        pixel. Raises TemplateRangeError, naming the spots, for positions outside `supported`.
+        part: first pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector that is wanted;
+            default: all of it.
+        Returns value, d value / d row, d value / d column, each (B, H, W) or (B, h, w); value is the fraction of the
+        flux per pixel. Raises TemplateRangeError, naming the spots, for positions outside `supported`.
         """
         rows = np.atleast_1d(np.asarray(row, dtype=np.float64))
         columns = np.atleast_1d(np.asarray(column, dtype=np.float64))
@@ -198,30 +202,75 @@ class SpotTemplate:
                 f"spot template: row {rows.shape}, column {columns.shape}, index {which.shape} must all be (B,)"
             )
         self._check_range(rows, columns, which)
-        a, da = self._shift(self.row_factors, self.centre[which, 0], rows, which, self.shape[0])
-        b, db = self._shift(self.column_factors, self.centre[which, 1], columns, which, self.shape[1])
-        bt = b.transpose(0, 2, 1)
-        return a @ bt, da @ bt, a @ db.transpose(0, 2, 1)
+        corner, shape = (np.zeros((rows.size, 2), np.intp), self.shape) if part is None else part
+        out = np.empty((3, rows.size, *shape))
+        self._fill(out[1:], out[0], rows - corner[:, 0], columns - corner[:, 1], which, np.ones(rows.size))
+        return out[0], out[1], out[2]
+
+    def fill_design(
+        self,
+        out: Array,
+        theta: Array,
+        index: NDArray[np.intp],
+        part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
+    ) -> None:
+        """Fill ``out`` (B, 4, H, W) with the derivatives of a spot over a background by row, column, flux, background.
+
+        theta: (B, 4) these four. index, part: as for `evaluate`. Raises TemplateRangeError as `evaluate` does.
+        """
+        self._check_range(theta[:, 0], theta[:, 1], index)
+        place = theta[:, :2] - (0 if part is None else part[0])
+        self._fill(out[:, :2].swapaxes(0, 1), out[:, 2], place[:, 0], place[:, 1], index, theta[:, 2])
+        out[:, 3] = 1.0
+
+    def _fill(
+        self, slopes: Array, value: Array, rows: Array, columns: Array, which: NDArray[np.intp], flux: Array
+    ) -> None:
+        """Values (B, H, W), and slopes by row and column (2, B, H, W) times flux (B,), for checked places."""
+        height, width = value.shape[1:]
+        a = self._shift(self._polynomials[0], self.centre[which, 0], rows, which, height, flux)
+        b = self._shift(self._polynomials[1], self.centre[which, 1], columns, which, width, flux).swapaxes(2, 3)
+        np.matmul(a[:, 0], b[:, 0], out=value)
+        np.matmul(a[:, 1], b[:, 0], out=slopes[0])
+        np.matmul(a[:, 0], b[:, 1], out=slopes[1])
+
+    @cached_property
+    def _polynomials(self) -> tuple[Array, Array]:
+        """Splines of rows and columns between two samples, as polynomials of the fraction: (T, power, sample, R)."""
+        out = []
+        for factors in (self.row_factors, self.column_factors):
+            intervals = factors.shape[1] - _TAPS + 1
+            taps = np.stack([factors[:, tap : tap + intervals] for tap in range(_TAPS)], axis=1)
+            out.append(np.ascontiguousarray(np.einsum("pk,tkmr->tpmr", _VALUE, taps)))
+        return out[0], out[1]
 
     def _shift(
-        self, factors: Array, centre: Array, position: Array, which: NDArray[np.intp], pixels: int
-    ) -> tuple[Array, Array]:
-        """Spline along one axis: (B, pixels, R) values at the detector's pixels, and derivatives for the position."""
-        start = centre - self.oversampling * position
-        base = np.floor(start).astype(np.intp)
-        powers = (start - base)[:, None] ** np.arange(_TAPS)
-        weight, slope = powers @ _VALUE, powers @ _SLOPE
-        # Spot-independent window of samples, then the six taps as strided views of it.
+        self,
+        polynomials: Array,
+        centre: Array,
+        position: Array,
+        which: NDArray[np.intp],
+        pixels: int,
+        flux: Array,
+    ) -> Array:
+        """Spline along one axis: (B, 2, pixels, R), values at the detector's pixels and derivatives for the position
+        times flux (B,).
+        """
         step = self.oversampling
-        span = np.arange(step * (pixels - 1) + _TAPS)
-        window = factors[which[:, None], (base - (_TAPS // 2 - 1))[:, None] + span]
-        value = np.zeros((position.size, pixels, factors.shape[2]))
-        gradient = np.zeros_like(value)
-        for tap in range(_TAPS):
-            sample = window[:, tap : tap + step * (pixels - 1) + 1 : step]
-            value += weight[:, tap, None, None] * sample
-            gradient -= (step * slope[:, tap, None, None]) * sample
-        return value, gradient
+        start = centre - step * position
+        base = np.floor(start).astype(np.intp)
+        power = np.arange(_TAPS)
+        powers = (start - base)[:, None] ** power
+        slopes = np.zeros_like(powers)
+        slopes[:, 1:] = (-step * flux)[:, None] * power[1:] * powers[:, :-1]
+        weights = np.stack([powers, slopes], axis=1)
+        rank = polynomials.shape[-1]
+        out = np.empty((position.size, 2, pixels * rank))
+        first = base - (_TAPS // 2 - 1)
+        for spot in range(position.size):
+            span = slice(first[spot], first[spot] + step * (pixels - 1) + 1, step)
+            np.matmul(weights[spot], polynomials[which[spot], :, span].reshape(_TAPS, -1), out=out[spot])
+        return out.reshape(position.size, 2, pixels, rank)
 
     def _check_range(self, rows: Array, columns: Array, which: NDArray[np.intp]) -> None:
         limits = np.array([self.supported(t) for t in range(self.count)])[which]

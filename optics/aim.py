@@ -41,12 +41,18 @@ class RayFan:
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Launch points and directions for parameters q (B, N, 2)."""
-        step = np.einsum("bnk,bnkx->bnx", q, np.broadcast_to(self.axes, (*q.shape, 3)))
+        start = self.position if self.moves_position else self.direction
+        # component by component: each is one block of memory
+        moved = np.empty((3, *q.shape[:2]))
+        for x in range(3):
+            np.multiply(q[..., 0], self.axes[..., 0, x], out=moved[x])
+            moved[x] += q[..., 1] * self.axes[..., 1, x]
+            moved[x] += start[..., x]
         shape = (*q.shape[:2], 3)
         if self.moves_position:
-            return self.position + step, np.broadcast_to(self.direction, shape)
-        direction = self.direction + step
-        return np.broadcast_to(self.position, shape), direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+            return np.moveaxis(moved, 0, -1), np.broadcast_to(self.direction, shape)
+        moved /= np.sqrt(moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2)
+        return np.broadcast_to(self.position, shape), np.moveaxis(moved, 0, -1)
 
 
 def transverse_axes(direction: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -90,7 +96,7 @@ def aim(
 
     def hit(q: np.ndarray) -> np.ndarray:
         position, direction = fan.at(q)
-        return trace(backend, uploaded, make_rays(backend, position, direction)).numpy()[0][..., :2]
+        return trace(backend, uploaded, make_rays(backend, position, direction)).place()
 
     count = max(systems.count, fan.position.shape[0], fan.direction.shape[0])
     rays = max(fan.position.shape[1], fan.direction.shape[1], np.shape(target)[-2] if np.ndim(target) > 1 else 1)
@@ -109,8 +115,8 @@ def aim(
         if worst <= tolerance:
             return q, slope
         if not np.isfinite(worst):
-            break
-        change = np.linalg.solve(slope, miss[..., None])[..., 0]
+            break  # also after a step along a singular Jacobian
+        change = _solve(slope, miss)
         q = q + change
         there = hit(q)
         error = (there - here) - np.einsum("bnij,bnj->bni", slope, change)
@@ -124,6 +130,14 @@ def aim(
         f"aiming at the last element did not converge: {float(np.max(np.abs(goal - here))):.3g} m off after "
         f"{MAX_ITERATIONS} steps; the perturbation may move the beam off the mirrors"
     )
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions (..., 2) of 2 x 2 systems by Cramer's rule, in a few passes; not finite where singular."""
+    (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    x, y = np.moveaxis(right, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
 
 
 def alive_along(

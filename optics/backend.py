@@ -36,28 +36,28 @@ class Backend:
     Vector3: Any
 
     def opaque(self, values: Any) -> Any:
-        """Upload numbers as kernel *inputs*: shape (n,) or scalar -> ``Float`` of width n.
+        """Upload numbers as kernel *inputs*: n numbers of any shape -> ``Float`` of width n.
 
         A Python float used directly would be compiled into the kernel as a literal, and each new value would compile a
         new kernel.
         """
         import drjit as dr
 
-        array = self.Float(_aligned(np.asarray(values, dtype=np.float64).ravel()))
+        array = self.Float(_aligned(np.asarray(values, dtype=np.float64)))
         dr.make_opaque(array)
         return array
 
     def vector(self, values: Any) -> Any:
-        """Upload an (n, 3) or (3,) array as a ``Vector3`` of width n."""
-        rows = np.atleast_2d(np.asarray(values, dtype=np.float64))
-        return self.Vector3(self.opaque(rows[:, 0]), self.opaque(rows[:, 1]), self.opaque(rows[:, 2]))
+        """Upload an array (..., 3) of n vectors as a ``Vector3`` of width n."""
+        rows = np.asarray(values, dtype=np.float64)
+        return self.Vector3(*(self.opaque(rows[..., x]) for x in range(3)))
 
 
 _ALIGNMENT = 128
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
-    """Copy of a flat array at an aligned address.
+    """Flat copy of an array at an aligned address.
 
     Dr.Jit reads a NumPy array in place and compiles the alignment of its address into the kernel; arrays that are
     aligned only by chance would make a second kernel of the same code now and then.
@@ -65,7 +65,7 @@ def _aligned(values: np.ndarray) -> np.ndarray:
     room = np.empty(values.size + _ALIGNMENT // values.itemsize, values.dtype)
     start = (-room.ctypes.data % _ALIGNMENT) // values.itemsize
     aligned = room[start : start + values.size]
-    aligned[:] = values
+    aligned.reshape(values.shape)[...] = values
     return aligned
 
 

@@ -74,10 +74,15 @@ class Traced:
         """Local positions (B, N, 3) on an element that was kept, metres."""
         return rows(self.hits[element], self.count)
 
+    def place(self, element: int | None = None) -> np.ndarray:
+        """Local x, y (B, N, 2), metres, on the last element or on one that was kept."""
+        vector = self.local.position if element is None else self.hits[element]
+        return np.moveaxis(np.stack([c.numpy() for c in (vector.x, vector.y)]).reshape(2, self.count, -1), 0, -1)
+
 
 def rows(vector: Any, count: int) -> np.ndarray:
-    """Components of a ``Vector3`` of B * N rays as an array (B, N, 3)."""
-    return np.stack([c.numpy() for c in vector], axis=-1).reshape(count, -1, 3)
+    """Components of a ``Vector3`` of B * N rays as an array (B, N, 3); in memory one component after the other."""
+    return np.moveaxis(np.stack([c.numpy() for c in vector]).reshape(3, count, -1), 0, -1)
 
 
 def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, path: np.ndarray | None = None) -> Rays:
@@ -89,8 +94,7 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
 
     position, direction = np.broadcast_arrays(np.asarray(position, np.float64), np.asarray(direction, np.float64))
     systems = position.shape[0] if position.ndim == 3 else 1
-    position, direction = position.reshape(-1, 3), direction.reshape(-1, 3)
-    n = len(position)
+    n = position.size // 3
     start = backend.opaque(np.zeros(n) if path is None else np.asarray(path, dtype=np.float64).ravel())
     return Rays(backend.vector(position), backend.vector(direction), start, dr.full(backend.Bool, True, n), systems)
 

@@ -5,6 +5,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 
 import numpy as np
@@ -47,8 +48,11 @@ class MonitorExperiment:
 
     @cached_property
     def wide_photons(self) -> np.ndarray:
-        """Expected photons of the unperturbed instrument with the template's margin, (C, rows + 2m, columns + 2m)."""
-        return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN)[0]
+        """Expected photons of the unperturbed instrument with the template's margin, (C, rows + 2m, columns + 2m).
+
+        In double precision: rounding to single makes noise that the template's factors would have to follow.
+        """
+        return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN, single=False)[0]
 
     @cached_property
     def thermal(self) -> ThermalModel:
@@ -153,12 +157,18 @@ class MonitorExperiment:
         """
         pattern = self.pattern(seed)
         out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
-        for s, image in enumerate(photons):
-            out[s] = self.detector.expose(image, pattern, frames, self.exposure, _stream(seed, 2, first + s))
+
+        def expose(s: int) -> None:
+            stream = _stream(seed, 2, first + s)
+            out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, stream, threads=1)
+
+        # one thread per state: threads then wait for each other once per batch and not once per state
+        with ThreadPoolExecutor(min(cores(), 8)) as pool:
+            list(pool.map(expose, range(len(photons))))
         return out
 
     def measure(
-        self, states: Sequence[State], frames: int, seed: int, centroid: str = "ml", chunk: int = 25
+        self, states: Sequence[State], frames: int, seed: int, centroid: str = "ml", chunk: int = 40
     ) -> Iterator[tuple[slice, Recovery]]:
         """Render, expose and recover many states against one nominal measurement, piece by piece to bound memory.
 

@@ -21,7 +21,8 @@ from optics.backend import Backend
 from optics.diffraction import Grid, PupilField, image
 from optics.pixel_response import PixelResponse
 from optics.quadrature import PupilNodes
-from optics.system import assemble
+from optics.system import SystemBatch, assemble
+from optics.threads import one_blas_thread
 from optics.trace import BeamMissedError, make_rays, trace
 from optics.tree import PlacedBodies, State
 from optics.wavefront import eikonal
@@ -31,11 +32,15 @@ from scenes.instrument_model import Instrument
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
 
-SPOT_RANGE = 0.8
-"""Share of the CCD's half size up to which a spot may be off its middle; farther out the estimators refuse it."""
+SPOT_RANGES = (0.25, 0.5, 0.8)
+"""Shares of the CCD's half size up to which spots may be off its middle, one class of pupil nodes for each: the farther
+off a spot, the farther its farthest pixel, and the more nodes it needs. Beyond the last the estimators refuse it."""
 
 COARSE_RINGS = 6
 """Rings of the quadrature for means: exact for polynomials to degree 23."""
+
+SCOUT_RINGS = 4
+"""Rings of the rays that are aimed in every state to find out how far the others have to be turned."""
 
 AIM_TOLERANCE = 1e-9
 """Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
@@ -60,6 +65,31 @@ class Aimed:
 
 
 @dataclass(frozen=True, eq=False)
+class Scouted:
+    """What a few rays say of C channels x S states (channel-major).
+
+    Attributes:
+        fan: of the rays from the pinholes.
+        outgoing, back: systems from the pinholes to the return face, and on to the CCDs.
+        turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
+        place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
+    """
+
+    fan: RayFan
+    outgoing: SystemBatch
+    back: SystemBatch
+    turn: np.ndarray
+    place: np.ndarray
+
+    def take(self, states: np.ndarray) -> Scouted:
+        """The states of the given indices."""
+        channels, count = self.place.shape[:2]
+        own = (np.arange(channels)[:, None] * count + states).ravel()
+        fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
+        return Scouted(fan, self.outgoing.take(own), self.back.take(own), self.turn[:, own], self.place[:, states])
+
+
+@dataclass(frozen=True, eq=False)
 class CcdRays:
     """Rays at the CCDs in each CCD's frame: position and direction (B, N, 3), optical path and validity (B, N)."""
 
@@ -75,8 +105,8 @@ class MonitorPath:
     Args:
         instrument: the instrument.
         backend: where to trace.
-        nodes: pupil quadrature; by default one that is right to 1e-6 of the peak for spots anywhere in the middle
-            ``SPOT_RANGE`` of the CCD, out to the far corner.
+        nodes: pupil quadrature; by default one that is right to 1e-6 of the peak for spots anywhere in the last of
+            ``SPOT_RANGES`` of the CCD, out to the far corner, and for images those of ``classes``.
     """
 
     def __init__(self, instrument: Instrument, backend: Backend, nodes: PupilNodes | None = None) -> None:
@@ -90,12 +120,33 @@ class MonitorPath:
         face = instrument.assembly.elements[f"{self.channels[0].key}/return_face"].aperture
         assert isinstance(face, Circle)
         self.face_radius = face.radius
-        self.nodes = quadrature.disk_for(self._largest_phase()) if nodes is None else nodes
+        self._sized = nodes is None
+        self.nodes = self._nodes_for(SPOT_RANGES[-1]) if nodes is None else nodes
 
-    def _largest_phase(self) -> float:
-        """Phase at the pupil's edge for the pixel that is farthest from a spot, radians."""
-        reach = 0.5 * (1.0 + SPOT_RANGE) * self.pitch * float(np.hypot(*self.shape))
-        return 2.0 * np.pi * self.numerical_aperture * reach / self.wavelength
+    def _nodes_for(self, spot_range: float) -> PupilNodes:
+        """Nodes for spots in a share of the CCD, by the phase at the pupil's edge for the farthest pixel."""
+        reach = 0.5 * (1.0 + spot_range) * self.pitch * float(np.hypot(*self.shape))
+        return quadrature.disk_for(2.0 * np.pi * self.numerical_aperture * reach / self.wavelength)
+
+    @cached_property
+    def classes(self) -> tuple[MonitorPath, ...]:
+        """Paths with as many nodes as the spots in each of ``SPOT_RANGES`` need; the last one is this path."""
+        if not self._sized:
+            return (self,)
+        inner = (MonitorPath(self.instrument, self.backend, self._nodes_for(share)) for share in SPOT_RANGES[:-1])
+        return (*inner, self)
+
+    def class_of(self, place: np.ndarray, margin: int = 0) -> np.ndarray:
+        """Number of the first of ``classes`` that is right for all spots of each state, (S,).
+
+        Args:
+            place: middle of the spots (C, S, 2), pixels from the CCD's middle.
+            margin: extra pixels rendered on every side of the CCD.
+        """
+        half = 0.5 * np.array(self.shape)
+        farthest = np.max(np.linalg.norm(np.abs(place) + half + margin, axis=-1), axis=0)
+        reached = (1.0 + np.array(SPOT_RANGES[: len(self.classes) - 1])) * np.linalg.norm(half)
+        return np.searchsorted(reached, farthest)
 
     @property
     def numerical_aperture(self) -> float:
@@ -109,75 +160,106 @@ class MonitorPath:
         return MonitorPath(self.instrument, self.backend, quadrature.disk(COARSE_RINGS))
 
     @cached_property
-    def nominal(self) -> Aimed:
-        """Aimed rays of the unperturbed instrument, the start for all other states."""
-        return self._aim(self.instrument.assembly.place(), [{}], None)
+    def scout(self) -> MonitorPath:
+        """The same with the fewest nodes: enough for the change of a smooth function over the aperture."""
+        return MonitorPath(self.instrument, self.backend, quadrature.disk(SCOUT_RINGS))
 
     @cached_property
-    def _slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Operators from values of a smooth function on the nodes to its d/dx and d/dy there, each (N, N)."""
+    def nominal(self) -> Aimed:
+        """Aimed rays of the unperturbed instrument, the start for all other states."""
+        return self._aim_nominal()
+
+    @cached_property
+    def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N, T)."""
         x, y = self.nodes.x, self.nodes.y
         root = np.sqrt(self.nodes.weight)
-        solve = np.linalg.pinv(zernike.basis(MAP_TERMS, x, y) * root[:, None]) * root
+        basis = zernike.basis(MAP_TERMS, x, y)
+        solve = np.linalg.pinv(basis * root[:, None]) * root
         dx, dy = (zernike.gradient_basis(MAP_TERMS, x, y, axis) for axis in (0, 1))
-        return dx @ solve, dy @ solve
+        return solve, basis, dx, dy
 
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N)."""
-        dx, dy = self._slopes
-        return np.asarray((u @ dx.T) * (v @ dy.T) - (u @ dy.T) * (v @ dx.T))
+        solve, _, dx, dy = self._smooth
+        a, b = u @ solve.T, v @ solve.T
+        return np.asarray((a @ dx.T) * (b @ dy.T) - (a @ dy.T) * (b @ dx.T))
 
-    def _aim(self, placed: PlacedBodies, states: Sequence[State], start: Aimed | None) -> Aimed:
-        """Aim rays from each pinhole at the nodes of its return face."""
-        count = len(states)
+    def _outgoing(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
+        """Rays from each pinhole toward the optics, and the systems up to the return face."""
         position, direction = [], []
         for channel in self.channels:
             position.append(placed.translation[:, placed.index[channel.reticle_body]])
             direction.append(self.instrument.toward_optics(placed, channel.camera))
-        origin = np.concatenate(position)[:, None].real
         guess = np.concatenate(direction)[:, None]
         axes = transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape))
-        fan = RayFan(origin, guess, axes)
-        outgoing = assemble(
-            self.instrument.assembly, [f"{c.key}/outgoing" for c in self.channels], states, placed=placed
-        )
-        target = self.face_radius * np.stack([self.nodes.x, self.nodes.y], axis=-1)
-        if start is None:
-            # first the middle of the face, then the nodes around it
-            middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
-            near = middle + np.einsum("bnij,pj->bpi", np.linalg.inv(slope), target)
-            q, slope = aim(self.backend, outgoing, fan, target, near, slope, AIM_TOLERANCE)
-        else:
-            q, slope = aim(
-                self.backend,
-                outgoing,
-                fan,
-                target,
-                np.repeat(start.parameters, count, axis=0),
-                np.repeat(start.jacobian, count, axis=0),
-                AIM_TOLERANCE,
-            )
-        place, heading = fan.at(q)
-        return Aimed(place, heading, axes, q, slope)
+        names = [f"{c.key}/outgoing" for c in self.channels]
+        systems = assemble(self.instrument.assembly, names, states, placed=placed)
+        return RayFan(np.concatenate(position)[:, None].real, guess, axes), systems
 
-    def rays(self, states: Sequence[State]) -> CcdRays:
+    @cached_property
+    def _target(self) -> np.ndarray:
+        """Nodes on the return face, (N, 2), metres."""
+        return self.face_radius * np.stack([self.nodes.x, self.nodes.y], axis=-1)
+
+    def _aim_nominal(self) -> Aimed:
+        """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
+        fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
+        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
+        near = middle + np.einsum("bnij,pj->bpi", np.linalg.inv(slope), self._target)
+        q, slope = aim(self.backend, outgoing, fan, self._target, near, slope, AIM_TOLERANCE)
+        place, heading = fan.at(q)
+        return Aimed(place, heading, fan.axes, q, slope)
+
+    def scouted(self, states: Sequence[State]) -> Scouted:
+        """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        scout, count = self.scout, len(states)
+        placed = self.instrument.assembly.place(states)
+        fan, outgoing = self._outgoing(placed, states)
+        names = [f"{c.key}/monitor" for c in self.channels]
+        back = assemble(self.instrument.assembly, names, states, placed=placed)
+        nominal = scout.nominal
+        start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
+        q, _ = aim(self.backend, outgoing, fan, scout._target, start, slope, AIM_TOLERANCE)
+        turn = np.moveaxis(q - start, -1, 0) @ scout._smooth[0].T
+        traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
+        place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / self.pitch
+        return Scouted(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
+
+    def rays(self, states: Sequence[State], scouted: Scouted | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
+
+        Args:
+            states: S states.
+            scouted: what ``scouted`` says of them, if it is known.
 
         Raises:
             BeamMissedError, AimError: a perturbation moves a beam off the mirrors or a spot off its CCD, named in the
                 message.
         """
-        placed = self.instrument.assembly.place(states)
-        aimed = self._aim(placed, states, self.nominal)
-        systems = assemble(self.instrument.assembly, [f"{c.key}/monitor" for c in self.channels], states, placed=placed)
-        traced = trace(self.backend, systems, make_rays(self.backend, aimed.position, aimed.direction))
+        known = self.scouted(states) if scouted is None else scouted
+        start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
+        q = start + np.moveaxis(known.turn @ self._smooth[1].T, 0, -1)
+        launch = known.fan.at(q)
+        uploaded = known.back.upload(self.backend)
+        face = len(known.outgoing.structure) - 1
+        traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
+        if not np.max(np.abs(traced.place(face) - self._target)) <= AIM_TOLERANCE:
+            # a change that is not smooth enough for its few terms
+            q, _ = aim(self.backend, known.outgoing, known.fan, self._target, q, slope, AIM_TOLERANCE)
+            launch = known.fan.at(q)
+            traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
         rays = CcdRays(*traced.numpy())
         for i, channel in enumerate(self.channels):
             own = slice(i * len(states), (i + 1) * len(states))
             if not np.all(np.any(rays.valid[own], axis=1)):
                 lost = int(np.argmin(np.any(rays.valid[own], axis=1)))
                 first = own.start + lost
-                where = self._where_lost(channel, states[lost], aimed.position[first], aimed.direction[first])
+                where = self._where_lost(channel, states[lost], launch[0][first], launch[1][first])
                 raise BeamMissedError(f"the whole beam of the monitor channel {channel.key} misses {where}")
             self._require_on_ccd(channel, rays.position[own])
         return rays
@@ -226,37 +308,50 @@ class MonitorPath:
         pinhole = self.instrument.spec.monitor.reticle.pinhole
         return PixelResponse.fit(self.pitch, pinhole, cutoff=2.0 * self.numerical_aperture / self.wavelength)
 
-    def expected_photons(self, states: Sequence[State], margin: int = 0, chunk: int = 32) -> np.ndarray:
+    def expected_photons(
+        self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
+    ) -> np.ndarray:
         """Expected photons per pixel and frame.
 
         Args:
             states: S states.
             margin: extra pixels rendered on every side of the CCD.
             chunk: states done at once, to bound memory.
+            single: in single precision, see ``optics.diffraction.image``.
 
         Returns:
             (S, C, rows + 2 margin, columns + 2 margin).
         """
         out = np.empty((len(states), len(self.channels), self.shape[0] + 2 * margin, self.shape[1] + 2 * margin))
-        for piece, photons in self.iterate_photons(states, margin, chunk):
+        for piece, photons in self.iterate_photons(states, margin, chunk, single):
             out[piece] = photons
         return out
 
     def iterate_photons(
-        self, states: Sequence[State], margin: int = 0, chunk: int = 32
+        self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
     ) -> Iterator[tuple[slice, np.ndarray]]:
         """Like ``expected_photons``, piece by piece: yields (slice of the states, photons)."""
-        response = self.response
-        border = margin + response.reach
-        y, x = (self.grid(axis, border) for axis in (0, 1))
         for start in range(0, len(states), chunk):
             some = states[start : start + chunk]
-            irradiance = image(self.fields(some), x, y, single=True)
-            photons = self.light_per_pixel * response.apply(irradiance)
-            yield (
-                slice(start, start + len(some)),
-                np.swapaxes(photons.reshape(len(self.channels), len(some), *photons.shape[1:]), 0, 1),
-            )
+            with one_blas_thread():
+                photons = self._render(some, margin, single)
+            yield slice(start, start + len(some)), photons
+
+    def _render(self, states: Sequence[State], margin: int, single: bool) -> np.ndarray:
+        """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class."""
+        channels, response = len(self.channels), self.response
+        y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
+        scouted = self.scouted(states)
+        chosen = self.class_of(scouted.place, margin)
+        out = np.empty((len(states), channels, *(n + 2 * margin for n in self.shape)))
+        for number in np.unique(chosen):
+            own = np.flatnonzero(chosen == number)
+            path, known = self.classes[number], scouted.take(own)
+            field = path.field_of(path.rays([states[s] for s in own.tolist()], known))
+            photons = response.apply(image(field, x, y, single))
+            photons *= self.light_per_pixel
+            out[own] = np.swapaxes(photons.reshape(channels, len(own), *photons.shape[1:]), 0, 1)
+        return out
 
     @property
     def light_per_pixel(self) -> float:

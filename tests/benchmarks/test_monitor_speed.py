@@ -16,7 +16,7 @@ from twin.truth import trace_truth
 
 ROOT = Path(__file__).resolve().parents[2]
 STATES = 200
-LIMIT_MS = 50.0
+LIMIT_MS = 20.0  # wall time on two cores, so that no more than 40 ms of a processor may be used
 COLD_S, WARM_S = 25.0, 8.0
 
 
@@ -30,14 +30,23 @@ def random_states(count, seed):
 
 
 def test_batch_of_monitor_states(benchmark, experiment):
-    """2 cameras, 4 spots, 9 frames, centroids and all estimators: at most 50 ms a state over a batch of 200."""
+    """2 cameras, 4 spots, 9 frames, centroids and all estimators: at most 20 ms a state over a batch of 200."""
     setup = experiment("gf7_pair")
     list(setup.measure(random_states(25, 1), 9, 1))  # calibration and kernels are not what is timed
     states = random_states(STATES, 2)
-    pieces = benchmark.pedantic(lambda: list(setup.measure(states, 9, 1)), rounds=2)
+    used = []
+
+    def measure():
+        started = time.process_time()
+        done = list(setup.measure(states, 9, 1))
+        used.append(time.process_time() - started)
+        return done
+
+    pieces = benchmark.pedantic(measure, rounds=2)
     assert sum(len(r.after) for _, r in pieces) == STATES
     milliseconds = 1e3 * benchmark.stats.stats.min / STATES
     benchmark.extra_info["ms_per_state"] = milliseconds
+    benchmark.extra_info["cpu_ms_per_state"] = 1e3 * min(used) / STATES
     assert milliseconds <= LIMIT_MS, milliseconds
 
 

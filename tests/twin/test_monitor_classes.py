@@ -1,0 +1,157 @@
+"""Classes of pupil nodes by where the spots fall, the prediction of the aim, and results that repeat to the byte."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from optics import quadrature
+from optics.aim import aim
+from optics.tree import Motion, State
+from scenes.channel import BASE
+from twin import monitor
+from twin.monitor import SPOT_RANGES, MonitorPath
+
+ROOT = Path(__file__).resolve().parents[2]
+ACCURACY = 1e-6  # of the peak: what the nodes are chosen for
+SINGLE = 1e-6  # of the peak: sums in single precision
+
+
+def shifted(path: MonitorPath, by: float) -> State:
+    return {f"{BASE}/forward/focal_plane": Motion(shift=(by, by, 0.0))}
+
+
+def off_middle(path: MonitorPath, wanted: float) -> State:
+    """A shift along the diagonal that brings the farthest pixel of the worst spot to ``wanted`` half diagonals of the
+    CCD from it."""
+    half = 0.5 * np.array(path.shape)
+
+    def excess(by: float) -> float:
+        place = path.scouted([shifted(path, by)]).place
+        return float(np.max(np.linalg.norm(np.abs(place) + half, axis=-1)) / np.linalg.norm(half) - wanted)
+
+    return shifted(path, brentq(excess, 0.0, 0.5 * path.pitch * half[0] * wanted, xtol=1e-11))
+
+
+@pytest.fixture(scope="module", params=["gf7_pair", "monitor_pair"])
+def setup(request, experiment):
+    return experiment(request.param)
+
+
+@pytest.mark.parametrize("number", range(len(SPOT_RANGES) - 1))
+def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
+    path = setup.path
+    inner, outer = (off_middle(path, 1.0 + SPOT_RANGES[number] + side * 2e-5) for side in (-1, 1))
+    chosen = path.class_of(path.scouted([inner, outer]).place)
+    assert chosen.tolist() == [number, number + 1]
+    assert path.classes[number].nodes.count < 0.85 * path.classes[number + 1].nodes.count
+    fine = MonitorPath(path.instrument, path.backend, quadrature.disk(30, 120))
+    want = fine.expected_photons([inner, outer], single=False)
+    peak = want.max(axis=(-2, -1), keepdims=True)
+    got = path.expected_photons([inner, outer], single=False)
+    assert np.max(np.abs(got - want) / peak) < ACCURACY
+    single = path.expected_photons([inner, outer])
+    assert np.max(np.abs(single - want) / peak) < ACCURACY + SINGLE
+    # one and the same state in both classes: no step where they meet
+    steps = [
+        path.light_per_pixel
+        * path.response.apply(
+            monitor.image(one.fields([inner]), *(path.grid(axis, path.response.reach) for axis in (1, 0)))
+        )
+        for one in path.classes[number : number + 2]
+    ]
+    assert np.max(np.abs(steps[0] - steps[1])[:, None] / peak[0][:, None]) < ACCURACY
+
+
+def test_too_few_nodes_would_be_seen(setup) -> None:
+    """The first class is not right for the last one's spots, so that the choice matters."""
+    path = setup.path
+    state = off_middle(path, 1.0 + 0.95 * SPOT_RANGES[-1])
+    want = path.expected_photons([state], single=False)
+    few = MonitorPath(path.instrument, path.backend, path.classes[0].nodes).expected_photons([state], single=False)
+    assert np.max(np.abs(few - want)) > 3 * ACCURACY * want.max()
+
+
+def test_a_state_has_its_class_in_any_company(setup) -> None:
+    path = setup.path
+    states = [off_middle(path, 1.0 + share) for share in (0.1, 0.4, 0.7, 0.2)]
+    together = path.expected_photons(states)
+    assert path.class_of(path.scouted(states).place).tolist() == [0, 1, 2, 0]
+    for state, image in zip(states, together, strict=True):
+        alone = path.expected_photons([state])[0]
+        # the compiler may contract other products; then sums in single precision round elsewhere
+        assert np.max(np.abs(alone - image)) < SINGLE * image.max()
+
+
+def test_margin_counts_as_distance(setup) -> None:
+    place = np.zeros((4, 1, 2))
+    half = 0.5 * setup.path.shape[0]
+    found = [int(setup.path.class_of(place, margin)[0]) for margin in (0, int(0.4 * half), int(0.7 * half))]
+    assert found == [0, 1, 2]
+
+
+def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
+    """Rays turned as the few scouted ones say, against rays that are aimed one by one from the nominal ones."""
+    states = [{f"{BASE}/forward/M2": Motion(shift=(2e-6, -3e-6, 4e-6), rotate=(3e-6, 1e-6, 0.0), pivot="centre")}]
+    path = setup.path
+    known = path.scouted(states)
+    path.rays(states, known)  # nominal rays are aimed before calls are counted
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return aim(*arguments)
+
+    monkeypatch.setattr(monitor, "aim", counted)
+    predicted = path.rays(states, known)
+    assert not calls
+    aimed = path.rays(states, replace(known, turn=np.zeros_like(known.turn)))
+    assert len(calls) == 1
+    # a nanometre off its node on the face, a ray is off by that part of the aperture in direction
+    limit = 2.0 * monitor.AIM_TOLERANCE / path.face_radius * path.numerical_aperture
+    assert np.max(np.abs(predicted.direction - aimed.direction)) < limit
+    assert np.max(np.abs(predicted.position - aimed.position)) < 2.0 * monitor.AIM_TOLERANCE
+
+
+SCRIPT = """
+import hashlib
+import numpy as np
+from optics.backend import load_backend
+from optics.tree import Motion
+from scenes.job import JobSpec
+from scenes.resolved import resolve_job
+from twin.experiment import MonitorExperiment
+setup = MonitorExperiment(resolve_job(JobSpec(instrument="gf7_pair")), load_backend("llvm"))
+rng = np.random.default_rng(5)
+states = [{"base/forward/focal_plane": Motion(shift=tuple(3e-5 * rng.normal(size=3)))} for _ in range(7)]
+digest = hashlib.sha256()
+for _, found in setup.measure(states, 3, 1, chunk=4):
+    for array in (found.after, found.shift_covariance, found.parameters["forward"]["model"].vector):
+        digest.update(np.ascontiguousarray(array).tobytes())
+print(digest.hexdigest())
+"""
+
+
+def digest(processors: set[int]) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        preexec_fn=lambda: os.sched_setaffinity(0, processors),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return done.stdout
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot bind a process to processors")
+def test_same_bytes_on_one_processor_and_on_all() -> None:
+    every = os.sched_getaffinity(0)
+    assert digest({min(every)}) == digest(every) != ""
