@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from optics.aim import transverse_axes
+from optics.backend import Backend
 from optics.diffraction import PupilTangent, image_derivative
 from optics.push_forward import RayTangents, push_forward
-from optics.system import assemble
+from optics.system import SystemBatch, assemble
 from optics.tree import COMPLEX_STEP
 from twin.monitor import MonitorPath
 from twin.motions import ElementaryMotion, pivot_states
@@ -35,10 +37,32 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayT
         return push_forward(path.backend, systems, position, direction, position_step, direction_step)
 
     drift = push("outgoing", 0.0).position[..., :2]
-    q_step = -np.linalg.solve(np.repeat(nominal.jacobian, m, axis=0), drift[..., None])[..., 0]
-    axes = np.broadcast_to(np.repeat(nominal.axes, m, axis=0), (*direction.shape[:2], 2, 3))
-    turn = np.einsum("bnk,bnkx->bnx", q_step, axes)
-    return push("monitor", turn - direction * np.sum(turn * direction, axis=-1, keepdims=True))
+    outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
+    start = np.broadcast_to(nominal.position, nominal.direction.shape)
+    axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
+    q_step = -np.linalg.solve(np.repeat(slopes, m, axis=0), drift[..., None])[..., 0]
+    return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0)))
+
+
+def hit_slopes(
+    backend: Backend, systems: SystemBatch, position: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exact derivative of where rays meet the last element by the directions in which they start.
+
+    Args:
+        backend: where to trace.
+        systems: B systems that carry no derivative.
+        position: launch points, world, (B, N, 3), metres.
+        direction: unit directions, (B, N, 3).
+
+    Returns:
+        Two unit vectors square to each direction, (B, N, 2, 3), and d(hit x, y)/d(turn toward each), (B, N, 2, 2),
+        metres per radian.
+    """
+    axes = transverse_axes(direction, np.broadcast_to([0.0, 1.0, 0.0], direction.shape))
+    place, heading = np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1)
+    pushed = push_forward(backend, systems, place, heading, 0.0, axes.reshape(len(direction), -1, 3))
+    return axes, np.swapaxes(pushed.position[..., :2].reshape(*direction.shape[:2], 2, 2), -1, -2)
 
 
 def spot_jacobian(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.ndarray:

@@ -1,0 +1,135 @@
+"""Optimisation of prescriptions: exact Jacobians, a detuned camera that comes back, constraints that cannot be held."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from optics.design import DesignError, optimise
+from optics.design_merit import Goals, Judge
+from optics.design_rays import beam_axes
+from optics.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
+from scenes.camera_design import beams_of, camera_of, prescription_of
+
+MIRRORS = ("M1", "M2", "M3")
+EVERY = (
+    *(Variable(mirror, quantity) for mirror in MIRRORS for quantity in (*SHAPE, *STAND)),
+    *(Variable("image", quantity) for quantity in STAND),
+    Variable("", BIAS),
+)
+CONICS = tuple(Variable(mirror, "conic") for mirror in MIRRORS)
+STEP = {"curvature": 1e-6, "conic": 1e-5, "A4": 1e-6, "A6": 1e-7, "A8": 1e-7, BIAS: 1e-6}
+STEP.update({"z": 1e-5, "y": 1e-5, "tilt": 1e-6})
+WAVES, METRES = 2e-9, 2e-14
+"""Rounding of paths of 20 m, in waves of 650 nm over the weighted pupil, and of places of 10 m."""
+
+
+@pytest.fixture(scope="module")
+def start(gf7) -> Prescription:
+    """gf7 with a few terms that it does not have, so that nothing is differentiated at zero only."""
+    odd = [Variable("M3", "tilt"), Variable("M3", "y"), Variable("image", "tilt"), Variable("M2", "tilt")]
+    odd += [Variable(mirror, "A8") for mirror in MIRRORS]
+    return prescription_of(gf7.spec).with_values(odd, np.array([1e-4, 1e-4, 1e-3, -2e-5, 1e-6, 1e-6, 1e-6]))
+
+
+@pytest.fixture(scope="module")
+def beams(gf7):
+    return beams_of(gf7.spec)
+
+
+@pytest.mark.parametrize("measure", ["wavefront", "spot"])
+def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) -> None:
+    goals = Goals(650e-9, principal_distance=5.5, measure=measure, distortion=1.0)
+    judge = Judge.of(backend, start, beams, goals)
+    exact = judge.judge(start, EVERY)
+    compared = 0
+    for k, variable in enumerate(EVERY):
+        h = STEP[variable.quantity]
+        value = start.value(variable)
+        high, low = (judge.judge(start.with_values([variable], np.array([value + s * h]))) for s in (1, -1))
+        for name, rounding in (
+            ("residuals", WAVES),
+            ("principal_distance", METRES),
+            ("extents", METRES),
+            ("clearances", METRES),
+        ):
+            slope = np.atleast_1d(getattr(exact, f"d_{name}")[k])
+            difference = (getattr(high, name) - getattr(low, name)) / (2.0 * h)
+            # a part in a million for the third order in the step, 1e-8 for what the step itself loses
+            assert np.max(np.abs(difference - slope)) < 1e-6 * np.max(np.abs(slope)) + rounding / h + 1e-8, variable
+            compared += int(np.max(np.abs(slope)) > 1e3 * rounding / h)
+    assert compared > 3 * len(EVERY)
+
+
+def test_axes_of_a_beam() -> None:
+    fields = np.array([[0.0, 0.0], [0.02, -0.01]])
+    along, axes = beam_axes(fields, 0.1)
+    np.testing.assert_allclose(along[0], [0.0, np.sin(0.1), np.cos(0.1)], atol=1e-15)
+    frames = np.concatenate([axes, along[:, None]], axis=1)
+    np.testing.assert_allclose(frames @ np.swapaxes(frames, -1, -2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-15)
+    np.testing.assert_allclose(np.linalg.det(frames), 1.0, rtol=1e-14)
+
+
+def test_a_detuned_camera_comes_back(backend, gf7, beams) -> None:
+    """From its own conics and from conics that are wrong by a percent gf7 gets to one optimum, no worse than itself."""
+    nominal = prescription_of(gf7.spec)
+    goals = Goals(gf7.spec.wavelength)
+    best = optimise(backend, nominal, CONICS, beams, goals)
+    wrong = nominal.with_values(CONICS, nominal.values(CONICS) + np.array([0.015, -0.02, 0.01]))
+    found = optimise(backend, wrong, CONICS, beams, goals)
+    merit = [np.sqrt(np.sum(j.residuals**2)) for j in (best.before, best.after, found.before, found.after)]
+    assert merit[1] < merit[0] < 0.03
+    assert merit[2] > 20.0 * merit[0]
+    # at a minimum the merit is flat; least squares stop when it changes by less than 1e-6
+    assert merit[3] == pytest.approx(merit[1], rel=1e-4)
+    moved = found.prescription.values(CONICS) - best.prescription.values(CONICS)
+    assert np.max(np.abs(moved)) < 1e-3
+    assert found.evaluations < 30
+
+
+def test_a_detuned_camera_gets_its_focal_length_back(backend, gf7, beams) -> None:
+    """The principal distance as a constraint: held to 2 um, with curvatures that made it 1 % wrong."""
+    variables = [Variable("M1", "curvature"), Variable("M3", "curvature"), Variable("image", "z"), *CONICS]
+    nominal = prescription_of(gf7.spec)
+    distance = Judge.of(backend, nominal, beams, Goals(650e-9)).judge(nominal).principal_distance
+    start = nominal.with_values(variables[:1], nominal.values(variables[:1]) * 1.01)
+    found = optimise(backend, start, variables, beams, Goals(650e-9, principal_distance=distance))
+    assert abs(found.before.principal_distance - distance) > 0.01
+    assert found.after.principal_distance == pytest.approx(distance, abs=2e-6)
+    assert found.after.errors.max() < 0.05
+
+
+def test_constraints_that_cannot_be_held(backend, gf7, beams) -> None:
+    """An envelope of half the length with nothing to vary but the image plane."""
+    nominal = prescription_of(gf7.spec)
+    with pytest.raises(DesignError, match=r"holds all constraints: envelope \(off by 1.* mm\); allow a longer"):
+        optimise(backend, nominal, [Variable("image", "z")], beams, Goals(650e-9, envelope=1.0), iterations=10)
+
+
+def test_a_start_outside_its_bounds_or_without_light(backend, gf7, beams) -> None:
+    nominal = prescription_of(gf7.spec)
+    with pytest.raises(DesignError, match=r"M1 conic starts at -1\.51.*outside its bounds"):
+        optimise(backend, nominal, [Variable("M1", "conic", low=-1.0)], beams, Goals(650e-9))
+    lost = nominal.with_values([Variable("M1", "curvature")], np.array([1.5]))
+    with pytest.raises(DesignError, match="passes no light"):
+        optimise(backend, lost, CONICS, beams, Goals(650e-9))
+
+
+def test_numbers_of_a_prescription(start) -> None:
+    values = start.values(EVERY)
+    assert start.with_values(EVERY, values) == start.with_values((), np.empty(0))
+    changed = start.with_values(EVERY, values + 1e-3)
+    np.testing.assert_allclose(changed.values(EVERY), values + 1e-3, rtol=1e-15)
+    with pytest.raises(KeyError):
+        start.value(Variable("M1", "A10"))
+    with pytest.raises(ValueError, match="stop"):
+        replace(start, stop="image")
+
+
+def test_a_camera_file_says_no_tilts(gf7, start) -> None:
+    nominal = prescription_of(gf7.spec)
+    assert camera_of(gf7.spec, nominal, "gf7", "").mirrors["M2"].radius == pytest.approx(
+        gf7.spec.mirrors["M2"].radius, rel=1e-15
+    )
+    with pytest.raises(ValueError, match="tilted or decentred"):
+        camera_of(gf7.spec, start, "tilted", "")
