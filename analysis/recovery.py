@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis import intersection_angle, model_fit, monitoring
-from analysis.calibration import MonitorCalibration
+from analysis.calibration import CameraCalibration, MonitorCalibration
 from analysis.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.intersection_angle import IntersectionAngleChange
 from analysis.likelihood import maximum_likelihood_fit
 from analysis.monitoring import CameraParameters, shift_covariance
 from analysis.spot_positions import SpotPositions, difference_covariance
 
-__all__ = ["CENTROIDS", "ESTIMATORS", "Recovery", "measure_spots", "recover"]
+__all__ = ["CENTROIDS", "ESTIMATORS", "Recovery", "angles", "estimates", "measure_spots", "recover"]
 
 Array = NDArray[np.float64]
 ESTIMATORS = ("paper_single", "paper_joint", "derived", "model")
@@ -81,17 +81,7 @@ def recover(
     joint = shift_covariance(spread[:, :, 0], spread[:, :, 1])
     start = np.broadcast_to(first.position.reshape(-1, spots, 2), (states, spots, 2))
     end = second.position.reshape(states, spots, 2)
-    parameters: dict[str, dict[str, CameraParameters]] = {}
-    for k, (name, camera) in enumerate(calibration.cameras.items()):
-        pair = slice(2 * k, 2 * k + 2)
-        shift = (end[:, pair] - start[:, pair]).reshape(states, 4)
-        formula = (start[:, pair], end[:, pair], joint[:, k], camera.geometry)
-        parameters[name] = {
-            "paper_single": monitoring.paper_single(*formula),
-            "paper_joint": monitoring.paper_joint(*formula),
-            "derived": monitoring.derived(*formula),
-            "model": model_fit.fit(shift, joint[:, k], camera.spot_jacobian, camera.parameter_jacobian, camera.motions),
-        }
+    parameters = estimates(start, end, joint, calibration.cameras)
     return Recovery(
         before=start,
         after=end,
@@ -99,8 +89,32 @@ def recover(
         sigma_after=_sigma(second).reshape(states, spots, 2),
         shift_covariance=joint,
         parameters=parameters,
-        angle=_angles(parameters, calibration),
+        angle=angles(parameters, calibration.cameras),
     )
+
+
+def estimates(
+    start: Array, end: Array, joint: Array, cameras: Mapping[str, CameraCalibration]
+) -> dict[str, dict[str, CameraParameters]]:
+    """All estimators on spot positions.
+
+    start, end: (S, C, 2) spot positions (row, column) before and after, px, two of each camera in their order.
+    joint: (S, cameras, 4, 4) covariance of after - before, px^2; all zero for positions without noise.
+    cameras: what is calibrated of each.
+    Returns camera -> estimator -> changes with arrays of shape (S,).
+    """
+    parameters: dict[str, dict[str, CameraParameters]] = {}
+    for k, (name, camera) in enumerate(cameras.items()):
+        pair = slice(2 * k, 2 * k + 2)
+        shift = (end[:, pair] - start[:, pair]).reshape(-1, 4)
+        formula = (start[:, pair], end[:, pair], joint[:, k], camera.geometry)
+        parameters[name] = {
+            "paper_single": monitoring.paper_single(*formula),
+            "paper_joint": monitoring.paper_joint(*formula),
+            "derived": monitoring.derived(*formula),
+            "model": model_fit.fit(shift, joint[:, k], camera.spot_jacobian, camera.parameter_jacobian, camera.motions),
+        }
+    return parameters
 
 
 def _flat(mean: Array) -> Array:
@@ -111,12 +125,12 @@ def _sigma(positions: SpotPositions) -> Array:
     return np.stack([positions.sigma_row, positions.sigma_column], axis=-1)
 
 
-def _angles(
-    parameters: Mapping[str, Mapping[str, CameraParameters]], calibration: MonitorCalibration
+def angles(
+    parameters: Mapping[str, Mapping[str, CameraParameters]], cameras: Mapping[str, CameraCalibration]
 ) -> dict[str, IntersectionAngleChange]:
     """Change of the angle between the two lines of sight, by every estimator; the forward camera is the reference."""
     if len(parameters) != 2:
         return {}
-    one, two = sorted(parameters, key=lambda name: -calibration.cameras[name].look_rad)
-    looks = calibration.cameras[one].look_rad, calibration.cameras[two].look_rad
+    one, two = sorted(parameters, key=lambda name: -cameras[name].look_rad)
+    looks = cameras[one].look_rad, cameras[two].look_rad
     return {name: intersection_angle.exact(parameters[one][name], parameters[two][name], *looks) for name in ESTIMATORS}

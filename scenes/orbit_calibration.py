@@ -7,7 +7,10 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.errors import Problem, names_text, nearest
-from scenes.orbit_angle import Flag, GroundSigma, Relief, TerrainHeight
+from scenes.orbit_angle import DatumShift, EffectsSpec, Flag, GroundSigma, Relief, TerrainHeight
+from scenes.orbit_drift import CameraDrifts, MonitorReadingSpec, StripSpec
+from scenes.orbit_points import ImagePointsSpec
+from scenes.orbit_scene import ControlSpec, GroundSpec
 from scenes.orbit_spec import AngleSigmas, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude
 from scenes.quantity import Quantity, Vector
 from scenes.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
@@ -18,13 +21,19 @@ LEAST_POINTS = 6
 """Control points of a field. Three points in three lines give 18 conditions for 12 unknowns, but on a field of a few
 points one wrong one cannot be told."""
 
+LEAST_PATCHES = 2
+"""Patches of a field. One has no width, and the principal distance is open."""
+
 InteriorChange = Annotated[float, Quantity(LENGTH, largest="5 mm")]
 PointChange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)]
 FieldAltitude = Annotated[float, Quantity(DISTANCE, smallest="150 km", largest="2000 km")]
 FieldLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="500 km")]
 FieldSpan = Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")]
+TrackPlace = Annotated[float, Quantity(DISTANCE, largest="200 km")]
+Side = Annotated[Whole, Field(ge=16, le=20_000)]
 LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
 Count = Annotated[Whole, Field(le=5000)]
+Repeats = Annotated[Whole, Field(ge=0, le=1000)]
 
 
 class InteriorChangeSpec(Spec):
@@ -83,6 +92,53 @@ class PointsSpec(Spec):
         return self
 
 
+class PatchPlaceSpec(Spec):
+    """Where a patch of ground lies.
+
+    Attributes:
+        pixel: of the nadir line that sees its middle.
+        track: of its middle from the field's middle, metres along the flight.
+    """
+
+    pixel: Number
+    track: TrackPlace = 0.0
+
+
+class CalibrationImagesSpec(Spec):
+    """Patches of every field whose images are rendered and measured, instead of drawn image points.
+
+    Attributes:
+        patches: of every field.
+        lines, pixels: size of every image.
+        ground: what is there. The terrain's height is the field's; a real terrain is another part of the model in each
+            patch.
+        control: orthophoto and elevation model. Their errors are drawn for each patch; a shift is common to all.
+        points: of every patch. What its `control` and `height_sigma` say is taken for the accuracy of the reference.
+        oversampling: samples of the ground along each side of a pixel.
+    """
+
+    patches: tuple[PatchPlaceSpec, ...]
+    lines: Side = 500
+    pixels: Side = 500
+    ground: GroundSpec = GroundSpec()
+    control: ControlSpec = ControlSpec()
+    points: ImagePointsSpec = ImagePointsSpec()
+    oversampling: Annotated[Whole, Field(ge=2, le=8)] = 3
+
+    @model_validator(mode="after")
+    def _are_enough(self) -> "CalibrationImagesSpec":
+        if len(self.patches) < LEAST_PATCHES:
+            found = f"{len(self.patches)}"
+            problem = "too few patches to tell focal length from attitude"
+            raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
+        if self.points.control < 1 or self.points.check < 1:
+            found = f"control {self.points.control}, check {self.points.check}"
+            raise Problem(
+                "a calibration needs control and check points", found, "1 or more of each", within=("points",)
+            )
+        return self
+
+
 class CalibrationErrorsSpec(ErrorsSpec):
     """Errors of what is measured. The star trackers' bias is the change of the angle between them and the cameras since
     the laboratory.
@@ -93,13 +149,29 @@ class CalibrationErrorsSpec(ErrorsSpec):
         season: standard deviation of a further constant bias of each field about body X, Y, Z, radians.
         image: standard deviation of an image point in x and in y, pixels.
         control: standard deviation of each coordinate of a control point, metres.
+        datum: shift that the coordinates of all control points share, east, north and up, unknown to the analysis,
+            metres. Check points are given in the right datum.
         switched_on: false for exact image points, control points and orbit, and an attitude with its biases only.
     """
 
     season: AngleSigmas = (0.0, 0.0, 0.0)
     image: Annotated[Number, Field(ge=0, le=10)] = 0.3
     control: GroundSigma = 1.0
+    datum: DatumShift = (0.0, 0.0, 0.0)
     switched_on: Flag = True
+
+
+class LaunchSpec(Spec):
+    """How much a launch may change, one standard deviation. The adjustment does not use it; an estimate far beyond it
+    is a sign of wrong ground coordinates or of a wrong camera file, which the fit alone does not show.
+
+    Attributes:
+        bias: angle between star trackers and cameras about body X, Y, Z, radians.
+        interior: principal distances and principal points, metres.
+    """
+
+    bias: AngleSigmas = (2e-4, 2e-4, 2e-4)
+    interior: Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")] = 100e-6
 
 
 class MapLimitsSpec(Spec):
@@ -137,9 +209,16 @@ class OrbitCalibrationSpec(Spec):
         fields: by name.
         schemes: scheme -> fields whose parameters are averaged for it. One more, by the next number, lets each field
             use its own.
-        points: of every field.
+        points: of every field, drawn; None where images are measured.
+        images: rendered and measured instead of drawn points.
+        effects: on the light.
         errors: of what is measured.
+        drift: line -> how its camera changes from field to field.
+        monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
+        strip: tie points for an adjustment of every pass; None for none.
+        launch: how much of a change is no surprise.
         limits: for the verdict.
+        repeats: campaigns over the same fields with everything drawn anew, for how often the paper's finding holds.
         seed: of every random number.
     """
 
@@ -154,10 +233,45 @@ class OrbitCalibrationSpec(Spec):
     attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
     fields: Annotated[Named[FieldSpec], AfterValidator(_some_fields)]
     schemes: tuple[tuple[Name, ...], ...]
-    points: PointsSpec
+    points: PointsSpec | None = None
+    images: CalibrationImagesSpec | None = None
+    effects: EffectsSpec = EffectsSpec()
     errors: CalibrationErrorsSpec = CalibrationErrorsSpec()
+    drift: CameraDrifts = Field(default_factory=dict, validate_default=True)
+    monitor: MonitorReadingSpec | None = None
+    strip: StripSpec | None = None
+    launch: LaunchSpec = LaunchSpec()
     limits: MapLimitsSpec = MapLimitsSpec()
+    repeats: Repeats = 0
     seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _has_points(self) -> "OrbitCalibrationSpec":
+        if (self.points is None) == (self.images is None):
+            found = "neither" if self.points is None else "both"
+            problem = "points are drawn or measured in images"
+            raise Problem(problem, found, "`points:` or `images:`", within=("points",))
+        if self.images is not None and self.repeats:
+            problem = "campaigns from images are not repeated, for each is rendered anew"
+            raise Problem(problem, str(self.repeats), "0", within=("repeats",))
+        return self
+
+    @model_validator(mode="after")
+    def _can_be_compared(self) -> "OrbitCalibrationSpec":
+        if self.monitor is not None and not self.drift:
+            allowed = "a section `drift:`, with sigmas of zero for cameras that keep"
+            raise Problem("a monitor, but nothing that it reads", None, allowed, within=("monitor",))
+        if self.drift and self.images is not None:
+            problem = (
+                "cameras that drift are compared on drawn points only, for images would be rendered for every size"
+            )
+            raise Problem(problem, None, "`points:` instead of `images:`", within=("drift",))
+        errors = self.errors
+        noise = (*errors.star_tracker.noise, *errors.star_tracker.slow.noise, *errors.gps.noise)
+        if self.strip is not None and not (errors.switched_on and any(noise)):
+            problem = "a strip adjustment without noise of attitude or orbit has nothing to adjust"
+            raise Problem(problem, None, "errors.star_tracker.noise or slow", within=("strip",))
+        return self
 
     @model_validator(mode="after")
     def _schemes_name_fields(self) -> "OrbitCalibrationSpec":

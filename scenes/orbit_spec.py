@@ -183,6 +183,19 @@ class ThermalDriftSpec(Spec):
     reference: Latitude = 0.0
 
 
+class SlowErrorsSpec(Spec):
+    """Errors of the attitude that last for many readings and change within a pass: a cubic spline through independent
+    values.
+
+    Attributes:
+        noise: standard deviation of a value about body X, Y and Z, radians.
+        interval: between values, seconds.
+    """
+
+    noise: AngleSigmas = _ZERO
+    interval: Interval = 10.0
+
+
 class StarTrackerErrorsSpec(Spec):
     """Errors of the measured attitude, rotations about body X, Y and Z: measured after true.
 
@@ -191,12 +204,14 @@ class StarTrackerErrorsSpec(Spec):
         noise: standard deviation of a reading, independent from reading to reading, radians.
         bias: constant, radians.
         thermal: changes with latitude.
+        slow: changes within a pass.
     """
 
     interval: Interval = 0.125
     noise: AngleSigmas = _ZERO
     bias: AngleErrors = _ZERO
     thermal: ThermalDriftSpec = ThermalDriftSpec()
+    slow: SlowErrorsSpec = SlowErrorsSpec()
 
 
 class ErrorsSpec(Spec):

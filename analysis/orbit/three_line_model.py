@@ -133,6 +133,7 @@ class Rays:
         attitude: (n, 3, 3) body to ITRS.
         time: (n,) of the exposures, seconds, on the scale of the readings of attitude and station; None where unknown,
             the rays' noise then counts as independent.
+        spread: (n, 2, 2) covariance of the image points in units of `Noise.image` squared; None for unit matrices.
     """
 
     point: NDArray[np.intp]
@@ -140,6 +141,7 @@ class Rays:
     station: Array
     attitude: Array
     time: Array | None = None
+    spread: Array | None = None
 
     @classmethod
     def of(

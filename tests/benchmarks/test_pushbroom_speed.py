@@ -8,7 +8,7 @@ import pytest
 
 from scenes.orbit_scene import ControlSpec, GroundSpec
 from tests.twin.pushbroom_bench import LINES, PLACE, lines
-from twin.orbit.patch import fly_patch
+from twin.orbit.images.patch import fly_patch
 
 LIMIT_S = 60.0
 

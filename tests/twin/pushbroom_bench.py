@@ -10,12 +10,12 @@ from scenes.load import load_detector, load_three_line_camera
 from scenes.orbit_spec import OrbitSpec
 from twin.orbit.attitude import Attitude
 from twin.orbit.earth import Earth
+from twin.orbit.images.camera_optics import optics_of
+from twin.orbit.images.line_optics import LineOptics
+from twin.orbit.images.patch import ImagedLine, imaged_lines
 from twin.orbit.line_camera import line_cameras
-from twin.orbit.line_optics import LineOptics
 from twin.orbit.orbit import propagate
-from twin.orbit.patch import ImagedLine, imaged_lines
 from twin.orbit.sensor import Sensor
-from twin.orbit.simulate_test import optics_of
 from twin.orbit.trajectory import Trajectory
 
 LINES = ("forward", "nadir", "aft")

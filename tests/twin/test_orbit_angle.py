@@ -19,9 +19,9 @@ from scenes.orbit_angle import LINES
 from scenes.orbit_setup import AngleSetup, resolve_angle
 from tests.analysis.test_sensitivity import REFUTED
 from tests.twin.commands import files, invoke, refused
-from twin.orbit.angle_analysis import ARCSEC, estimated, frame_rows, run_passes, tls_angles
-from twin.orbit.angle_camera import angle_camera
-from twin.orbit.angle_test import AnglePass, fly
+from twin.orbit.angle.camera import angle_camera
+from twin.orbit.angle.flight import AnglePass, fly
+from twin.orbit.angle.procedure import ARCSEC, estimated, frame_rows, run_passes, tls_angles
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.line_camera import look_angle
 from twin.trial.result import silent

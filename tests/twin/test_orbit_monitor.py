@@ -13,7 +13,7 @@ from optics.tree import Motion
 from scenes.orbit_setup import MonitorSetup, resolve_monitor
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.line_camera import traced_line_cameras
-from twin.orbit.monitor_analysis import rms, run_monitored
+from twin.orbit.monitoring.procedure import rms, run_monitored
 from twin.trial.result import silent
 from twin.truth import trace_truth
 

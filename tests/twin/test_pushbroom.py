@@ -9,12 +9,12 @@ from scipy.stats import chi2
 from analysis.mtf.slanted_edge import measure_edge
 from scenes.orbit_scene import ControlSpec, GroundSpec, TerrainSpec
 from tests.twin.pushbroom_bench import LINES, PLACE, Ground, lines, optics
-from twin.orbit.ground_frame import GroundFrame
-from twin.orbit.line_optics import ImageMotion
-from twin.orbit.look_map import SteepTerrainError
-from twin.orbit.patch import PatchError, fly_patch, window_of
-from twin.orbit.pushbroom import MARGIN, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
-from twin.orbit.terrain import Terrain
+from twin.orbit.ground.frame import GroundFrame
+from twin.orbit.ground.terrain import Terrain
+from twin.orbit.images.line_optics import ImageMotion
+from twin.orbit.images.look_map import SteepTerrainError
+from twin.orbit.images.patch import PatchError, fly_patch, window_of
+from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
 
 FRAME = GroundFrame(*PLACE)
 ROUGH = TerrainSpec.model_validate({"kind": "fractal", "relief": "80 m", "height": "600 m", "exponent": 2.0})

@@ -5,12 +5,12 @@ import pytest
 
 from scenes.orbit_scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
 from twin.orbit.earth import Earth
-from twin.orbit.ground_frame import GroundFrame
-from twin.orbit.ground_texture import Extent, apparent, reflectance
-from twin.orbit.orthophoto import SCALE, make_control
-from twin.orbit.random_field import correlated_field, fractal_field
-from twin.orbit.spline_grid import SplineGrid
-from twin.orbit.terrain import Terrain
+from twin.orbit.ground.frame import GroundFrame
+from twin.orbit.ground.orthophoto import SCALE, make_control
+from twin.orbit.ground.random_field import correlated_field, fractal_field
+from twin.orbit.ground.spline_grid import SplineGrid
+from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.texture import Extent, apparent, reflectance
 
 SEED = np.random.SeedSequence(7)
 FRAME = GroundFrame(np.radians(116.0), np.radians(40.0))

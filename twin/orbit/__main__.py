@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from scenes.orbit_setup import resolve_angle, resolve_calibration
-from twin.orbit.angle_result import run_angle
-from twin.orbit.calibration_result import run_calibration
+from scenes.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+from twin.orbit.angle.result import run_angle
+from twin.orbit.calibration.result import run_calibration
+from twin.orbit.images.result import run_simulation
+from twin.orbit.monitoring.result import run_monitor
 from twin.trial.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
 
 PROGRAM = "twin.orbit"
@@ -65,6 +67,46 @@ def calibrate(
     """
     options = Options(out, seed, backend, force, as_json, quiet)
     run_test(PROGRAM, "calibrate", file, resolve_calibration, run_calibration, options)
+
+
+@app.command()
+def monitor(
+    file: File,
+    out: Out = None,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
+    monitor, heights as in papers 000 and 003).
+
+    monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
+    time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from.
+    """
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "monitor", file, resolve_monitor, run_monitor, options)
+
+
+@app.command()
+def simulate(
+    file: File,
+    out: Out = None,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
+    model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
+
+    simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
+    truth knows is in artefacts/truth.json.
+    """
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "simulate", file, resolve_simulate, run_simulation, options)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,15 @@ from scipy.signal import lfilter
 if TYPE_CHECKING:
     from scenes.orbit_spec import ErrorsSpec
 
-TERMS = ("gps_noise", "gps_drift", "gps_velocity", "attitude_noise", "attitude_bias", "attitude_thermal")
+TERMS = (
+    "gps_noise",
+    "gps_drift",
+    "gps_velocity",
+    "attitude_noise",
+    "attitude_bias",
+    "attitude_thermal",
+    "attitude_slow",
+)
 """All that can be switched."""
 
 _SPARE_READINGS = 8
@@ -121,6 +129,9 @@ def draw_errors(
     if "attitude_noise" in terms and any(star.noise):
         looks = readings(first, last, star.interval)
         attitude.append(_noise(looks, np.array(star.noise), streams["attitude_noise"]))
+    if "attitude_slow" in terms and any(star.slow.noise):
+        values = readings(first, last, star.slow.interval)
+        attitude.append(_noise(values, np.array(star.slow.noise), streams["attitude_slow"]))
     return MeasurementErrors(
         tuple(position),
         tuple(velocity),

@@ -1,0 +1,110 @@
+"""Files of a simulated pass: units, defaults, the way to its camera and detectors, and what is said of mistakes."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from scenes.errors import InputError
+from scenes.load import DETECTORS, LIBRARY, ORBIT, PAYLOADS, load_three_line_camera
+from scenes.orbit_setup import SimulateSetup, resolve_simulate
+from scenes.schema import json_schema
+
+EXAMPLE = LIBRARY / ORBIT / "simulate.yaml"
+SMALL = """
+name: small
+camera: th1
+orbit: {epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}
+patch: {pixel: 6000}
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "test.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def test_example() -> None:
+    setup = resolve_simulate(EXAMPLE)
+    assert setup.camera == load_three_line_camera("th1")
+    assert set(setup.detectors) == {"th1_line"}
+    test = setup.test
+    assert (test.patch.lines, test.patch.pixels, test.oversampling) == (1000, 1000, 3)
+    assert test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
+    assert test.control.shift == (0.6, -0.4)
+    image = setup.camera.image_of("aft")
+    assert image is not None
+    assert image.wavefront["Z4"] == 20e-9
+
+
+def test_what_is_not_written(tmp_path: Path) -> None:
+    test = resolve_simulate(write(tmp_path, SMALL)).test
+    assert test.lines == ("forward", "nadir", "aft")
+    assert (test.ground.terrain.kind, test.ground.terrain.relief) == ("real", None)
+    assert (test.patch.line, test.patch.lines, test.seed) == ("nadir", 1000, 0)
+    assert math.degrees(test.control.light.elevation) == pytest.approx(60.0)
+
+
+def test_a_camera_and_a_detector_of_ones_own(tmp_path: Path) -> None:
+    sheet = (LIBRARY / DETECTORS / "th1_line.yaml").read_text("utf-8").replace("name: th1_line", "name: mine")
+    (tmp_path / "mine.yaml").write_text(sheet, "utf-8")
+    text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8").replace("detector: th1_line", "detector: mine.yaml")
+    (tmp_path / "own.yaml").write_text(text, "utf-8")
+    setup = resolve_simulate(write(tmp_path, SMALL.replace("th1", "own.yaml")))
+    assert setup.detectors["mine.yaml"].name == "mine"
+
+
+def test_config_reads_back_to_the_same_values(tmp_path: Path) -> None:
+    setup = resolve_simulate(EXAMPLE).with_seed(7)
+    again = resolve_simulate(write(tmp_path, setup.to_yaml()))
+    assert isinstance(again, SimulateSetup)
+    assert again == setup
+    assert again.to_yaml() == setup.to_yaml()
+
+
+def test_schema() -> None:
+    assert "ground" in json_schema("orbit_simulate")["properties"]
+
+
+# change of the small file, key that is named, what is said
+PATCH = "patch: {pixel: 6000}"
+BAD = {
+    "no size": (PATCH, "patch: {pixel: 6000, lines: 0}", "patch.lines", ["16"]),
+    "line": (PATCH, f"{PATCH}\nlines: [forward, nadi]", "lines", ["no such line", "did you mean 'nadir'"]),
+    "twice": (PATCH, f"{PATCH}\nlines: [nadir, nadir]", "lines", ["each line once"]),
+    "patch line": (PATCH, "patch: {pixel: 6000, line: fore}", "patch.line", ["no such line", "forward"]),
+    "pixel": (PATCH, "patch: {pixel: 12000}", "patch.pixel", ["outside the line", "11999.5"]),
+    "time": (PATCH, "patch: {pixel: 6000, time: 11 min}", "patch.time", ["outside the orbit data"]),
+    "change": (PATCH, f"{PATCH}\nchanges: {{back: {{}}}}", "changes.back", ["no such line"]),
+    "relief": (PATCH, f"{PATCH}\nground: {{terrain: {{kind: fractal}}}}", "ground.terrain", ["without relief"]),
+    "spacing": (PATCH, f"{PATCH}\nground: {{texture: {{spacing: 0 m}}}}", "ground.texture.spacing", ["0.1 m"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_mistakes_are_told(case: str, tmp_path: Path) -> None:
+    old, new, key, words = BAD[case]
+    assert SMALL.count(old) == 1
+    path = write(tmp_path, SMALL.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        resolve_simulate(path)
+    assert re.search(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}", str(caught.value)), caught.value
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_an_odd_wavefront_term(tmp_path: Path) -> None:
+    text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8").replace("Z6: 18 nm", "Z8: 18 nm")
+    (tmp_path / "own.yaml").write_text(text, "utf-8")
+    with pytest.raises(InputError, match="shift the image"):
+        resolve_simulate(write(tmp_path, SMALL.replace("th1", "own.yaml")))
+
+
+def test_a_camera_without_images(tmp_path: Path) -> None:
+    text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8")
+    first, last = text.index("image:"), text.index("lines:\n")
+    (tmp_path / "own.yaml").write_text(text[:first] + text[last:], "utf-8")
+    with pytest.raises(InputError, match="does not say how its line forward"):
+        resolve_simulate(write(tmp_path, SMALL.replace("th1", "own.yaml")))

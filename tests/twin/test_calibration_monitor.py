@@ -1,0 +1,199 @@
+"""Cameras that drift from field to field in an in-orbit calibration, with and without an on-board monitor."""
+
+import json
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import twin.orbit.__main__ as command
+from optics.frozen_map import FrozenMap
+from scenes.load import LIBRARY, ORBIT
+from scenes.orbit_angle import LINES
+from scenes.orbit_setup import CalibrationSetup, resolve_calibration
+from scenes.orbit_spec import ThermalDriftSpec
+from tests.twin.commands import invoke, refused
+from twin.orbit.calibration.campaign import fly_fields, line_model
+from twin.orbit.calibration.drift import drifted_payload
+from twin.orbit.calibration.influences import simultaneous
+from twin.orbit.calibration.monitor import (
+    ARCSEC,
+    PooledErrors,
+    all_told,
+    flown,
+    height_per_arcsec,
+    told_alone,
+    with_monitor,
+    without_monitor,
+)
+from twin.orbit.calibration.schemes import tested as at_checks
+
+run = partial(invoke, command.app)
+EXAMPLE = LIBRARY / ORBIT / "calibrate_monitor.yaml"
+WHOLE = resolve_calibration(EXAMPLE)
+KEPT = ("Beijing", "Anhui", "Xinjiang")
+SEED = np.random.SeedSequence(3)
+
+
+def setup_with(exact: bool = False) -> CalibrationSetup:
+    """Three fields of the example; exact: no noise, and no bias that changes from field to field or in a pass."""
+    test = WHOLE.test
+    update: dict[str, object] = {
+        "fields": FrozenMap({k: test.fields[k] for k in KEPT}),
+        "schemes": (KEPT[:1], KEPT),
+    }
+    if exact:
+        tracker = test.errors.star_tracker.model_copy(update={"thermal": ThermalDriftSpec()})
+        errors = {"switched_on": False, "season": (0.0, 0.0, 0.0), "star_tracker": tracker}
+        update["errors"] = test.errors.model_copy(update=errors)
+    return WHOLE.model_copy(update={"test": test.model_copy(update=update)})
+
+
+def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
+    """To rounding: 1e-15 of f and of a rotation's elements, 1e-9 of the drift."""
+    drift = {"aft": np.array([30 * ARCSEC, -20 * ARCSEC, 50 * ARCSEC, 40e-6])}
+    turned = line_model(drifted_payload(WHOLE.camera, drift), "aft")
+    expected = line_model(WHOLE.camera, "aft").drifted(drift["aft"])
+    np.testing.assert_allclose(turned.to_body, expected.axes, rtol=0, atol=1e-14)
+    assert turned.interior[0] == pytest.approx(expected.focal_length, abs=1e-15)
+
+
+def test_exact_readings_return_everything() -> None:
+    """Places of the sensor are solved to 1e-12 m; 1e-6 of the drift is 20 pm, and 1e-6 of 1 um is as good."""
+    campaign = flown(setup_with(exact=True), 1.0, SEED)
+    found = all_told(campaign)
+    for one in campaign.passes:
+        assert np.abs(one.drift["forward"]).max() > 0.1 * ARCSEC
+        assert not np.any(one.drift["nadir"])
+        cameras = found.cameras_of(one.name)
+        for line in LINES:
+            np.testing.assert_allclose(cameras[line].drift[:3], one.drift[line][:3], rtol=1e-6, atol=1e-6 * ARCSEC)
+            np.testing.assert_allclose(cameras[line].drift[3], one.drift[line][3], rtol=1e-6, atol=1e-11)
+            np.testing.assert_allclose(cameras[line].interior, campaign.truth[line].interior, rtol=0, atol=1e-11)
+        errors = at_checks(campaign, one, cameras, found.bias(one.name))
+        assert max(errors.plan_rms, errors.height_rms) < 1e-4  # 1e-6 of 40 arcsec of bias, over 500 km
+    assert with_monitor(campaign).schemes["1"].height < 1e-3
+
+
+def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
+    """By hand, over a flat Earth: 1 arcsec of one outer line is H / sin(2 look) per radian, 3.2 m; the curved Earth
+    takes 7% off. Heights of a field differ by its d_alpha, forward less aft, against the mean of all, to the same
+    few per cent of metres per arcsec over latitudes, and d_beta, d_gamma and d_f act at the ends of the line."""
+    setup = setup_with(exact=True)
+    campaign = flown(setup, 1.0, SEED)
+    metres = height_per_arcsec(flown(setup, 0.0, SEED))
+    by_hand = setup.test.altitude / np.sin(np.radians(50.0)) * ARCSEC
+    assert abs(metres) == pytest.approx(by_hand, rel=0.1)
+    found = simultaneous(campaign)
+    angle = np.array([(p.drift["forward"] - p.drift["aft"])[0] / ARCSEC for p in campaign.passes])
+    height = [at_checks(campaign, p, found.cameras, found.bias(p.name)).error[:, 2].mean() for p in campaign.passes]
+    # cameras that do not have the drift see the opposite of it
+    assert np.array(height) == pytest.approx(-metres * (angle - angle.mean()), abs=0.05 * abs(metres) * np.ptp(angle))
+    assert np.ptp(height) > 1.0
+
+
+def test_a_monitor_brings_errors_back() -> None:
+    """Same noise with and without drift. What a reading leaves is 0.03 arcsec of forward less aft, 0.1 m beside 3 m:
+    0.1% of an RMS; 2% allow for d_gamma and d_f. Drifts of 4 arcsec are 12 m and more."""
+    setup = setup_with()
+    still, moved = (flown(setup, factor, SEED) for factor in (0.0, 4.0))
+    base, blind, told = without_monitor(still), without_monitor(moved), with_monitor(moved)
+    assert told.together.height == pytest.approx(base.together.height, rel=0.02)
+    assert told.together.plan == pytest.approx(base.together.plan, rel=0.02)
+    assert blind.together.height > 1.5 * base.together.height
+    for scheme in ("1", "2"):
+        assert told.schemes[scheme].height == pytest.approx(base.schemes[scheme].height, rel=0.02)
+        assert blind.schemes[scheme].height > 1.5 * base.schemes[scheme].height
+    assert blind.p_value < 1e-6 < told.p_value
+
+
+def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
+    """1 arcsec of the forward line in all readings is 3.15 um of x, f times it, and no error of heights. In the reading
+    of one tested pass alone it is that pass's error, metres per arcsec."""
+    campaign = flown(setup_with(exact=True), 1.0, SEED)
+    wrong = np.array([ARCSEC, 0.0, 0.0, 0.0])
+
+    def off(one):
+        return replace(one, readings=FrozenMap({**one.readings, "forward": one.readings["forward"] + wrong}))
+
+    all_off = replace(campaign, passes=tuple(off(p) for p in campaign.passes))
+    found = all_told(all_off)
+    moved = abs(found.value("forward x") - campaign.truth["forward"].interior[1])
+    assert moved == pytest.approx(0.65 * ARCSEC, rel=0.01)
+    assert with_monitor(all_off).together.height < 0.02
+    alone = told_alone(campaign, campaign.passes[0])
+    last = off(campaign.passes[-1])
+    cameras = {k: alone.cameras[k].drifted(last.readings[k]) for k in LINES}
+    errors = at_checks(campaign, last, cameras, alone.bias(KEPT[0]))
+    assert PooledErrors.of([errors]).height == pytest.approx(abs(height_per_arcsec(campaign)), rel=0.05)
+
+
+def test_draws_do_not_change_others() -> None:
+    """Without drift the same campaign as that of a file that has no such section."""
+    setup = setup_with()
+    none = setup.model_copy(update={"test": setup.test.model_copy(update={"drift": FrozenMap({}), "monitor": None})})
+    plain = fly_fields(none, np.random.SeedSequence(7)).passes[1]
+    drifted = fly_fields(setup, np.random.SeedSequence(7)).passes[1]
+    np.testing.assert_array_equal(plain.control_images["nadir"].line, drifted.control_images["nadir"].line)
+    np.testing.assert_array_equal(plain.control_ground, drifted.control_ground)
+    assert np.abs(plain.control_images["aft"].pixel - drifted.control_images["aft"].pixel).max() > 0.01
+    assert not plain.readings
+
+
+def write(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = EXAMPLE.read_text("utf-8")
+    for old, new in changes:
+        assert text.count(old) >= 1, old
+        text = text.replace(old, new)
+    path = folder / "small.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+def test_command(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        ("control: 60, check: 100", "control: 20, check: 20"),
+        (
+            "light_time: true, aberration: true, refraction: true",
+            "light_time: false, aberration: false, refraction: false",
+        ),
+    )
+    text = re.sub(r"(?m)^  (?!Beijing|Anhui)[A-Z][\w-]+: \{latitude.*\n", "", path.read_text("utf-8"))
+    path.write_text(re.sub(r"(?m)^  - \[Beijing, Anhui, .*\n", "", text), "utf-8")
+    result = run("calibrate", path, "--out", tmp_path / "run", "--json")
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)["monitoring"]
+    assert [s["factor"] for s in found["sizes"]] == [0.0, 0.5, 1.0, 2.0, 4.0]
+    last = found["sizes"][-1]
+    assert (
+        last["without_monitor"]["schemes"]["2"]["height_rms_m"] > last["with_monitor"]["schemes"]["2"]["height_rms_m"]
+    )
+    assert {f"monitor-{k}" for k in ("heights.svg", "sizes.csv", "schemes.csv")} <= {
+        p.name for p in (tmp_path / "run" / "artefacts").iterdir()
+    }
+    assert "on-board monitor" in (tmp_path / "run" / "report.html").read_text("utf-8")
+
+
+BAD = {
+    "line": ("  aft: {angles", "  after: {angles", "drift.after", ["no such line", "aft"]),
+    "negative": ("focal_length: 10 um}", "focal_length: -10 um}", "monitor.focal_length", ["outside the limits"]),
+    "negative drift": ("[1 arcsec, 1 arcsec, 2 arcsec]", "[-1 arcsec, 0 arcsec, 0 arcsec]", "drift", ["outside"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(case: str, tmp_path: Path) -> None:
+    old, new, key, words = BAD[case]
+    refused(run, "calibrate", write(tmp_path, (old, new)), key, words)
+
+
+def test_a_monitor_needs_a_drift(tmp_path: Path) -> None:
+    lines = EXAMPLE.read_text("utf-8").splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("drift:"))
+    path = tmp_path / "small.yaml"
+    path.write_text("\n".join(lines[:start] + lines[start + 3 :]), "utf-8")
+    refused(run, "calibrate", path, "monitor", ["nothing that it reads", "drift"])

@@ -1,0 +1,126 @@
+"""A simulated pass as a user runs it, and what its files say to other software."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+import twin.orbit.__main__ as command
+from scenes.load import LIBRARY, ORBIT
+from tests.twin.commands import files, invoke, refused
+
+run = partial(invoke, command.app)
+EXAMPLE = LIBRARY / ORBIT / "simulate.yaml"
+SIZE = "lines: 1000, pixels: 1000}"
+SMALL = "lines: 64, pixels: 80}"
+# such small images have no room for templates
+POINTS = "points: {control: 200, check: 100, tie: 200, reach: 40, template: 31}"
+LINES = ("forward", "nadir", "aft")
+
+
+def write(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = EXAMPLE.read_text("utf-8")
+    for old, new in ((SIZE, SMALL), (POINTS, ""), *changes):
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "small.yaml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("simulate")
+    result = run("simulate", write(place), "--out", place / "run", "--seed", 5, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout) == read(place / "run" / "simulate.json")
+    return place / "run"
+
+
+def read(path: Path):
+    return json.loads(path.read_text("utf-8"))
+
+
+def test_files(folder: Path) -> None:
+    data = read(folder / "simulate.json")
+    images = {f"images/{n}.{k}" for n in (*LINES, "orthophoto", "dem") for k in ("tiff", "png")}
+    named = ("images.csv", "windows.csv", "lines.png", "control.png", "transfer.svg")
+    plain = ("camera.json", "trajectory.json", "georeference.json", "truth.json")
+    own = {"manifest.json", "config.yaml", "simulate.json", "report.html"}
+    assert files(folder) == own | images | {f"artefacts/{n}" for n in (*named, *plain)}
+    for name in LINES:
+        said = data["lines"][name]
+        (image,) = np.atleast_3d(tifffile.imread(folder / "images" / f"{name}.tiff")).reshape(1, 64, 80)
+        assert image.dtype == np.uint16
+        assert (said["lines"], said["pixels"]) == (64, 80)
+        assert said["mean_dn"] == pytest.approx(image.mean(), rel=1e-12)
+        assert said["saturated_pixels"] == 0
+        assert said["geometry_error_px"] < 0.002
+        assert 100.0 < image.mean() < 500.0
+        assert 4.9 < said["sample_along_track_m"] < 5.1
+    times = [data["lines"][k]["first_line_time_s"] for k in LINES]
+    assert times[0] == pytest.approx(-33.0, abs=1.0)
+    assert times[2] == pytest.approx(33.0, abs=1.0)
+    assert tifffile.imread(folder / "images" / "dem.tiff").shape[-2:] == (data["dem"]["rows"], data["dem"]["columns"])
+    # nothing that only the truth knows
+    known = "".join((folder / "artefacts" / f"{n}.json").read_text("utf-8") for n in ("camera", "trajectory"))
+    assert "0.65009" not in known
+    assert read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["focal_length_m"] == 0.65 + 90e-6
+
+
+def test_other_software_finds_the_ground(folder: Path) -> None:
+    """Camera, orbit and attitude from truth.json alone, a straight look: places to 20 m, which light time, aberration
+    and refraction are (13 m along the track by aberration)."""
+    truth, data = read(folder / "artefacts" / "truth.json"), read(folder / "simulate.json")
+    way, checked = truth["trajectory"], 0
+    position = CubicSpline(way["orbit_s"], way["position_m"])
+    turn = CubicSpline(way["attitude_s"], way["quaternion"])
+    for name in LINES:
+        line, points = truth["camera"]["lines"][name], truth["ground_points"][name]
+        said = data["lines"][name]
+        seconds = said["first_line_time_s"] + (np.array(points["line"]) - said["first_line"]) * said["line_time_s"]
+        x0, y0 = line["principal_point_m"]
+        y = (np.array(points["pixel"]) - 0.5 * (line["pixels"] - 1)) * line["pitch_m"] - y0
+        grown = 1.0 + line["k1_per_m2"] * (x0**2 + y**2)
+        look = np.stack([x0 * grown, -y * grown, np.full_like(y, line["focal_length_m"])], axis=-1)
+        look = look @ np.array(line["camera_to_body"]).T
+        look = Rotation.from_quat(turn(seconds)).apply(look / np.linalg.norm(look, axis=-1, keepdims=True))
+        arm = np.array(points["itrs_m"]) - position(seconds)
+        beside = np.linalg.norm(np.cross(arm, look), axis=-1)
+        assert beside.max() < 20.0
+        checked += len(beside)
+    assert checked == 3 * 441
+
+
+def test_the_seed_decides(folder: Path, tmp_path: Path) -> None:
+    again = run("simulate", folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
+    assert (again.exit_code, again.stdout) == (0, "")
+    for name in (*LINES, "orthophoto", "dem"):
+        path = f"images/{name}.tiff"
+        assert (tmp_path / "again" / path).read_bytes() == (folder / path).read_bytes()
+    assert (tmp_path / "again" / "simulate.json").read_bytes() == (folder / "simulate.json").read_bytes()
+
+
+# what is wrong, key, what to do about it
+BAD = {
+    "no size": (SMALL, "lines: 0, pixels: 80}", "patch.lines", ["16"]),
+    "line": ("lines: [forward, nadir, aft]", "lines: [forward, nadr]", "lines", ["did you mean 'nadir'"]),
+    "edge": ("pixel: 6000", "pixel: 40", "patch", ["reaches into", "nadir"]),
+    "short before": ("before: 60 s ", "before: 20 s ", "orbit", ["before the orbit data begin", "longer"]),
+    "short after": ("after: 60 s", "after: 20 s", "orbit", ["after the orbit data end", "longer"]),
+    "steep": ("kind: real, height: 500 m", "kind: real, height: 4000 m, relief: 1500 m", "ground.terrain", ["hides"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(case: str, tmp_path: Path) -> None:
+    old, new, key, words = BAD[case]
+    path = write(tmp_path, (old, new)) if old != SMALL else write(tmp_path)
+    if old == SMALL:
+        path.write_text(path.read_text("utf-8").replace(old, new), "utf-8")
+    refused(run, "simulate", path, key, words)

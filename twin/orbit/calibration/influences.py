@@ -1,0 +1,235 @@
+"""What is not seen in the fit: effects on the light that are left in the image points, ground coordinates in a wrong
+datum. Both are carried by the parameters; how far, is found by calibrating again from the same measurements. These
+comparisons count the noise of attitude and orbit as independent, which takes a tenth of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from analysis.orbit.adjustment import Adjustment, Robust, adjust
+from analysis.orbit.calibration_parameters import Prior, Unknowns
+from analysis.orbit.forward_intersection import CheckErrors
+from analysis.orbit.three_line_model import BIAS, INTERIOR
+from scenes.orbit_angle import LINES
+from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.light import EFFECTS
+from twin.orbit.calibration.schemes import GAUGE, RMS, calibrated_alone, schemes_tested, tested_before, values_of
+from twin.orbit.light_effects import NO_EFFECTS
+
+INNER = tuple(f"{line} {name}" for line in LINES for name in INTERIOR)
+OFFSET = ("along", "across", "down")
+SURPRISE = 4.0
+"""Sigmas of what is expected of an unknown; one of seventy lies beyond by chance in 1 of 200 campaigns."""
+_LEAST_OFFSET = 1e-3
+"""Metres; sigma of an orbit without a drift along one axis."""
+_TRIAL_SHIFT = 100.0
+"""Metres; of a wrong datum where the file has none."""
+
+
+@dataclass(frozen=True, eq=False)
+class LightRow:
+    """One case of what is left in the image points.
+
+    Attributes:
+        left: effects that are not taken out, of `EFFECTS`.
+        moved: line -> (2,) RMS of what they move the check points' image points by, x and y, metres.
+        before: mean of the fields' RMS with the laboratory's camera, plan and height, metres.
+        after: likewise, each field with its own parameters.
+        shift: name -> change of a parameter of the simultaneous adjustment from the case that nothing is left in.
+        sigma: name -> its sigma.
+        p_value: of the adjustment.
+    """
+
+    left: tuple[str, ...]
+    moved: Mapping[str, np.ndarray]
+    before: tuple[float, float]
+    after: tuple[float, float]
+    shift: Mapping[str, float]
+    sigma: Mapping[str, float]
+    p_value: float
+
+    def most(self, names: tuple[str, ...]) -> tuple[str, float]:
+        """Which of these unknowns is moved by the most sigmas, and by how many; held ones do not count."""
+        size = {n: self.shift[n] / self.sigma[n] for n in names if self.sigma[n] > 0.0}
+        worst = max(size, key=lambda n: abs(size[n]))
+        return worst, size[worst]
+
+
+@dataclass(frozen=True, eq=False)
+class DatumRow:
+    """What a common shift of all control points does.
+
+    Attributes:
+        shift: east, north, up, metres.
+        bias: (3,) mean change of the fields' roll, pitch and yaw, radians.
+        interior: name -> change, metres.
+        offset: (3,) mean change of the orbit's offsets along, across, down, metres; zero where not solved for.
+        fit: change of the chi-square of the simultaneous adjustment.
+        p_value: of the adjustment with the shift.
+        after: mean of the fields' RMS against the right datum, each field with its own parameters, plan and height.
+    """
+
+    shift: tuple[float, float, float]
+    bias: np.ndarray
+    interior: Mapping[str, float]
+    offset: np.ndarray
+    fit: float
+    p_value: float
+    after: tuple[float, float]
+
+    @property
+    def most(self) -> tuple[str, float]:
+        """The element of the interior that is moved most, and its change, metres."""
+        worst = max(self.interior, key=lambda n: abs(self.interior[n]))
+        return worst, self.interior[worst]
+
+
+@dataclass(frozen=True)
+class Surprise:
+    """An estimate beyond what is expected of it, in the unit of the unknown: metres or radians."""
+
+    name: str
+    change: float
+    expected: float
+
+    @property
+    def ratio(self) -> float:
+        """In sigmas of what is expected."""
+        return abs(self.change) / self.expected
+
+
+def simultaneous(
+    campaign: Campaign, priors: tuple[Prior, ...] = (), robust: Robust | None = None, drift: bool = False
+) -> Adjustment:
+    """All fields at once: one interior, a bias and, where the orbit drifts, an offset with its prior for each field.
+
+    Args:
+        campaign: the fields.
+        priors: what else is known of the unknowns, for example by an on-board monitor in each pass.
+        robust: weights of the image points.
+        drift: whether the cameras' changes in each pass are unknowns, too; priors must tell them.
+
+    Raises:
+        CalibrationError: it cannot be solved.
+    """
+    errors = campaign.spec.errors
+    offsets = errors.switched_on and any(errors.gps.drift)
+    drifts = tuple(
+        Prior({f"{p.name} offset {axis}": 1.0}, 0.0, max(sigma, _LEAST_OFFSET), "orbit")
+        for p in campaign.passes
+        for axis, sigma in zip(OFFSET, errors.gps.drift, strict=True)
+    )
+    return adjust(
+        [p.control for p in campaign.passes],
+        campaign.laboratory,
+        campaign.noise,
+        unknowns=Unknowns(offset="field" if offsets else "none", drift="field" if drift else "none"),
+        priors=(*(drifts if offsets else ()), *priors),
+        gauge=GAUGE,
+        robust=robust,
+    )
+
+
+def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow, ...]:
+    """Nothing left in, each effect alone, all of them; only effects that are on.
+
+    Args:
+        campaign: the measurements.
+        sigma: name -> sigma of a parameter of the simultaneous adjustment.
+
+    Raises:
+        CalibrationError: a case cannot be solved.
+    """
+    on = [name for name in EFFECTS if getattr(campaign.effects, name)]
+    cases = [(), *((name,) for name in on), *([tuple(on)] if len(on) > 1 else [])]
+    clean = campaign.independent.without_effects(campaign.effects)
+    base = simultaneous(clean)
+    rows = []
+    for left in cases:
+        case, found = clean, base
+        if left:
+            removed = replace(campaign.effects, **dict.fromkeys(left, False))
+            case = clean.without_effects(removed if len(left) < len(on) else NO_EFFECTS)
+            found = simultaneous(case)
+        moved = {
+            line: np.sqrt(
+                np.mean(
+                    np.concatenate(
+                        [
+                            (a.check[line].image - b.check[line].image) ** 2
+                            for a, b in zip(case.passes, clean.passes, strict=True)
+                        ]
+                    ),
+                    axis=0,
+                )
+            )
+            for line in LINES
+        }
+        shift = dict(zip(found.names, (found.values - base.values).tolist(), strict=True))
+        rows.append(LightRow(left, moved, _means(tested_before(case)), _after(case), shift, sigma, found.p_value))
+    return tuple(rows)
+
+
+def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
+    """The file's datum, or 100 m along each axis where it has none.
+
+    Raises:
+        CalibrationError: a case cannot be solved.
+    """
+    errors = campaign.spec.errors
+    right = campaign.independent
+    shifts = [(_TRIAL_SHIFT, 0.0, 0.0), (0.0, _TRIAL_SHIFT, 0.0), (0.0, 0.0, _TRIAL_SHIFT)]
+    if errors.switched_on and any(errors.datum):
+        east, north, up = errors.datum
+        right, shifts = right.shifted((-east, -north, -up)), [errors.datum]
+    base = simultaneous(right)
+    rows = []
+    for east, north, up in shifts:
+        wrong = right.shifted((east, north, up))
+        found = simultaneous(wrong)
+        change = dict(zip(found.names, found.values - base.values, strict=True))
+        names = [p.name for p in campaign.passes]
+        rows.append(
+            DatumRow(
+                (float(east), float(north), float(up)),
+                np.array([np.mean([change[f"{n} {axis}"] for n in names]) for axis in BIAS]),
+                {n: float(change[n]) for n in INNER},
+                np.array([np.mean([change.get(f"{n} offset {axis}", 0.0) for n in names]) for axis in OFFSET]),
+                found.chi_square - base.chi_square,
+                found.p_value,
+                _after(wrong),
+            )
+        )
+    return tuple(rows)
+
+
+def surprises(campaign: Campaign, found: Adjustment) -> tuple[Surprise, ...]:
+    """Estimates beyond `SURPRISE` sigmas of what launch and orbit leave to expect, the largest first."""
+    launch, errors = campaign.spec.launch, campaign.spec.errors
+    start = dict(zip(INNER, np.ravel([campaign.laboratory[line].interior for line in LINES]), strict=True))
+    known = {name: (start[name], launch.interior) for name in INNER}
+    for one in campaign.passes:
+        # a season's part is no surprise either
+        spread = np.hypot(launch.bias, np.array(errors.season))
+        known |= {f"{one.name} {axis}": (0.0, s) for axis, s in zip(BIAS, spread.tolist(), strict=True) if s > 0.0}
+        if errors.switched_on:
+            drift = zip(OFFSET, errors.gps.drift, strict=True)
+            known |= {f"{one.name} offset {axis}": (0.0, s) for axis, s in drift if s > 0.0}
+    all_of_them = [Surprise(n, float(found.value(n) - v), s) for n, (v, s) in known.items() if n in found.names]
+    return tuple(sorted((s for s in all_of_them if s.ratio > SURPRISE), key=lambda s: -s.ratio))
+
+
+def _after(campaign: Campaign) -> tuple[float, float]:
+    """Mean RMS in plan and height, each field with its own parameters."""
+    alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
+    return _means(list(schemes_tested(campaign, alone).values())[-1])
+
+
+def _means(errors: Mapping[str, CheckErrors]) -> tuple[float, float]:
+    """Of the fields' RMS in plan and height, metres."""
+    plan, height = (float(values_of(errors, what).mean()) for what in RMS)
+    return plan, height

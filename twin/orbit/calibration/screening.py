@@ -1,0 +1,144 @@
+"""Last test of measured points: robust weights of the adjustment, and of check points the intersection of their rays.
+
+What the adjustment leaves out is taken from the measurements for good, and the sigmas of matching grow where the
+residuals of the rest ask for it. Nothing of it uses the truth but the counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from analysis.orbit.adjustment import Adjustment
+from analysis.orbit.calibration_parameters import CalibrationError
+from analysis.orbit.forward_intersection import intersect
+from analysis.orbit.residual_weights import REJECT
+from optics.frozen_map import FrozenMap
+from twin.orbit.calibration.campaign import Campaign, FieldPass
+from twin.orbit.calibration.images import FieldImages, Screening
+from twin.orbit.calibration.influences import simultaneous
+from twin.orbit.calibration.points import ImagePoints
+from twin.orbit.light_effects import NO_EFFECTS
+
+_ROUNDS = 3
+_SETTLED = 1.05
+"""A factor on the sigmas that is as small is not applied, and none below 1: what the three lines' matches with one
+template have in common does not show in residuals, because it moves the adjusted point."""
+_FALSE_ALARM = 1e-4
+"""Of check points, as of image points in the adjustment."""
+
+
+def screened(campaign: Campaign) -> Campaign:
+    """The campaign without what the adjustment rejects, with sigmas of the image points that fit the residuals.
+
+    Raises:
+        CalibrationError: it cannot be adjusted.
+    """
+    assert campaign.images is not None
+    found, kept = _robust(campaign)
+    for _ in range(_ROUNDS):
+        factor = _factor(found, kept)
+        if factor <= _SETTLED:
+            break
+        campaign = replace(campaign, noise=replace(campaign.noise, image=campaign.noise.image * factor))
+        found, kept = _robust(campaign)
+    assert campaign.images is not None
+    passes, images = [], []
+    for one, shown in zip(campaign.passes, campaign.images, strict=True):
+        less, keep_check = _without(campaign, one, kept[one.name], found)
+        passes.append(less)
+        images.append(replace(shown, screening=_counted(one, shown, kept[one.name], keep_check)))
+    removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
+    return replace(campaign, passes=tuple(passes), images=tuple(images)).without_effects(removed)
+
+
+_Kept = dict[str, dict[str, np.ndarray]]
+
+
+def _robust(campaign: Campaign) -> tuple[Adjustment, _Kept]:
+    """The adjustment with robust weights, and field -> line -> which image points it keeps.
+
+    IGG's weights can swing between a point and its neighbour for ever. Huber's do not: then his, and the limit of IGG.
+    """
+    try:
+        found = simultaneous(campaign, robust="igg")
+    except CalibrationError:
+        found = simultaneous(campaign, robust="huber")
+    kept: _Kept = {}
+    for name, lines in found.residual.items():
+        kept[name] = {}
+        for line, residual in lines.items():
+            far = np.linalg.norm(residual, axis=1) > REJECT
+            kept[name][line] = (found.weight[name][line] > 0.0) & ~far
+    return found, kept
+
+
+def _factor(found: Adjustment, kept: _Kept) -> float:
+    """Root of the mean square of the standardised residuals of the points that are kept, by their median."""
+    squares = []
+    for name, lines in found.residual.items():
+        for line, residual in lines.items():
+            squares.append(np.sum(residual**2, axis=1)[kept[name][line]])
+    # median of chi-square with two degrees of freedom is 2 ln 2; the tails are what robust weights are for
+    return float(np.sqrt(np.median(np.concatenate(squares)) / (2.0 * np.log(2.0))))
+
+
+def _without(
+    campaign: Campaign, one: FieldPass, kept: dict[str, np.ndarray], found: Adjustment
+) -> tuple[FieldPass, np.ndarray]:
+    """A pass without rejected image points, ties that are left to one line, check points whose rays do not meet."""
+    count = len(one.control_ground)
+    seen = np.zeros(count, int)
+    for name, row in one.control_images.items():
+        np.add.at(seen, row.point[kept[name]], 1)
+    stays = np.where(one.control.control, seen > 0, seen > 1)
+    number = np.cumsum(stays) - 1
+    images = {}
+    for name, row in one.control_images.items():
+        rest = row.taken(kept[name] & stays[row.point])
+        images[name] = replace(rest, point=number[rest.point])
+    meeting = intersect(one.check, found.cameras_of(one.name), campaign.noise, bias=found.bias(one.name))
+    # three rays are six conditions of three coordinates
+    keep = meeting.chi_square <= chi2.isf(_FALSE_ALARM, 2 * meeting.rays - 3)
+    check = {name: _renumbered(row.taken(keep[row.point])) for name, row in one.check_images.items()}
+    less = replace(
+        one,
+        control_images=FrozenMap(images),
+        control_ground=one.control_ground[stays],
+        control=replace(
+            one.control,
+            ground=one.control.ground[stays],
+            covariance=one.control.covariance[stays],
+            control=one.control.control[stays],
+        ),
+        check_images=FrozenMap(check),
+        check_ground=one.check_ground[keep],
+    )
+    return less, keep
+
+
+def _renumbered(row: ImagePoints) -> ImagePoints:
+    """Check points are seen by every line, in one order."""
+    return replace(row, point=np.arange(len(row.point)))
+
+
+def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], check: np.ndarray) -> Screening:
+    entered = left = wrong_entered = wrong_left = right_lost = 0
+    for name, row in one.control_images.items():
+        wrong, stays = shown.wrong[name][row.point], kept[name]
+        entered, left = entered + len(wrong), left + int(stays.sum())
+        wrong_entered, wrong_left = wrong_entered + int(wrong.sum()), wrong_left + int((wrong & stays).sum())
+        right_lost += int((~wrong & ~stays).sum())
+    bad = np.any(list(shown.wrong_check.values()), axis=0)
+    return Screening(
+        entered,
+        left,
+        wrong_entered,
+        wrong_left,
+        right_lost,
+        len(check),
+        int(check.sum()),
+        int((bad & check).sum()),
+    )

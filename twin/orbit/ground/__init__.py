@@ -1,0 +1,1 @@
+"""The ground: its plane frame, terrain, texture, orthophoto and elevation model."""

@@ -1,0 +1,283 @@
+"""Images of one patch of ground by the lines of a camera, with control: the way in for everybody who needs images.
+
+    lines = imaged_lines(sensors, measured, optics, seed)
+    patch = fly_patch(lines, place, (600, 600), ground, control, seed)
+    patch.images["nadir"].frame          # uint16, what the detector gave
+    patch.images["nadir"].image_point(row, column)      # line and pixel of the whole image
+    patch.images["nadir"].measured       # Sensor: the laboratory's camera on the measured trajectory
+    patch.control.orthophoto, patch.control.dem
+
+An analysis may use `frame`, `window`, `measured` and the control's rasters. `sensor`, `terrain` and the control's
+errors are the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.frozen_map import FrozenMap
+from twin.detector import FixedPattern
+from twin.orbit.ground.frame import GroundFrame
+from twin.orbit.ground.orthophoto import Control, make_control
+from twin.orbit.ground.random_field import stream
+from twin.orbit.ground.terrain import Terrain
+from twin.orbit.ground.texture import apparent, around, reflectance
+from twin.orbit.images.line_optics import ImageMotion, LineOptics
+from twin.orbit.images.look_map import LookMap, SteepTerrainError
+from twin.orbit.images.pushbroom import BORDER, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
+from twin.orbit.sensor import Sensor
+
+if TYPE_CHECKING:
+    from scenes.orbit_scene import ControlSpec, GroundSpec
+
+LARGEST_GROUND = 40_000.0
+"""Metres: side of the ground of one patch, against input that asks for more than the memory holds."""
+
+
+class PatchError(ValueError):
+    """A patch that cannot be imaged.
+
+    Attributes:
+        part: what is to be changed: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
+        line: of the camera that cannot image it; empty where it is not one line's fault.
+    """
+
+    def __init__(self, problem: str, part: str, line: str = "") -> None:
+        super().__init__(problem)
+        self.part, self.line = part, line
+
+
+@dataclass(frozen=True, eq=False)
+class ImagedLine:
+    """A line that records images.
+
+    Attributes:
+        sensor: as it is.
+        measured: as the user knows it: the laboratory's camera on the measured trajectory.
+        optics: lens and CCD.
+        pattern: its pixels' differences.
+    """
+
+    sensor: Sensor
+    measured: Sensor
+    optics: LineOptics
+    pattern: FixedPattern
+
+
+@dataclass(frozen=True, eq=False)
+class LineImage:
+    """What one line recorded of a patch.
+
+    Attributes:
+        frame: grey values, uint16, (lines, pixels) of the window.
+        window: where it lies in the line's whole image.
+        sensor: the true one.
+        measured: the one that the user knows.
+        motion: of the image over the line, in the window's middle.
+        sample: distance of two pixels along the line, and of two lines, on the ground in the window's middle, metres.
+        nyquist: modulation transfer at half a cycle per pixel, and per line.
+        saturated: pixels at the end of the detector's range.
+        error: of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
+    """
+
+    frame: np.ndarray
+    window: Window
+    sensor: Sensor
+    measured: Sensor
+    motion: ImageMotion
+    sample: tuple[float, float]
+    nyquist: tuple[float, float]
+    saturated: int
+    error: float
+
+    def image_point(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Line and pixel of places of the frame (row, column), whole or not."""
+        return self.window.first_line + np.asarray(row), self.window.first_pixel + np.asarray(column)
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A patch of ground, imaged.
+
+    Attributes:
+        frame: plane coordinates of the ground, metres east and north of the patch's middle.
+        terrain: the true heights.
+        images: line -> what it recorded.
+        control: orthophoto and elevation model, with their errors.
+    """
+
+    frame: GroundFrame
+    terrain: Terrain
+    images: Mapping[str, LineImage]
+    control: Control
+
+    def true_point(self, name: str, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """The place on the true terrain that places of a line's frame see, ITRS, (N, 3), metres: the exact inverse of
+        `Sensor.image`. Rows and columns (N,) must lie on the frame.
+        """
+        image = self.images[name]
+        line, pixel = (np.ravel(v) for v in image.image_point(row, column))
+        height = np.full(line.shape, 0.5 * sum(self.terrain.limits))
+        # as followed from the look: the terrain's slope times the look's makes each step smaller
+        for _ in range(60):
+            points = image.sensor.ground(line, pixel, height)
+            east, north, _ = self.frame.local(points)
+            found = self.terrain.height(east, north)
+            away, height = np.max(np.abs(found - height)), 0.5 * (found + height)
+            if away < 1e-5:
+                return points
+        raise PatchError("the terrain is as steep as the look", "terrain", name)
+
+
+def fly_patch(
+    lines: Mapping[str, ImagedLine],
+    place: tuple[float, float],
+    size: tuple[int, int],
+    ground: GroundSpec,
+    control: ControlSpec,
+    seed: np.random.SeedSequence,
+    oversampling: int = 3,
+) -> Patch:
+    """Image a patch of ground with every line.
+
+    Each line's window of the same size has the patch's middle in its middle, to half a pixel.
+
+    Args:
+        lines: by name; see `imaged_lines`.
+        place: longitude and latitude of the patch's middle, radians.
+        size: lines and pixels of every window.
+        ground: terrain, texture and light.
+        control: of the orthophoto and the elevation model.
+        seed: of the ground, of the control's errors and of the frames' noise.
+        oversampling: samples of the ground along each side of a pixel.
+
+    Raises:
+        PatchError: a line does not see the patch within its image, terrain that hides a part of itself, or a patch too
+            large.
+    """
+    for_terrain, for_ground, for_control, for_frames = (stream(seed, k) for k in range(4))
+    frame = GroundFrame(*place)
+    guess = {name: window_of(name, one.sensor, frame, ground.terrain.height, size) for name, one in lines.items()}
+    side = max(_side(one.sensor, guess[name], frame, ground.terrain.height) for name, one in lines.items())
+    if side > LARGEST_GROUND:
+        raise PatchError(f"the patch is {side / 1e3:.0f} km long, more than {LARGEST_GROUND / 1e3:g} km", "size")
+    terrain = Terrain.from_spec(ground.terrain, side, for_terrain)
+    middle = float(terrain.height(np.zeros(1), np.zeros(1))[0])
+    windows = {name: window_of(name, one.sensor, frame, middle, size) for name, one in lines.items()}
+    looks, extents = {}, []
+    for name, one in lines.items():
+        try:
+            looks[name] = look_map(one.sensor, frame, terrain, windows[name])
+            extents.append(extent_of(looks[name]))
+            require_open(looks[name], extents[-1])
+        except SteepTerrainError as error:
+            raise PatchError(f"{name}: {error}", "terrain", name) from error
+    extent = around(extents)
+    seen = apparent(reflectance(extent, ground.texture, for_ground), terrain, ground.light)
+    scene = PushbroomScene(frame, terrain, seen)
+    images = {}
+    for k, (name, one) in enumerate(lines.items()):
+        images[name] = _recorded(one, scene, windows[name], looks[name], oversampling, stream(for_frames, k))
+    known = make_control(frame, extent, terrain, ground.texture, control, for_ground, for_control)
+    return Patch(frame, terrain, FrozenMap(images), known)
+
+
+def imaged_lines(
+    sensors: Mapping[str, Sensor],
+    measured: Mapping[str, Sensor],
+    optics: Mapping[str, LineOptics],
+    seed: np.random.SeedSequence,
+) -> dict[str, ImagedLine]:
+    """Lines that record images.
+
+    Args:
+        sensors: the true ones, by name.
+        measured: as the user knows them.
+        optics: lens and CCD.
+        seed: of the pixels' differences, which stay the same in all images of the line.
+    """
+    return {
+        name: ImagedLine(sensor, measured[name], optics[name], optics[name].ccd.pattern(stream(seed, k)))
+        for k, (name, sensor) in enumerate(sensors.items())
+    }
+
+
+def window_of(name: str, sensor: Sensor, frame: GroundFrame, height: float, size: tuple[int, int]) -> Window:
+    """The window of an image with the frame's origin, at a height (metres), in its middle.
+
+    Raises:
+        PatchError: it does not lie inside the image.
+    """
+    (line,), (pixel,) = sensor.image(frame.itrs(0.0, 0.0, height))
+    if not np.isfinite(line):
+        raise _not_seen(name, sensor, frame, height)
+    first = [round(float(at) - 0.5 * (count - 1)) for at, count in zip((line, pixel), size, strict=True)]
+    window = Window(first[0], first[1], *size)
+    if not window.fits(sensor):
+        long = window.first_line < BORDER or window.first_line + window.lines + BORDER > sensor.lines
+        raise PatchError(
+            f"the window of {name}, lines {window.first_line} to {window.first_line + window.lines - 1} and pixels "
+            f"{window.first_pixel} to {window.first_pixel + window.pixels - 1}, reaches into the last {BORDER} lines "
+            f"or pixels of the image of {sensor.lines} lines and {sensor.camera.pixels} pixels, or beyond",
+            "span" if long else "size",
+            name,
+        )
+    return window
+
+
+def _not_seen(name: str, sensor: Sensor, frame: GroundFrame, height: float) -> PatchError:
+    """What to say of a place outside an image: does the pass end before it, or does it lie beside the swath?"""
+    ends, middle = np.array([0.0, sensor.lines - 1.0]), np.array([0.5 * (sensor.camera.pixels - 1)])
+    begin, end = np.stack(frame.local(sensor.ground(ends, middle, height))[:2], axis=-1)
+    track = end - begin
+    share = float(-begin @ track / (track @ track))
+    if 0.0 <= share <= 1.0:
+        beside = float(np.linalg.norm(begin + share * track))
+        return PatchError(
+            f"the {name} line does not see the patch, {beside / 1e3:.0f} km beside its middle pixel", "place", name
+        )
+    early = -share if share < 0.0 else share - 1.0
+    seconds = early * sensor.lines * sensor.line_time
+    when = "before the orbit data begin" if share < 0.0 else "after the orbit data end"
+    return PatchError(f"the {name} line sees the patch {seconds:.1f} s {when}", "span", name)
+
+
+def _side(sensor: Sensor, window: Window, frame: GroundFrame, height: float) -> float:
+    """Length of the longer side of what a window sees, metres."""
+    lines = window.first_line + np.array([0.0, 0.0, 1.0, 1.0]) * (window.lines - 1)
+    pixels = window.first_pixel + np.array([0.0, 1.0, 0.0, 1.0]) * (window.pixels - 1)
+    east, north, _ = frame.local(sensor.ground(lines, pixels, height))
+    return float(max(np.ptp(east), np.ptp(north)))
+
+
+def _recorded(
+    one: ImagedLine,
+    scene: PushbroomScene,
+    window: Window,
+    looks: LookMap,
+    oversampling: int,
+    seed: np.random.SeedSequence,
+) -> LineImage:
+    done = render_patch(one.sensor, one.optics, scene, window, oversampling, looks)
+    frame = one.optics.ccd.expose(done.photons[None], window.first_pixel, one.pattern, 1, seed)[0, 0]
+    line, pixel = window.middle
+    height = float(looks.ground(np.array([line]), np.array([pixel]))[2][0, 0])
+    points = one.sensor.ground(line + np.array([-0.5, 0.5, 0.0, 0.0]), pixel + np.array([0.0, 0.0, -0.5, 0.5]), height)
+    sample = float(np.linalg.norm(points[3] - points[2])), float(np.linalg.norm(points[1] - points[0]))
+    half = np.array([0.5, 0.0])
+    along, across = one.optics.transfer(half, half[::-1], done.motion)
+    return LineImage(
+        frame,
+        window,
+        one.sensor,
+        one.measured,
+        done.motion,
+        sample,
+        (float(along), float(across)),
+        int(one.optics.ccd.detector.saturated(frame[None]).pixels),
+        done.error,
+    )
