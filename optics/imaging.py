@@ -12,6 +12,7 @@ with both Jacobians by forward-mode AD through the trace. Paths count from the i
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -69,6 +70,59 @@ def aim_collimated(
     return fan.at(q)[0], axes[:, 0]
 
 
+@dataclass(frozen=True, eq=False)
+class ImagingRays:
+    """Rays of collimated beams at the detector of B systems, N nodes of the stop each.
+
+    Attributes:
+        position, direction: in the detector's frame, (B, N, 3), metres and unit.
+        path: optical path from the incoming wavefront, (B, N), metres.
+        amplitude: a du dv of the module's formula, (B, N); 0 where another aperture stops the ray.
+        launched: points of the incoming wavefront, world, (B, N, 3), metres.
+        launch_area: |dp/ds| ds, area of the wavefront that belongs to each node, (B, N), m^2.
+        axes: of the wavefront, world, (B, 2, 3).
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    amplitude: np.ndarray
+    launched: np.ndarray
+    launch_area: np.ndarray
+    axes: np.ndarray
+
+
+def imaging_rays(
+    backend: Backend,
+    systems: SystemBatch,
+    to_stop: SystemBatch,
+    direction: np.ndarray,
+    launch: np.ndarray,
+    stop: Circle,
+    nodes: PupilNodes,
+    first: np.ndarray | None = None,
+) -> ImagingRays:
+    """Trace the beams of ``imaging_field``; arguments and exceptions as there."""
+    target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
+    launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
+    count = len(launched)
+    heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], launched.shape)
+    stop_index = len(to_stop.structure) - 1
+    # every ray twice, once for each axis of the wavefront along which its launch point is moved
+    twice, heading = (np.repeat(array, 2, axis=1) for array in (launched, heading))
+    moves = np.broadcast_to(axes[:, None], (*launched.shape[:2], 2, 3)).reshape(twice.shape)
+    out = push_forward(backend, systems, twice, heading, moves, keep=(stop_index,))
+    hit, turn = (
+        np.swapaxes(step[..., :2].reshape(*launched.shape[:2], 2, 2), -1, -2)
+        for step in (out.hits[stop_index], out.direction)
+    )
+    place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
+    require_some(valid, "the imaging path")
+    launch_area = stop.radius**2 * nodes.weight / np.abs(np.linalg.det(hit))
+    amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
+    return ImagingRays(place, leaving, path, amplitude, launched, launch_area, axes)
+
+
 def imaging_field(
     backend: Backend,
     systems: SystemBatch,
@@ -105,26 +159,12 @@ def imaging_field(
         AimError: the beam does not reach the stop.
         BeamMissedError: no ray reaches the detector.
     """
-    target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
-    launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
-    count = len(launched)
-    heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], launched.shape)
-    stop_index = len(to_stop.structure) - 1
-    # every ray twice, once for each axis of the wavefront along which its launch point is moved
-    twice, heading = (np.repeat(array, 2, axis=1) for array in (launched, heading))
-    moves = np.broadcast_to(axes[:, None], (*launched.shape[:2], 2, 3)).reshape(twice.shape)
-    out = push_forward(backend, systems, twice, heading, moves, keep=(stop_index,))
-    hit, turn = (
-        np.swapaxes(step[..., :2].reshape(*launched.shape[:2], 2, 2), -1, -2)
-        for step in (out.hits[stop_index], out.direction)
-    )
-    place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
-    require_some(valid, "the imaging path")
-    launch_area = stop.radius**2 * nodes.weight / np.abs(np.linalg.det(hit))
-    amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
-    centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (count, 3))[:, None]
-    phase = eikonal(place, leaving, path, centre)
+    rays = imaging_rays(backend, systems, to_stop, direction, launch, stop, nodes, first)
+    centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]
+    leaving = rays.direction
+    phase = eikonal(rays.position, leaving, rays.path, centre)
     if incoming is not None:
-        middle = np.einsum("bn,bnx->bx", launch_area, launched) / np.sum(launch_area, axis=-1, keepdims=True)
-        phase = phase + incoming(np.einsum("bnx,bkx->bnk", launched - middle[:, None], axes))
-    return PupilField(leaving[..., 0], leaving[..., 1], phase - phase[:, :1], amplitude, wavelength)
+        area, launched = rays.launch_area, rays.launched
+        middle = np.einsum("bn,bnx->bx", area, launched) / np.sum(area, axis=-1, keepdims=True)
+        phase = phase + incoming(np.einsum("bnx,bkx->bnk", launched - middle[:, None], rays.axes))
+    return PupilField(leaving[..., 0], leaving[..., 1], phase - phase[:, :1], rays.amplitude, wavelength)

@@ -22,10 +22,10 @@ _CLOSE = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class PupilEdge:
-    """Smooth convex edge that is nearly the unit circle.
+    """Smooth convex edge that is nearly the unit circle; or S such edges, one for each of S shifts.
 
     Attributes:
-        harmonics: c_-H .. c_H, complex, (2H + 1,), with c_1 = 1 and c_0 = c_-1 = 0.
+        harmonics: c_-H .. c_H, complex, (2H + 1,) or (2H + 1, S), with c_1 = 1 and c_0 = c_-1 = 0.
 
     Raises:
         ValueError: the edge is too far from the unit circle.
@@ -35,17 +35,20 @@ class PupilEdge:
 
     def __post_init__(self) -> None:
         last = len(self.harmonics) // 2
-        bend = float(np.sum(np.arange(-last, last + 1) ** 2 * np.abs(self.harmonics)) - 1.0)
+        bend = float(np.max(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics)) - 1.0)
         if bend > WORST_BEND:
             raise ValueError(f"the pupil's edge is too far from an ellipse: sum n^2 |c_n| = {bend:.2g} > {WORST_BEND}")
 
     def boundary(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Edge points B and dB/da at angles a of the stop's rim, complex, of the angles' shape."""
+        """Edge points B and dB/da at angles a of the stop's rim, complex, of the angles' shape; of S edges (S, ...)."""
         last = len(self.harmonics) // 2
         turn = np.exp(1j * angle)
-        point, slope, power = self.harmonics[last] + 0.0 * turn, 0.0 * turn, turn
+        own = self.harmonics
+        if own.ndim > 1:
+            own = own.reshape(*own.shape, *(1,) * (turn.ndim - 1))
+        point, slope, power = own[last] + 0.0 * turn, 0.0 * turn, turn
         for n in range(1, last + 1):
-            plus, minus = self.harmonics[last + n] * power, self.harmonics[last - n] * np.conj(power)
+            plus, minus = own[last + n] * power, own[last - n] * np.conj(power)
             point += plus + minus
             slope += 1j * n * (plus - minus)
             power = power * turn

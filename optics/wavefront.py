@@ -43,14 +43,31 @@ def path_difference(
     Returns:
         (..., N) metres.
     """
-    origin = position[..., chief : chief + 1, :]
+    to_sphere = path_to_sphere(position, direction, path, position[..., chief : chief + 1, :], radius)
+    return np.asarray(to_sphere[..., chief : chief + 1] - to_sphere)
+
+
+def path_to_sphere(
+    position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray, radius: float = np.inf
+) -> np.ndarray:
+    """Optical path of each ray to the sphere of a radius about ``origin``, plus that radius.
+
+    Args:
+        position: rays near the image, (..., N, 3), metres.
+        direction: unit directions there.
+        path: optical paths to ``position``, (..., N).
+        origin: the image point, broadcastable to (..., 1, 3).
+        radius: as for ``path_difference``; for an infinite one this is the ``eikonal``.
+
+    Returns:
+        (..., N) metres.
+    """
     offset = position - origin
     along = np.sum(direction * offset, axis=-1)
     # path back to the sphere minus the radius, written so that nothing cancels and an infinite radius is allowed
     bend = along**2 - np.sum(offset**2, axis=-1)
     back = along if np.isinf(radius) else along + bend / (radius + np.sign(radius) * np.sqrt(radius**2 + bend))
-    to_sphere = path - back
-    return np.asarray(to_sphere[..., chief : chief + 1] - to_sphere)
+    return np.asarray(path - back)
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,6 +133,7 @@ class RenderSpec(Spec):
         images: which images: the monitor's spots, which are always among them, and test targets on the line CCDs.
         targets: how the test targets are turned and exposed, None for the defaults.
         stray: whether ghosts and stray light are path-traced and added: true, or the number of paths.
+        quality: whether wavefront errors, defocus and MTF on the line CCDs are worked out.
         frames: number of frames, None for as many as the instrument's monitor takes.
         seed: of every random number in the job.
     """
@@ -142,6 +143,7 @@ class RenderSpec(Spec):
     )
     targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
+    quality: Annotated[bool, Field(strict=True)] = False
     frames: Frames | None = None
     seed: Seed = 1
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from scenes.camera import CameraSpec
+from scenes.camera_design_spec import CameraDesignSpec
 from scenes.collimator import CameraUnderTestSpec
 from scenes.detector import DetectorSpec
 from scenes.distortion_test import DistortionTestSpec
@@ -131,8 +132,8 @@ def load_orbit_test(model: type[SpecType], name_or_path: str | Path) -> SpecType
     return _load(model, ORBIT, name_or_path, None)
 
 
-def find_camera(test: CameraUnderTestSpec) -> Path:
-    """The file of the camera under test. Raises InputError if there is none."""
+def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
+    """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
     return _find(CAMERAS, test.camera, test, ("camera",))
 
 

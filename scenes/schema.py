@@ -15,6 +15,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 
 from scenes.camera import CameraSpec
+from scenes.camera_design_spec import CameraDesignSpec
 from scenes.detector import DetectorSpec
 from scenes.distortion_test import DistortionTestSpec
 from scenes.dividing_error import TurntableTestSpec
@@ -24,7 +25,10 @@ from scenes.instrument import InstrumentSpec
 from scenes.job import JobSpec
 from scenes.orbit_angle import OrbitAngleSpec
 from scenes.orbit_calibration import OrbitCalibrationSpec
+from scenes.orbit_monitor import OrbitMonitorSpec
+from scenes.orbit_simulate import OrbitSimulateSpec
 from scenes.spec import Spec
+from scenes.study import StudySpec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.turntable import PrincipleExperimentSpec
 
@@ -32,6 +36,7 @@ MODELS: dict[str, type[Spec]] = {
     "job": JobSpec,
     "instrument": InstrumentSpec,
     "camera": CameraSpec,
+    "camera_design": CameraDesignSpec,
     "detector": DetectorSpec,
     "error_budget": ErrorBudgetSpec,
     "principle_experiment": PrincipleExperimentSpec,
@@ -40,7 +45,10 @@ MODELS: dict[str, type[Spec]] = {
     "turntable_test": TurntableTestSpec,
     "orbit_angle": OrbitAngleSpec,
     "orbit_calibration": OrbitCalibrationSpec,
+    "orbit_simulate": OrbitSimulateSpec,
+    "orbit_monitor": OrbitMonitorSpec,
     "three_line_camera": ThreeLineCameraSpec,
+    "study": StudySpec,
 }
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")

@@ -58,7 +58,7 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
         names = _fields(model, key)
         problem, allowed = "not a mapping", f"a mapping with keys {names_text(names)}" if names else "a mapping"
     elif kind == "literal_error":
-        names = list(typing.get_args(_annotation_at(model, key)))
+        names = list(typing.get_args(annotation_at(model, key)))
         problem, allowed = "not one of the choices", names_text(names)
         suggestion = nearest(str(value), [str(name) for name in names])
     elif of_key:
@@ -95,7 +95,7 @@ def _limit(kind: str, context: dict[str, Any]) -> str:
 
 def _fields(model: type[Spec], key: KeyPath) -> list[str]:
     """The keys that the mapping at `key` may have, empty if they are free or it is no mapping."""
-    annotation = _annotation_at(model, key)
+    annotation = annotation_at(model, key)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return list(annotation.model_fields)
     return [name for item in _field_metadata(model, key) if isinstance(item, Terms) for name in item.of]
@@ -111,13 +111,13 @@ def _example(model: type[Spec], key: KeyPath) -> str | None:
 def _field_metadata(model: type[Spec], key: KeyPath) -> list[Any]:
     if not key:
         return []
-    owner = _annotation_at(model, key[:-1])
+    owner = annotation_at(model, key[:-1])
     if isinstance(owner, type) and issubclass(owner, BaseModel) and key[-1] in owner.model_fields:
         return owner.model_fields[str(key[-1])].metadata
     return []
 
 
-def _annotation_at(model: type[Spec], key: KeyPath) -> Any:
+def annotation_at(model: type[Spec], key: KeyPath) -> Any:
     """The type that a model declares for the value at `key`, without its annotations; None if `key` leads nowhere."""
     annotation: Any = model
     for part in key:

@@ -126,6 +126,27 @@ def format_quantity(value: float, kind: Kind) -> str:
     return min(choices, key=lambda choice: choice[:2])[2] if choices else f"{value!r} {kind.si or 'dimensionless'}"
 
 
+def split_quantity(text: object) -> tuple[float, str] | None:
+    """Number and unit of a quantity, without asking what it measures; None for anything that is not a quantity."""
+    match = _QUANTITY.fullmatch(text.strip()) if isinstance(text, str) and len(text) <= LONGEST_TEXT else None
+    if match is None or _look_up(match[2] or match[3]) is None:
+        return None
+    return float(match[1]), match[2] or match[3]
+
+
+def unit_ratio(unit: str, other: str) -> float:
+    """What a number in ``unit`` is multiplied by to be one in ``other``; degrees Celsius are differences here.
+
+    Raises:
+        Problem: the two units measure different things, or one is not known.
+    """
+    one, two = _look_up(unit), _look_up(other)
+    if one is None or two is None or one[1] != two[1]:
+        raise Problem(f"{unit} and {other} do not measure the same", unit, f"the unit {other}, or a multiple of it")
+    with localcontext(prec=50):
+        return float(one[0] / two[0])
+
+
 def _shortest_number(value: float, unit: str, kind: Kind) -> str | None:
     """The shortest number that, in this unit, reads back to `value`; None if there is none of 17 digits."""
     with localcontext(prec=50):

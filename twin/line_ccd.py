@@ -30,6 +30,22 @@ def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * (first + last) + 0.5 * (last - first) * node, 0.5 * weight
 
 
+def band_factors(band: BandSpec, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
+    """What a line CCD does to an image, at frequencies along the line (fx) and along the track (fy), cycles/m.
+
+    Returns:
+        ``pixel``: its square area; ``diffusion``: charge that spreads to neighbours; ``tdi_step``: the image moves on
+        while the charge waits for its next step; ``tdi_rate``: image and charge drift apart over the stages.
+    """
+    p, tdi = band.pitch, band.tdi
+    return {
+        "pixel": np.sinc(p * fx) * np.sinc(p * fy),
+        "diffusion": np.exp(-2.0 * np.pi**2 * band.diffusion**2 * (fx**2 + fy**2)),
+        "tdi_step": np.sinc(tdi.open_share * p / tdi.phases * fy),
+        "tdi_rate": np.sinc(tdi.stages * p * tdi.rate_error * fy),
+    }
+
+
 @dataclass(frozen=True)
 class LineCcd:
     """One band's line CCD. Images have columns along the line (+Y') and rows along the track (+X').
@@ -51,19 +67,8 @@ class LineCcd:
         return cls(band, EmvaDetector.from_sheet(sheet))
 
     def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
-        """Each effect's transfer at frequencies along the line (fx) and along the track (fy), cycles/m.
-
-        Returns:
-            ``pixel``: its square area; ``diffusion``: charge that spreads to neighbours; ``tdi_step``: the image moves
-            on while the charge waits for its next step; ``tdi_rate``: image and charge drift apart over the stages.
-        """
-        p, tdi = self.band.pitch, self.band.tdi
-        return {
-            "pixel": np.sinc(p * fx) * np.sinc(p * fy),
-            "diffusion": np.exp(-2.0 * np.pi**2 * self.band.diffusion**2 * (fx**2 + fy**2)),
-            "tdi_step": np.sinc(tdi.open_share * p / tdi.phases * fy),
-            "tdi_rate": np.sinc(tdi.stages * p * tdi.rate_error * fy),
-        }
+        """Each effect's transfer, see ``band_factors``."""
+        return band_factors(self.band, fx, fy)
 
     def transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Product of all factors."""

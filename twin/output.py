@@ -11,7 +11,7 @@ import xarray as xr
 from twin.course import CourseRun
 from twin.image_file import SPOT_STRETCH, preview_png, tiff
 from twin.report import write_report
-from twin.results import RenderRun
+from twin.results import RenderRun, quality_dict
 from twin.run_folder import MANIFEST, RunFolder
 from twin.scene_file import write_scene
 from twin.summary_figure import write_summary
@@ -49,6 +49,8 @@ def write_run(
         _write_course(run, run.course, folder)
     if run.targets is not None:
         _write_targets(run.targets, folder)
+    if run.quality is not None:
+        folder.write_json("quality.json", quality_dict(run.quality))
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))

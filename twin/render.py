@@ -115,6 +115,9 @@ def main(
     With `render: {stray: true}` ghosts and scattered light are path-traced and added to the images; stray.json lists
     them.
 
+    With `render: {quality: true}` wavefront errors, defocus and MTF on the line CCDs are worked out before and after;
+    quality.json has them.
+
     With --picture the run folder also gets picture.png (the instrument), picture_prisms.png and
     picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba cannot, the rest of the
     run is kept and the exit code is 1.

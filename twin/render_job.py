@@ -20,6 +20,7 @@ from scenes.resolved import ResolvedJob
 from twin.course import course_states, run_course, too_large
 from twin.crosstalk import crosstalk
 from twin.experiment import MonitorExperiment
+from twin.image_quality import image_quality
 from twin.path_tracing.stray import NominalPathLost
 from twin.results import RenderRun, StrayPair
 from twin.stray_light import stray_light
@@ -121,6 +122,8 @@ def render_job(
     progress(STAGES[7])
     tables = crosstalk(experiment, _covariances(recovery))
     targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
+    instrument = experiment.instrument
+    quality = image_quality(instrument, backend, [{}, state]) if resolved.job.render.quality else None
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -139,10 +142,12 @@ def render_job(
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(targets.warnings if targets is not None else ()),
+            *(quality.warnings if quality is not None else ()),
         ),
         course=series,
         stray=stray,
         targets=targets,
+        quality=quality,
     )
 
 

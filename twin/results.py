@@ -16,6 +16,7 @@ from scenes.resolved import ResolvedJob
 from twin.course import CourseRun
 from twin.crosstalk import CameraCrosstalk
 from twin.experiment import MonitorExperiment
+from twin.image_quality import ImageQuality
 from twin.stray_light import StrayLight
 from twin.target_result import TargetRun
 from twin.truth import Truth
@@ -53,6 +54,7 @@ class RenderRun:
         course: all times of the job's course, None if it has none; the rest is then about the time it shows.
         stray: ghosts and stray light, None if not asked for.
         targets: test targets on the line CCDs, None if not asked for.
+        quality: image quality of the nominal and of the perturbed state, None if not asked for.
     """
 
     resolved: ResolvedJob
@@ -71,6 +73,7 @@ class RenderRun:
     course: CourseRun | None = None
     stray: StrayPair | None = None
     targets: TargetRun | None = None
+    quality: ImageQuality | None = None
 
     def true_parameters(self, camera: str) -> dict[str, float]:
         """True change of a camera in the units of the keys."""
@@ -116,6 +119,20 @@ class RenderRun:
         out["centroid"] = self.resolved.job.analysis.centroid
         out["frames"] = self.frames
         return out
+
+
+def quality_dict(quality: ImageQuality) -> dict[str, Any]:
+    """Contents of quality.json: ``cameras`` of the perturbed state, and ``before`` those of the nominal one."""
+    before, after = quality.to_dicts()
+    light = {
+        name: {
+            "nyquist_per_mm": 1e-3 * camera.nyquist,
+            "spectrum_nm": [1e9 * wavelength for wavelength in camera.wavelengths],
+        }
+        for name, camera in quality.cameras.items()
+    }
+    about = {"wavelength_nm": 1e9 * quality.wavelength, "fields": list(quality.fields), "mtf": light}
+    return {**after, "before": before, **about}
 
 
 def _first(arrays: Mapping[str, Any]) -> dict[str, float]:

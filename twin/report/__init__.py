@@ -9,7 +9,15 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from twin.light_paths import trace_light_paths
-from twin.report import content, course_content, crosstalk_content, labels, stray_content, target_content
+from twin.report import (
+    content,
+    course_content,
+    crosstalk_content,
+    labels,
+    quality_content,
+    stray_content,
+    target_content,
+)
 from twin.report.course_figure import parameters_svg, temperatures_svg
 from twin.report.light_path_figure import footprints_svg, side_view_svg
 from twin.report.numbers import FAR
@@ -61,6 +69,7 @@ def render_report(run: RenderRun) -> str:
         course=course_content.course_content(run),
         stray=stray_content.stray_content(run),
         targets=target_content.target_content(run),
+        quality=quality_content.quality_content(run),
         tables=tables,
         summary=content.summary(tables),
         spots=content.spots(run),
