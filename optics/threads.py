@@ -26,6 +26,15 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
+LIMIT = "TWIN_THREADS"
+"""Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
+
+
 def cores() -> int:
-    """Number of cores that this process may use."""
+    """Number of cores that this process may use: those that it is given, or fewer if the variable LIMIT says so."""
+    named = os.environ.get(LIMIT, "")
+    return min(_given(), int(named)) if named.isdecimal() and int(named) > 0 else _given()
+
+
+def _given() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

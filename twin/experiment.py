@@ -96,8 +96,8 @@ class MonitorExperiment:
         return {name: every[name][:, 4 * k : 4 * k + 4] for k, name in enumerate(names)}
 
     @cached_property
-    def calibration(self) -> MonitorCalibration:
-        """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
+    def cameras(self) -> dict[str, CameraCalibration]:
+        """What is calibrated of every camera without an image: geometry and Jacobians of the nominal instrument."""
         families = {name: line_family(name) for name in self.instrument.cameras}
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
@@ -109,8 +109,13 @@ class MonitorExperiment:
                 parameter_jacobian=self._truth_by_family[name],
                 motions=tuple(motion.label for motion in family),
             )
+        return cameras
+
+    @cached_property
+    def calibration(self) -> MonitorCalibration:
+        """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
         template = SpotTemplate.stack([self._template(image) for image in self.wide_photons])
-        return MonitorCalibration(cameras, template, self.detector.noise_model(self.exposure))
+        return MonitorCalibration(self.cameras, template, self.detector.noise_model(self.exposure))
 
     def geometry(self, camera: str) -> MonitorGeometry:
         """Calibrated numbers for the formulas: principal distance, plate scale across the line, distortion, L, pixel.
@@ -162,6 +167,9 @@ class MonitorExperiment:
             stream = _stream(seed, 2, first + s)
             out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, stream, threads=1)
 
+        if len(photons) == 1:
+            expose(0)
+            return out
         # one thread per state: threads then wait for each other once per batch and not once per state
         with ThreadPoolExecutor(min(cores(), 8)) as pool:
             list(pool.map(expose, range(len(photons))))

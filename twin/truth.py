@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from optics.assembly import points_to_world
 from optics.backend import Backend
 from optics.line_of_sight import LineChange, chief_directions, line_change
 from optics.system import assemble
-from optics.tree import State
+from optics.tree import PlacedBodies, State
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from twin.motions import ElementaryMotion
@@ -43,40 +43,63 @@ def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State
     Raises:
         AimError, BeamMissedError: a perturbation moves the image off the mirrors.
     """
-    every: list[State] = [{}, *states]
+    return truth_of_sight(instrument, trace_sight(instrument, backend, [{}, *states]))
+
+
+def line_points(instrument: Instrument, camera: str) -> np.ndarray:
+    """Where along camera Y the points of the line CCD lie, (LINE_POINTS,), metres."""
+    line = instrument.cameras[camera].spec.line
+    half = 0.5 * line.pixels * line.pitch
+    return np.linspace(-half, half, LINE_POINTS)
+
+
+def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
+    """The points of the line CCD in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
+    position = line_points(instrument, camera)
+    line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
+    return points_to_world(placed, f"{BASE}/{camera}/focal_plane/line", line)
+
+
+def trace_sight(instrument: Instrument, backend: Backend, states: Sequence[State]) -> np.ndarray:
+    """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
+
+    Raises:
+        AimError, BeamMissedError: a perturbation moves the image off the mirrors.
+    """
     assembly = instrument.assembly
-    placed = assembly.place(every)
+    placed = assembly.place(states)
     names = list(instrument.cameras)
-    points, guesses, positions = [], [], []
-    for name in names:
-        model = instrument.cameras[name]
-        half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
-        position = np.linspace(-half, half, LINE_POINTS)
-        body = f"{BASE}/{name}/focal_plane/line"
-        line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
-        points.append(points_to_world(placed, body, line))
-        guesses.append(instrument.toward_optics(placed, name))
-        positions.append(position)
+    points = [line_in_world(instrument, name, placed) for name in names]
+    guesses = [instrument.toward_optics(placed, name) for name in names]
     sight = chief_directions(
         backend,
-        assemble(assembly, [f"{name}/image_to_stop" for name in names], every, placed=placed),
-        assemble(assembly, [f"{name}/image_to_object" for name in names], every, placed=placed),
+        assemble(assembly, [f"{name}/image_to_stop" for name in names], states, placed=placed),
+        assemble(assembly, [f"{name}/image_to_object" for name in names], states, placed=placed),
         np.concatenate(points),
         np.concatenate(guesses)[:, None],
         np.array([0.0, 1.0, 0.0]),
     )
-    sight = sight.reshape(len(names), len(every), LINE_POINTS, 3)
+    return sight.reshape(len(names), len(states), LINE_POINTS, 3)
+
+
+def truth_of_sight(instrument: Instrument, sight: np.ndarray, axes: Mapping[str, np.ndarray] | None = None) -> Truth:
+    """What directions of sight (cameras, 1 + S, LINE_POINTS, 3) say of S states; entry 0 is the nominal one.
+
+    ``axes``: ``instrument.camera_axes`` of every camera, where they are known already.
+    """
+    names = list(instrument.cameras)
     cameras: dict[str, LineChange] = {}
     principal: dict[str, float] = {}
     for i, name in enumerate(names):
-        change = line_change(sight[i], positions[i], instrument.camera_axes(name))
+        own = instrument.camera_axes(name) if axes is None else axes[name]
+        change = line_change(sight[i], line_points(instrument, name), own)
         cameras[name] = change
         principal[name] = change.nominal_distance
-    axes = sight[:, :, LINE_POINTS // 2]
+    lines = sight[:, :, LINE_POINTS // 2]
     if len(names) == 2:
-        angle = np.arctan2(np.linalg.norm(np.cross(axes[0], axes[1]), axis=-1), np.sum(axes[0] * axes[1], axis=-1))
+        angle = np.arctan2(np.linalg.norm(np.cross(lines[0], lines[1]), axis=-1), np.sum(lines[0] * lines[1], axis=-1))
     else:
-        angle = np.full(len(every), np.nan)
+        angle = np.full(sight.shape[1], np.nan)
     return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0])
 
 

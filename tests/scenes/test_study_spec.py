@@ -1,0 +1,124 @@
+"""Files of design trade studies: what they may say, and how they are told that they may not."""
+
+import re
+
+import pytest
+
+from scenes.errors import InputError
+from scenes.load import EXAMPLES
+from scenes.study import StudySpec, unit_of
+from scenes.translate import validate
+from scenes.units import split_quantity, unit_ratio
+from scenes.yaml_file import dump_yaml, parse_yaml, read_yaml
+
+TEXT = """name: study
+base: {command: render, file: perturb}
+factors:
+  a: {key: [job, x], range: [0 um, 0.003 mm], count: 3}
+  b: {keys: [[y, 1], [z]], values: [9, 16]}
+responses:
+  r: {key: [truth, d_f_um], sigma: [truth, d_f_um_sigma]}
+  s: {key: [truth, share], unit: percent}
+report: {scatter: [[a, r]], thresholds: {good: {response: r, at_most: 2}}}
+"""
+
+
+def read(text: str) -> StudySpec:
+    return validate(StudySpec, parse_yaml(text, "study.yaml"))
+
+
+def test_what_it_says() -> None:
+    study = read(TEXT)
+    assert study.factors["a"].unit == "um"
+    assert study.factors["a"].numbers().values == (0.0, 3.0)
+    assert study.factors["a"].places == (("job", "x"),)
+    assert study.factors["b"].places == (("y", 1), ("z",))
+    assert study.factors["b"].numbers().whole
+    assert study.responses["r"].units == "um"
+    assert study.responses["s"].units == "percent"
+    assert study.limits.runs == 20_000
+    assert study.limits.bytes == 4e9
+    assert study.noise == "own"
+
+
+def test_what_it_writes_reads_back() -> None:
+    study = read(TEXT)
+    assert read(dump_yaml(study.plain())) == study
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("study_*.yaml")), ids=lambda file: file.stem)
+def test_the_examples_are_valid(file) -> None:
+    study = validate(StudySpec, read_yaml(file))
+    assert study.name == file.stem
+    assert study.description
+
+
+CHANGES = [
+    ("range: [0 um, 0.003 mm], count: 3", "values: []", "factors.a.values", "empty"),
+    ("range: [0 um, 0.003 mm], count: 3", "count: 3", "factors.a", "one of values, range"),
+    ("range: [0 um, 0.003 mm], count: 3", "range: [0 um, 3 um]", "factors.a", "count: 5"),
+    ("range: [0 um, 0.003 mm], count: 3", "range: [0 um, 3], count: 3", "factors.a.range", "not a quantity among"),
+    ("range: [0 um, 0.003 mm], count: 3", "range: [0 um, 3 deg], count: 3", "factors.a.range", "do not measure"),
+    ("range: [0 um, 0.003 mm], count: 3", "range: [3 um, 0 um], count: 3", "factors.a.range", "range is empty"),
+    ("range: [0 um, 0.003 mm], count: 3", "uniform: [0 um, 3 um]", "factors.a.uniform", "can be counted"),
+    ("key: [job, x]", "key: [z]", "factors.b.keys[1]", "factor a already"),
+    ("keys: [[y, 1], [z]]", "keys: [[y, 1], [z]], key: [q]", "factors.b", "both"),
+    ("name: study", "name: study\ndesign: {kind: sobol}", "design", "runs: 1000"),
+    ("name: study", "name: study\ndesign: {runs: 10}", "design.runs", "grid"),
+    ("name: study", "name: study\ndesign: {kind: sobol, runs: 9}", "factors.a.count", "draws"),
+    ("command: render", "command: lab fokus", "base.command", "'lab focus'"),
+    ("  s: {", "  r_sigma: {", "responses", "'r_sigma' would name two columns"),
+    ("[[a, r]]", "[[a, q]]", "report.scatter[0][1]", "no such factor or response"),
+    ("at_most: 2", "", "report.thresholds.good", "asks nothing"),
+    (
+        "[truth, d_f_um_sigma]}",
+        "[truth, d_f_um_sigma], minus: [truth, d_alpha_arcsec]}",
+        "responses.r.minus",
+        "arcsec and um",
+    ),
+    ("sigma: [truth, d_f_um_sigma]", "sigma: [truth, d_f_mm_sigma]", "responses.r.sigma", "mm and um"),
+    ("key: [job, x], ", "", "factors.a", "changes something"),
+    ("key: [job, x], ", "scales: [{key: [job, q]}], ", "factors.a.range", "ratio"),
+    ("keys: [[y, 1], [z]], values: [9, 16]", "scales: [{key: [z]}], values: [a, b]", "factors.b.values", "not numbers"),
+    (
+        "keys: [[y, 1], [z]]",
+        "keys: [[y, 1], [z]], scales: [{key: [z], power: 2}]",
+        "factors.b.scales[0].key",
+        "sets this value itself",
+    ),
+    ("name: study", "name: study\nlimits: {memory: 4 stones}", "limits.memory", "MB"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "key", "words"), CHANGES)
+def test_what_it_refuses(old: str, new: str, key: str, words: str) -> None:
+    assert TEXT.count(old) == 1
+    with pytest.raises(InputError) as refused:
+        read(TEXT.replace(old, new))
+    text = str(refused.value)
+    assert words in text
+    assert re.search(rf"study.yaml:\d+: {re.escape(key)}: ", text), text
+
+
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [
+        (("focus", "fields", 0, "error_um"), "um"),
+        (("recovered", "change_arcsec_sigma"), "arcsec"),
+        (("focus", "shims_um", 2), "um"),
+        (("monitor", "gradient_K_per_m"), "K/m"),
+        (("turntable", "rejected"), ""),
+        (("x", "m"), ""),
+    ],
+)
+def test_units_of_results(key, unit) -> None:
+    assert unit_of(key) == unit
+
+
+def test_quantities_are_split() -> None:
+    assert split_quantity("3 um") == (3.0, "um")
+    assert split_quantity("-1.5e-3arcsec") == (-1.5e-3, "arcsec")
+    assert split_quantity("gf7") is None
+    assert split_quantity("3 bananas") is None
+    assert split_quantity(3) is None
+    assert unit_ratio("mm", "um") == 1000.0

@@ -1,0 +1,279 @@
+"""`python -m twin.study` as a user runs it: the same numbers however it is run, and what it refuses."""
+
+import csv
+import hashlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import twin.study.__main__ as command
+from tests.twin.commands import files, invoke
+from tests.twin.study_bench import ROOT, children, chunks, start, wait_for, write_study
+from twin.study.chunk_store import ChunkStore
+from twin.study.cluster import local_workers
+from twin.study.engine import Engine
+from twin.study.plan import Plan
+from twin.study.render_base import BLOCK
+from twin.study.setup import resolve_study
+
+run = partial(invoke, command.app)
+
+
+@pytest.fixture(scope="module")
+def workers():
+    """Two worker processes for all tests of this file."""
+    with local_workers(2) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A study of 110 runs, one of which fails, done by the command with one worker: folder, file, stdout."""
+    folder = tmp_path_factory.mktemp("study")
+    (folder / "table.csv").parent.mkdir(exist_ok=True)
+    rows = ["z,x", *(f"{0.01 * k} um,{k % 7} nm" for k in range(109)), "3 mm,0 nm"]
+    (folder / "table.csv").write_text("\n".join(rows) + "\n", "utf-8")
+    path = write_study(
+        folder,
+        ("normal: {mean: 0 um, sigma: 1 um}", "table: {file: table.csv, column: z}"),
+        ("uniform: [-1 um, 1 um]", "table: {file: table.csv, column: x}"),
+        ("design: {kind: monte_carlo, runs: 100, seed: 3}", "design: {seed: 3}"),
+    )
+    process = start(path, "--out", folder / "run", "--workers", 1, "--json")
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert errors == ""
+    return folder / "run", path, json.loads(out)
+
+
+def test_files(done) -> None:
+    folder, _, numbers = done
+    assert {"study.nc", "study.csv", "study.json", "config.yaml", "report.html", "manifest.json"} <= files(folder)
+    assert json.loads((folder / "study.json").read_text("utf-8")) == numbers
+    manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
+    for name, checksum in manifest["sha256"].items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == checksum
+    assert {"study.nc", "study.csv", "study.json", "report.html"} <= set(manifest["sha256"])
+
+
+def test_dataset(done) -> None:
+    folder, path, numbers = done
+    with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
+        assert dict(data.sizes) == {"run": 110}
+        assert data["m2z"].attrs["units"] == "um"
+        # the table's values, in the unit of the first of them
+        np.testing.assert_allclose(data["m2z"].values, [*(0.01 * k for k in range(109)), 3000.0], rtol=1e-12)
+        np.testing.assert_allclose(data["m2x"].values[:9], [0, 1, 2, 3, 4, 5, 6, 0, 1])
+        assert data["df"].attrs == {
+            "units": "um",
+            "role": "response",
+            "key": "recovered cameras forward model d_f_um",
+        }
+        assert data["failed"].values.tolist() == [0] * 109 + [1]
+        assert str(data["message"].values[-1])
+        assert not any(data["message"].values[:-1])
+        assert np.isnan(data["df"].values[-1])
+        off = (data["df"] - data["true_df"]).values[:-1] / data["df_sigma"].values[:-1]
+        # 109 errors in units of their sigma; 4.5 sigma is passed once in 1300 such sets
+        assert np.max(np.abs(off)) < 4.5
+        assert len(set(data["seed"].values.tolist())) == 110
+        assert data.attrs["seed"] == 3
+        assert "instrument" in data.attrs["study"]
+    assert numbers["runs"] == 110
+    assert numbers["failed"] == 1
+    assert numbers["responses"]["df"]["unit"] == "um"
+    with (folder / "study.csv").open(encoding="utf-8", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == 110
+    assert table[-1]["df [um]"] == ""
+    assert table[-1]["failed"] == "1"
+    assert path.exists()
+
+
+def test_a_block_that_loses_a_run_keeps_the_others(done) -> None:
+    """The last run moves a mirror by 3 mm; the runs of its block are there all the same."""
+    with xr.open_dataset(done[0] / "study.nc", engine="h5netcdf") as data:
+        assert np.all(np.isfinite(data["df"].values[4 * BLOCK : -1]))
+        assert len(data["df"].values[4 * BLOCK :]) == 10
+
+
+@pytest.mark.parametrize("chunk_blocks", [pytest.param(1, marks=pytest.mark.slow), 3])
+def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_path, chunk_blocks) -> None:
+    folder, _, _ = done
+    # from the config.yaml, which needs no other file
+    plan = Plan.of(resolve_study(folder / "config.yaml"))
+    store = ChunkStore(tmp_path, plan)
+    store.open()
+    Engine(plan, store, chunk_blocks=chunk_blocks).run(workers)
+    assert max(entry.blocks for entry in store.entries.values()) == chunk_blocks
+    result = store.result()
+    with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
+        np.testing.assert_array_equal(result.values[:, 0], data["df"].values)
+        np.testing.assert_array_equal(result.values[:, 1], data["true_df"].values)
+        np.testing.assert_array_equal(result.sigmas[:, 0], data["df_sigma"].values)
+
+
+def test_a_corrupt_chunk_is_computed_again(done) -> None:
+    """A damaged chunk, a half-written file and a torn line of the index; afterwards every byte is as it was."""
+    folder, path, _ = done
+    before = (folder / "study.nc").read_bytes()
+    chunk = sorted((folder / "chunks").glob("*.npz"))[1]
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    (folder / "chunks" / "00099.npz.partial").write_bytes(b"half")
+    with (folder / "chunks" / "index.txt").open("ab") as index:
+        index.write(b'0123456789abcdef {"file": "00')
+    result = run(path, "--out", folder, "--resume", "--workers", 1)
+    assert result.exit_code == 0, result.stderr
+    assert chunk.name in result.stderr
+    assert "corrupt" in result.stderr
+    assert "are there already" in result.stderr
+    assert chunk.with_name(f"{chunk.name}.corrupt").exists()
+    assert not list((folder / "chunks").glob("*.partial"))
+    assert (folder / "study.nc").read_bytes() == before
+
+
+def test_resume_of_a_finished_study_computes_nothing(done) -> None:
+    folder, path, _ = done
+    before = (folder / "study.nc").read_bytes()
+    begun = time.monotonic()
+    result = run(path, "--out", folder, "--resume", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["runs_computed"] == 0
+    assert (folder / "study.nc").read_bytes() == before
+    assert time.monotonic() - begun < 30.0
+
+
+def test_folders_that_are_not_ones_own(done, tmp_path) -> None:
+    folder, path, _ = done
+    before = {name: (folder / name).read_bytes() for name in files(folder)}
+    taken = run(path, "--out", folder)
+    assert taken.exit_code == 2
+    assert "--resume" in taken.stderr
+    assert "--force" in taken.stderr
+    other = path.with_name("other.yaml")
+    other.write_text(path.read_text("utf-8").replace("seed: 3", "seed: 4"), "utf-8")
+    result = run(other, "--out", folder, "--resume")
+    assert result.exit_code == 2
+    assert "another study" in result.stderr
+    assert {name: (folder / name).read_bytes() for name in files(folder)} == before
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear", "utf-8")
+    for option in ("--resume", "--force"):
+        result = run(path, "--out", tmp_path / "mine", option)
+        assert result.exit_code == 2
+        assert files(tmp_path / "mine") == {"letter.txt"}
+
+
+BAD = [
+    (("m2z: {key: [job, perturb, base/forward/M2, shift, 2]", "m2z: {key: [job, pertrub, base/forward/M2, shift, 2]"),
+     "factors.m2z.key[1]", ("'perturb'",)),
+    (("shift, 2]", "shift, 3]"), "factors.m2z.key[4]", ("0 to 2",)),
+    (("normal: {mean: 0 um, sigma: 1 um}", "values: []"), "factors.m2z.values", ("empty",)),
+    (("[-1 um, 1 um]", "[-1 um, 1 km]"), "factors.m2x.uniform", ("outside the limits", "100 mm")),
+    (("[-1 um, 1 um]", "[-1 arcsec, 1 arcsec]"), "factors.m2x.uniform", ("angle", "length")),
+    (("runs: 100", "runs: 20001"), "limits.runs", ("20001", "--yes")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "key", "words"), BAD, ids=lambda value: value if isinstance(value, str) else "")
+def test_bad_input_is_refused_at_its_line(tmp_path, change, key, words) -> None:
+    path = write_study(tmp_path / "in", change)
+    result = run(path, "--out", tmp_path / "run")
+    assert result.exit_code == 2
+    assert f"{path}:" in result.stderr, result.stderr
+    assert f": {key}:" in result.stderr, result.stderr
+    for word in words:
+        assert word in result.stderr, result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_what_only_the_pilot_finds(tmp_path) -> None:
+    """A response that the results do not have, and a node that the instrument does not; nothing is left behind."""
+    path = write_study(tmp_path / "a", ("truth, cameras, forward, d_f_um]", "truth, cameras, forward, d_f_mm]"))
+    result = run(path, "--out", tmp_path / "run", "--workers", 1)
+    assert result.exit_code == 2
+    assert "responses.true_df.key[3]" in result.stderr
+    assert "'d_f_um'" in result.stderr
+    assert "d_alpha_arcsec" in result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_scheduler_that_is_not_there(tmp_path) -> None:
+    path = write_study(tmp_path / "in")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    begun = time.monotonic()
+    result = run(path, "--out", tmp_path / "run", "--scheduler", f"tcp://127.0.0.1:{port}")
+    assert result.exit_code == 2
+    assert "cannot be reached" in result.stderr
+    assert time.monotonic() - begun < 20.0  # 5 s are waited; the rest is for a busy machine
+    assert not (tmp_path / "run").exists()
+    result = run(path, "--out", tmp_path / "run", "--scheduler", "nowhere")
+    assert result.exit_code == 2
+    assert "tcp://" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
+def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
+    """To the whole group of processes, as the terminal's Ctrl-C is, and to the command alone, as kill is."""
+    path = write_study(tmp_path / "in", ("runs: 100", "runs: 4000"))
+    process = start(path, "--out", tmp_path / "run", "--workers", 1)
+    try:
+        wait_for(lambda: chunks(tmp_path / "run") >= 1)
+        second = run(path, "--out", tmp_path / "run", "--resume")
+        assert second.exit_code == 2
+        assert "another command" in second.stderr
+        below = children(process.pid)
+        assert below
+        os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
+        _, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == code, errors
+    assert "--resume" in errors
+    assert "Traceback" not in errors, errors
+    assert chunks(tmp_path / "run") >= 1
+    assert not (tmp_path / "run" / "study.nc").exists()
+
+
+@pytest.mark.slow
+def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
+    """As a user sets it up by hand; the numbers are those of the local processes."""
+    folder, path, _ = done
+    program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    place = tmp_path / "scheduler.json"
+    quiet = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(
+        [*program, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)], **quiet
+    ) as scheduler:
+        wait_for(lambda: place.exists() and place.stat().st_size > 0)
+        address = json.loads(place.read_text("utf-8"))["address"]
+        program = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+        two = [
+            subprocess.Popen([*program, "--local-directory", str(tmp_path), "--name", f"w{k}"], **quiet)
+            for k in range(2)
+        ]
+        try:
+            result = run(path, "--out", tmp_path / "run", "--scheduler", address)
+            assert result.exit_code == 0, result.stderr
+            assert (tmp_path / "run" / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
+        finally:
+            for process in (*two, scheduler):
+                process.terminate()
+            for process in two:
+                process.wait(20)

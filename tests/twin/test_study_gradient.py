@@ -1,0 +1,201 @@
+"""The Jacobian of a study: AD against differences, against images, what is written, and what is refused."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from optics.frozen_map import FrozenMap
+from scenes.load import EXAMPLES
+from tests.twin.study_bench import write_study
+from twin.study.__main__ import app
+from twin.study.base_job import Run
+from twin.study.gradient import AD, TRACED, WHOLE, study_gradient
+from twin.study.setup import StudySetup, resolve_study
+
+AGREEMENT = 1e-6
+"""Differences extrapolated to the fifth power of the step leave 1e-8, rounding of the traces 1e-9 of an entry; entries
+are judged down to 1e-3 of the largest."""
+RUNNER = CliRunner()
+STUDY = """name: study
+base: {command: render, file: job.yaml}
+factors:
+  m2z: {key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 1 um}}
+  both: {keys: [[job, perturb, base/forward/M2, shift, 0], [job, perturb, base/backward/M2, shift, 0]],
+    uniform: [-2 um, 2 um]}
+  turn: {key: [job, perturb, base/forward/focal_plane, rotate, 2], uniform: [-10 arcsec, 10 arcsec]}
+  coma: {key: [job, perturb, base/forward/M1, figure, Z7], uniform: [-10 nm, 10 nm]}
+  warmth: {key: [job, perturb, base, temperature, change], uniform: [-1 K, 1 K]}
+  exposure: {key: [instrument, monitor, area_ccd, exposure], uniform: [7 ms, 8 ms]}
+design: {kind: monte_carlo, runs: 4, seed: 3}
+responses:
+  df: {key: [recovered, cameras, forward, model, d_f_um]}
+  error: {key: [recovered, cameras, forward, model, d_f_um], minus: [truth, cameras, forward, d_f_um]}
+  gamma: {key: [recovered, cameras, forward, paper_single, d_gamma_arcsec]}
+  angle: {key: [recovered, intersection_angle, derived, change_arcsec]}
+"""
+
+
+def without(setup: StudySetup, file: str) -> StudySetup:
+    """The study without responses from a file of the results."""
+    kept = {name: response for name, response in setup.study.responses.items() if response.key[0] != file}
+    return StudySetup(setup.study.model_copy(update={"responses": FrozenMap(kept)}), setup.tree)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return write_study(tmp_path_factory.mktemp("gradient"), text=STUDY)
+
+
+@pytest.fixture(scope="module")
+def written(small):
+    """The folder that the command makes of the small study, and what it prints."""
+    folder = small.parent / "out"
+    result = RUNNER.invoke(app, [str(small), "--gradient", "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    return folder, result.output
+
+
+@pytest.fixture(scope="module")
+def numbers(written):
+    return json.loads((written[0] / "gradient.json").read_text("utf-8"))
+
+
+def test_all_motions_of_the_alignment_study_agree_with_differences(backend):
+    setup = without(resolve_study(EXAMPLES / "study_alignment.yaml"), "quality")
+    found = study_gradient(setup, backend)
+    assert found.ad.shape[1] == len(setup.study.factors) >= 12
+    assert np.all(found.method == AD)
+    assert found.worst is not None
+    assert found.worst < AGREEMENT
+    # every factor moves some spot, or the agreement says nothing
+    assert np.all(np.abs(found.change[:8]).max(axis=0) > 1e-4)
+
+
+def test_motions_are_exact_and_all_else_is_marked(numbers):
+    method, ad = np.array(numbers["method"]), np.array(numbers["ad"], float)
+    names = numbers["factors"]
+    traced = list(range(len(numbers["responses"])))
+    moving = [names.index(name) for name in ("m2z", "both", "turn", "coma")]
+    still = [names.index(name) for name in ("warmth", "exposure")]
+    assert np.all(method[np.ix_(traced, moving)] == AD)
+    assert np.all(np.isfinite(ad[np.ix_(traced, moving)]))
+    assert np.all(method[np.ix_(traced, still)] == TRACED)
+    assert np.all(np.isnan(ad[np.ix_(traced, still)]))
+    assert numbers["worst_relative"] < AGREEMENT
+    assert numbers["units"][traced[0]][names.index("m2z")] == "px/um"
+
+
+def test_an_error_is_what_is_recovered_minus_what_is_true(numbers):
+    rows = {name: np.array(numbers["ad"][k], float) for k, name in enumerate(numbers["responses"])}
+    k = numbers["factors"].index("m2z")
+    # the model sees a despace of M2 nearly right, so that the error is small beside the change itself, and not zero
+    assert 1e-4 < abs(rows["error"][k] / rows["df"][k]) < 0.1
+
+
+def test_a_factor_of_two_places_moves_both_cameras(numbers):
+    k = numbers["factors"].index("both")
+    spots = np.array([row[k] for row in numbers["ad"][:8]])
+    assert np.abs(spots[:4]).max() > 0.01
+    assert np.abs(spots[4:]).max() > 0.01
+
+
+def test_what_needs_images_is_by_the_whole_job(small, backend):
+    setup = resolve_study(small)
+    spread = setup.study.responses["df"].model_copy(
+        update={"key": (*setup.study.responses["df"].key[:-1], "d_f_um_sigma")}
+    )
+    one = {"factors": FrozenMap(m2z=setup.study.factors["m2z"]), "responses": FrozenMap(spread=spread)}
+    found = study_gradient(StudySetup(setup.study.model_copy(update=one), setup.tree), backend)
+    assert found.method[:, 0].tolist() == [AD] * 8 + [WHOLE]
+    assert np.isnan(found.ad[8, 0])
+    assert np.isfinite(found.differences[8, 0])
+
+
+def test_images_say_the_same(small, backend, numbers):
+    """The whole job, images and noise included, through steps that move spots by some 0.5 px.
+
+    Runs share their noise, but frames of other spots draw other photons: with one frame a recovered angle has a sigma
+    of 0.035 arcsec, so that a slope of 2 arcsec per arcsec over 20 arcsec is good to 2.5e-3; tolerated are 5 of these,
+    one in 1e6.
+    """
+    setup = resolve_study(small)
+    key = ("job", "perturb", "base/forward/focal_plane", "rotate", 2)
+    ends = [Run(k, ((key, f"{amount!r} arcsec"),), None) for k, amount in enumerate((-10.0, 10.0))]
+    low, high = setup.job.evaluate(setup.tree, ends, backend)
+    at = [run["recovered"]["cameras"]["forward"]["paper_single"] for run in (low, high)]
+    sigma = np.hypot(*(one["d_gamma_arcsec_sigma"] for one in at)) / 20.0
+    exact = numbers["ad"][numbers["responses"].index("gamma")][numbers["factors"].index("turn")]
+    assert sigma < 5e-3
+    assert abs((at[1]["d_gamma_arcsec"] - at[0]["d_gamma_arcsec"]) / 20.0 - exact) < 5.0 * sigma
+    middle = np.array([run["recovered"]["spots"]["forward"]["left"]["after"]["row"] for run in (low, high)])
+    assert np.all(np.abs(middle - 23.5) < 10.0)
+
+
+def test_what_is_written(written, numbers):
+    folder, said = written
+    rows = list(csv.DictReader((folder / "gradient.csv").open(encoding="utf-8")))
+    assert len(rows) == len(numbers["responses"]) * len(numbers["factors"])
+    for row, value in zip(rows, np.ravel(np.array(numbers["differences"], float)), strict=True):
+        assert float(row["differences"]) == value
+    page = (folder / "report.html").read_text("utf-8")
+    assert page.count("<svg") == 2
+    assert "spots.forward.left.row" in page
+    assert "strongest factor" in said
+    assert str(folder) in said
+    manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
+    assert manifest["worst_relative"] == numbers["worst_relative"]
+    assert resolve_study(folder / "config.yaml").tree == resolve_study(folder.parent / "study.yaml").tree
+
+
+def test_a_folder_is_not_overwritten(small, written):
+    result = RUNNER.invoke(app, [str(small), "--gradient", "--out", str(written[0])])
+    assert result.exit_code == 2
+    assert "exists" in result.output
+
+
+@pytest.mark.parametrize(
+    "option", [("--workers", "2"), ("--resume",), ("--yes",), ("--scheduler", "tcp://127.0.0.1:1")], ids=lambda o: o[0]
+)
+def test_options_of_runs_are_refused(small, option):
+    result = RUNNER.invoke(app, [str(small), "--gradient", *option])
+    assert result.exit_code == 2
+    assert f"{option[0]} has no meaning" in result.output
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "warmth: {key: [job, perturb, base, temperature, change], uniform: [-1 K, 1 K]}",
+            "centroid: {key: [job, analysis, centroid], values: [ml, energy]}",
+            "no derivative by what is not a number",
+        ),
+        (
+            "warmth: {key: [job, perturb, base, temperature, change], uniform: [-1 K, 1 K]}",
+            "frames: {key: [instrument, monitor, frames], values: [4, 8]}",
+            "does not allow values beside its own",
+        ),
+        (
+            "key: [recovered, intersection_angle, derived, change_arcsec]",
+            "key: [recovered, centroid]",
+            "not a number in the base",
+        ),
+        (
+            "key: [recovered, intersection_angle, derived, change_arcsec]",
+            "key: [recovered, nothing]",
+            "no such key",
+        ),
+    ],
+    ids=["text", "whole number", "text response", "no response"],
+)
+def test_what_has_no_derivative_is_refused(tmp_path, old, new, told):
+    coma = "  coma: {key: [job, perturb, base/forward/M1, figure, Z7], uniform: [-10 nm, 10 nm]}\n"
+    path = write_study(tmp_path, (old, new), (coma, ""), text=STUDY)
+    result = RUNNER.invoke(app, [str(path), "--gradient", "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2, result.output
+    assert told in result.output
+    assert "study.yaml" in result.output
+    assert not (tmp_path / "out").exists()

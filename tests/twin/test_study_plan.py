@@ -1,0 +1,205 @@
+"""The table of runs: designs against their definitions, places in the base, seeds, files of tables."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, norm, truncnorm
+
+from scenes.errors import InputError
+from tests.twin.study_bench import STUDY, write_study
+from twin.study.config_tree import leaf, with_values
+from twin.study.plan import Plan
+from twin.study.render_base import BLOCK
+from twin.study.setup import StudySetup, resolve_study, study_from_text
+
+FACTORS = STUDY[STUDY.index("factors:") : STUDY.index("design:")]
+NORMAL = "normal: {mean: 0 um, sigma: 1 um}"
+RUNS = 2000
+FALSE_ALARM = 1e-6
+"""Of each statistical test; seeds are fixed, so that it passes always or never."""
+
+
+def plan_of(folder: Path, *changes) -> Plan:
+    return Plan.of(resolve_study(write_study(folder, *changes)))
+
+
+def column(plan: Plan, name: str) -> np.ndarray:
+    return next(c.values for c in plan.columns if c.name == name)
+
+
+@pytest.mark.parametrize("kind", ["latin_hypercube", "sobol", "monte_carlo"])
+def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
+    changes = (("kind: monte_carlo, runs: 100", f"kind: {kind}, runs: {RUNS}"),)
+    plan = plan_of(tmp_path, *changes)
+    z, x = column(plan, "m2z"), column(plan, "m2x")
+    # evenly spread designs are closer to the distribution than random draws, never farther
+    assert kstest(z, norm(0.0, 1.0).cdf).pvalue > FALSE_ALARM
+    assert kstest(x, lambda v: 0.5 * (v + 1.0)).pvalue > FALSE_ALARM
+    # independent: the correlation of 2000 pairs is below 5/sqrt(2000) but once in two million
+    assert abs(np.corrcoef(z, x)[0, 1]) < 5.0 / np.sqrt(RUNS)
+    if kind == "latin_hypercube":
+        for u in (norm.cdf(z), 0.5 * (x + 1.0)):
+            assert np.array_equal(np.sort(np.floor(u * RUNS)), np.arange(RUNS))
+    again = plan_of(tmp_path / "again", *changes)
+    assert np.array_equal(column(again, "m2z"), z)
+    other = plan_of(tmp_path / "other", *changes, ("seed: 3}", "seed: 4}"))
+    assert not np.any(column(other, "m2z") == z)
+
+
+@pytest.mark.parametrize("limits", [(-1.0, 0.5), (2.0, 3.0), (-4.0, -3.5)])
+def test_truncated_distributions(tmp_path, limits) -> None:
+    text = f"truncated: {{mean: 1 um, sigma: 1 um, limits: [{limits[0]} um, {limits[1]} um]}}"
+    values = column(plan_of(tmp_path, (NORMAL, text), ("runs: 100", f"runs: {RUNS}")), "m2z")
+    assert values.min() >= limits[0]
+    assert values.max() <= limits[1]
+    known = truncnorm(limits[0] - 1.0, limits[1] - 1.0, loc=1.0, scale=1.0)
+    assert kstest(values, known.cdf).pvalue > FALSE_ALARM
+
+
+def test_a_grid_is_every_combination(tmp_path) -> None:
+    plan = plan_of(
+        tmp_path,
+        (NORMAL, "range: [0 um, 0.002 mm], count: 3"),
+        ("uniform: [-1 um, 1 um]", "values: [5 nm, 1 um]"),
+        ("kind: monte_carlo, runs: 100, seed: 3", "kind: grid, seed: 3"),
+    )
+    assert plan.runs == 6
+    np.testing.assert_allclose(column(plan, "m2z"), [0, 0, 1, 1, 2, 2])
+    np.testing.assert_allclose(column(plan, "m2x"), [5, 1000] * 3)
+    assert plan.columns[1].unit == "nm"
+    values = dict(plan.run(5).values)
+    assert values["job", "perturb", "base/forward/M2", "shift", 2] == "2.0 um"
+    assert values["job", "perturb", "base/forward/M2", "shift", 0] == "1000.0 nm"
+
+
+def test_blocks_and_seeds(tmp_path) -> None:
+    plan = plan_of(tmp_path, ("runs: 100", "runs: 110"))
+    assert plan.blocks == 5
+    assert [number for k in range(plan.blocks) for number in plan.block(k)] == list(range(110))
+    assert len(plan.block(4)) == 110 - 4 * BLOCK
+    assert len(set(plan.seeds.tolist())) == 110
+    assert plan.seeds.min() >= 0
+    word = np.random.SeedSequence(3, spawn_key=(7,)).generate_state(1, np.uint64)[0]
+    assert plan.run(7).seed == int(word) >> 1
+    shared = plan_of(tmp_path / "shared", ("responses:", "noise: shared\nresponses:"))
+    assert shared.run(7).seed is None
+
+
+def test_config_yaml_says_all(tmp_path) -> None:
+    """A table's values travel with it; the numbers and the fingerprint are the same."""
+    (tmp_path / "t.csv").write_text("z,name\n1 um,a\n2 um,b\n3 um,c\n", "utf-8")
+    path = write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: z}"))
+    setup = resolve_study(path)
+    again = study_from_text(setup.to_yaml())
+    assert again.fingerprint == setup.fingerprint
+    assert again.tree == setup.tree
+    one, two = Plan.of(setup), Plan.of(again)
+    assert [one.run(k) for k in range(one.runs)] == [two.run(k) for k in range(two.runs)]
+    assert set(column(one, "m2z").tolist()) == {1.0, 2.0, 3.0}
+    # what changes no number does not make it another study
+    renamed = write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: z}"), ("name: study", "name: other"))
+    assert resolve_study(renamed).fingerprint == setup.fingerprint
+
+
+def test_a_new_node_and_a_new_figure_term_are_made(tmp_path) -> None:
+    plan = plan_of(tmp_path, ("base/forward/M2, shift, 2]", "base/forward/M3, figure, Z11]"))
+    made = leaf(plan.setup.tree, ("job", "perturb", "base/forward/M3"))
+    assert made["shift"] == ["0 m"] * 3 or made["shift"][0].startswith("0 ")
+    assert "Z11" in made["figure"]
+
+
+REFUSED = [
+    (("M2, shift, 2]", "M2, shfit, 2]"), "factors.m2z.key[3]", "'shift'"),
+    (("M2, shift, 2]", "M2, shift]"), "factors.m2z.key", "not a single value"),
+    (("M2, shift, 2]", "M2, figure, Z99]"), "factors.m2z", "Z66"),
+    ((NORMAL, "values: [1 um, a]"), "factors.m2z.values", "not a quantity among"),
+    ((NORMAL, "table: {file: none.csv, column: z}"), "factors.m2z.table.file", "No such file"),
+    (("file: job.yaml", "file: jobs.yaml"), "base.file", "no such file"),
+    (("file: job.yaml", "file: pertrub"), "base.file", "'perturb'"),
+]
+
+
+@pytest.mark.parametrize(("change", "key", "words"), REFUSED)
+def test_what_is_refused(tmp_path, change, key, words) -> None:
+    path = write_study(tmp_path, change)
+    with pytest.raises(InputError) as refused:
+        Plan.of(resolve_study(path))
+    assert f"{path}:" in str(refused.value)
+    assert key in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_scaled_values(tmp_path) -> None:
+    """Light grows with the squares of aperture and pinhole; a ratio multiplies what another factor sets."""
+    photons = "[instrument, monitor, reticle, photons_per_frame]"
+    factors = """factors:
+  aperture:
+    key: [instrument, monitor, return_face, aperture]
+    values: [25 mm, 5 cm]
+    scales: [{key: PHOTONS, power: 2}, {key: [instrument, monitor, prism_180, width]}]
+  pinhole: {key: [instrument, monitor, reticle, pinhole], values: [10 um, 40 um], scales: [{key: PHOTONS, power: 2}]}
+  m2z: {key: [job, perturb, base/forward/M2, shift, 2], values: [3 um, 4 um]}
+  level: {scales: [{key: [job, perturb, base/forward/M2, shift, 2]}], values: [0, 2]}
+""".replace("PHOTONS", photons)
+    plan = plan_of(tmp_path, (FACTORS, factors), ("kind: monte_carlo, runs: 100, seed: 3", "kind: grid, seed: 3"))
+    assert plan.runs == 16
+    light, width = (
+        ("instrument", "monitor", "reticle", "photons_per_frame"),
+        ("instrument", "monitor", "prism_180", "width"),
+    )
+    base = {place: leaf(plan.setup.tree, place) for place in (light, width)}
+    assert base == {light: 4e6, width: "60 mm"}
+    m2z = ("job", "perturb", "base/forward/M2", "shift", 2)
+    found = [dict(plan.run(k).values) for k in range(16)]
+    # the base has 50 mm, 20 um and 4e6 photons; the last factor changes fastest
+    expected = [4e6 * a**2 * p**2 for a in (0.5, 1.0) for p in (0.5, 2.0) for _ in range(4)]
+    assert [run[light] for run in found] == pytest.approx(expected, rel=1e-12)
+    assert {run[width] for run in found} == {"30.0 mm", "60.0 mm"}
+    assert [run[m2z] for run in found[:4]] == ["0.0 um", "6.0 um", "0.0 um", "8.0 um"]
+    assert len({place for run in found for place in run}) == len(found[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "words"),
+    [
+        ("scales: [{key: [job, render, images, 0]}], values: [1, 2]", "factors.m2z.scales[0].key", "not a number"),
+        ("scales: [{key: [job, rendr, seed]}], values: [1, 2]", "factors.m2z.scales[0].key[1]", "'render'"),
+        ("scales: [{key: [job, render, frames], power: 0.5}], values: [-1, 2]", "scales[0].power", "no such number"),
+        ("scales: [{key: [job, render, frames]}], values: [1, 1e9]", "factors.m2z.values", "outside the limits"),
+        ("key: [job, perturb, base/forward/M2, shift, 2], values: [1 um, 2 um], scales: [{key: [job, render, frames]}]",
+         "factors.m2z", "zero in the base"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_scaled(tmp_path, change, key, words) -> None:
+    place = "key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 1 um}"
+    with pytest.raises(InputError) as refused:
+        plan_of(tmp_path, (place, change))
+    assert key in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_changed_values_leave_the_tree_alone() -> None:
+    tree = {"a": {"b": [1, 2, 3]}, "c": {"d": 4}}
+    new = with_values(tree, [(("a", "b", 1), 9), (("a", "b", 2), 8)])
+    assert new == {"a": {"b": [1, 9, 8]}, "c": {"d": 4}}
+    assert tree == {"a": {"b": [1, 2, 3]}, "c": {"d": 4}}
+    assert new["c"] is tree["c"]
+
+
+def test_every_base_command_is_known(tmp_path) -> None:
+    """Every command that the schema names can be resolved, and a value of it be a factor."""
+    for command, file, key in (
+        ("lab turntable", "turntable", "[test, seed]"),
+        ("orbit angle", "angle", "[test, errors, station]"),
+    ):
+        value = "values: [1, 2]" if "seed" in key else "range: [0 m, 2 m], count: 2"
+        path = tmp_path / "s.yaml"
+        path.write_text(
+            f"name: s\nbase: {{command: {command}, file: {file}}}\nfactors: {{f: {{key: {key}, {value}}}}}\n"
+            "responses: {r: {key: [x, y]}}\n",
+            "utf-8",
+        )
+        setup = resolve_study(path)
+        assert isinstance(setup, StudySetup)
+        assert Plan.of(setup).runs == 2

@@ -1,0 +1,170 @@
+"""The main job as the base of a study, against the command that a user would run by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from scenes.errors import InputError
+from scenes.job import PerturbationSpec
+from scenes.study import ResponseSpec
+from tests.twin.study_bench import write_study
+from twin.render_job import render_job
+from twin.study.base_job import Failure, Run
+from twin.study.block_result import BlockResult
+from twin.study.config_tree import leaf
+from twin.study.engine import check_responses
+from twin.study.perturbed_job import JobMaker, quantity_at, read_job
+from twin.study.plan import Plan
+from twin.study.setup import resolve_study
+
+
+def numbers(tree, path=()):
+    """Key path -> number of everything in results."""
+    if isinstance(tree, dict):
+        return {key: value for name, below in tree.items() for key, value in numbers(below, (*path, name)).items()}
+    return {path: tree}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    setup = resolve_study(write_study(tmp_path_factory.mktemp("render")))
+    return SimpleNamespace(setup=setup, plan=Plan.of(setup))
+
+
+def test_one_run_is_what_the_command_gives(study, backend) -> None:
+    """All keys and all numbers of truth.json and recovered.json, by a job file that says the same by hand."""
+    first = study.plan.run(0)
+    (outcome,) = study.setup.job.evaluate(study.setup.tree, [first], backend)
+    resolved = read_job(study.setup.tree)
+    shift = [value for _, value in reversed(first.values)]
+    tree = resolved.plain()
+    tree["job"]["perturb"] = {"base/forward/M2": {"shift": [shift[0], "0 um", shift[1]]}}
+    tree["job"]["render"]["seed"] = first.seed
+    by_hand = render_job(read_job(tree), backend)
+    expected = {"truth": by_hand.truth_dict(), "recovered": by_hand.recovered_dict()}
+    one, two = numbers(outcome), numbers(expected)
+    assert list(one) == list(two)
+    assert len(one) > 80
+    for key, value in two.items():
+        if isinstance(value, float):
+            # the same arithmetic on the same numbers: rounding only
+            assert one[key] == pytest.approx(value, rel=1e-9, abs=1e-12), key
+        else:
+            assert one[key] == value, key
+
+
+def test_a_state_among_others_has_the_truth_that_it_has_alone(study, backend) -> None:
+    runs = [study.plan.run(k) for k in range(6)]
+    together = study.setup.job.evaluate(study.setup.tree, runs, backend)
+    for run, outcome in zip(runs, together, strict=True):
+        (alone,) = study.setup.job.evaluate(study.setup.tree, [run], backend)
+        for key, value in numbers(alone["truth"]).items():
+            # traced with others a state differs by rounding: 1e-16 of metres and radians, in um and arcsec
+            assert numbers(outcome["truth"])[key] == pytest.approx(value, rel=1e-8, abs=1e-8), key
+
+
+def test_the_same_block_gives_the_same_bits(study, backend) -> None:
+    runs = next(study.plan.runs_of(range(1, 2)))
+    one = study.setup.job.evaluate(study.setup.tree, runs, backend)
+    two = study.setup.job.evaluate(study.setup.tree, runs, backend)
+    assert one == two
+
+
+def test_a_lost_run_fails_alone(study, backend) -> None:
+    """A mirror shifted by 3 mm loses the beam; a value outside the schema is refused; the run between them is good."""
+    place = ("job", "perturb", "base/forward/M2", "shift", 2)
+    runs = [Run(k, ((place, value),), 5) for k, value in enumerate(("3 mm", "1 um", "2 m", "1 arcsec"))]
+    lost, good, outside, wrong = study.setup.job.evaluate(study.setup.tree, runs, backend)
+    assert isinstance(lost, Failure)
+    assert "forward" in lost.message or "spot" in lost.message
+    assert good["recovered"]["cameras"]["forward"]["model"]["d_f_um"] != 0.0
+    assert isinstance(outside, Failure)
+    assert "outside the limits" in outside.message
+    assert isinstance(wrong, Failure)
+
+
+def test_shared_noise(study, backend) -> None:
+    """Runs without a seed of their own have the base's noise: two that are alike give the same numbers."""
+    place = ("job", "perturb", "base/forward/M2", "shift", 2)
+
+    def recovered(seeds):
+        runs = [Run(k, ((place, "1 um"),), seed) for k, seed in enumerate(seeds)]
+        found = study.setup.job.evaluate(study.setup.tree, runs, backend)
+        return [outcome["recovered"]["cameras"]["forward"]["model"]["d_f_um"] for outcome in found]
+
+    shared = recovered([None, None])
+    own = recovered([1, 2])
+    assert shared[0] == pytest.approx(shared[1], abs=1e-6)
+    assert abs(own[0] - own[1]) > 1e-3
+
+
+def test_jobs_made_quickly_are_those_that_the_schema_reads(study) -> None:
+    """Every sort of number under perturb, by the short way and by reading the whole job anew."""
+    tree = study.setup.tree
+    tree = {
+        **tree,
+        "job": {**tree["job"], "perturb": {"base/forward/M2": PerturbationSpec(figure={"Z5": "1 nm"}).plain()}},
+    }
+    start = ("job", "perturb", "base/forward/M2")
+    values = (
+        ((*start, "rotate", 1), "1.5 arcsec"),
+        ((*start, "shift", 2), "-0.25 um"),
+        ((*start, "figure", "Z5"), "3 nm"),
+        ((*start, "scale"), "2 ppm"),
+        ((*start, "temperature", "change"), "0.5 K"),
+        ((*start, "temperature", "gradient", 0), "0.1 K/m"),
+    )
+    maker = JobMaker(tree)
+    quick = maker.job(values)
+    changed = PerturbationSpec.model_validate(
+        {
+            "rotate": ["0 arcsec", "1.5 arcsec", "0 arcsec"],
+            "shift": ["0 um", "0 um", "-0.25 um"],
+            "figure": {"Z5": "3 nm"},
+            "scale": "2 ppm",
+            "temperature": {"change": "0.5 K", "gradient": ["0.1 K/m", "0 K/m", "0 K/m"]},
+        }
+    )
+    assert quick.job.perturb["base/forward/M2"] == changed
+    assert quick.plain()["instrument"] == tree["instrument"]
+    assert maker.base.job.perturb["base/forward/M2"].shift == (0.0, 0.0, 0.0)
+    with pytest.raises(InputError, match="outside the limits"):
+        maker.job((((*start, "shift", 2), "1 m"),))
+    assert quantity_at(PerturbationSpec, ("pivot",)) is None
+
+
+def test_a_response_may_be_a_difference(study, backend) -> None:
+    """What is recovered minus what is true; where one of them is not there, the run fails."""
+    outcomes = study.setup.job.evaluate(study.setup.tree, [study.plan.run(k) for k in range(3)], backend)
+    key, true = (("recovered", "cameras", "forward", "model", "d_f_um"), ("truth", "cameras", "forward", "d_f_um"))
+    asked = {"error": ResponseSpec(key=key, minus=true), "lost": ResponseSpec(key=key, minus=(*true[:-1], "f_um"))}
+    result = BlockResult.of(outcomes, {"error": asked["error"]})
+    expected = [o["recovered"]["cameras"]["forward"]["model"]["d_f_um"] - leaf(o, true) for o in outcomes]
+    assert result.values[:, 0].tolist() == expected
+    assert all(result.values[:, 0] != 0.0)
+    assert BlockResult.of(outcomes, asked).failed.all()
+
+
+def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> None:
+    (sample,) = study.setup.job.evaluate(study.setup.tree, [study.plan.run(0)], backend)
+    check_responses(study.setup, sample)
+    wrong = write_study(tmp_path / "a", ("truth, cameras, forward, d_f_um]", "truth, cameras, forward, d_f_mm]"))
+    with pytest.raises(InputError, match=r"responses\.true_df\.key\[3\]: the results of 'render'.*'d_f_um'"):
+        check_responses(resolve_study(wrong), sample)
+    wrong = write_study(
+        tmp_path / "b", ("sigma: [recovered, cameras, forward, model, d_f_um_sigma]", "minus: [truth, d_f_um]")
+    )
+    with pytest.raises(InputError, match=r"responses\.df\.minus\[1\].*cameras"):
+        check_responses(resolve_study(wrong), sample)
+
+
+def test_other_keys_than_motions(study, backend) -> None:
+    """The number of photons changes the scatter that the analysis expects as the root of it."""
+    place = ("instrument", "monitor", "reticle", "photons_per_frame")
+    runs = [Run(k, ((place, value),), 7) for k, value in enumerate((4e6, 1e6))]
+    one, two = study.setup.job.evaluate(study.setup.tree, runs, backend)
+    sigma = [o["recovered"]["cameras"]["forward"]["model"]["d_f_um_sigma"] for o in (one, two)]
+    # shot noise alone would give 2; read-out and fixed pattern noise change it a little
+    assert 1.5 < sigma[1] / sigma[0] < 2.6
+    assert np.isfinite(sigma).all()

@@ -1,0 +1,150 @@
+"""Reports of studies of all kinds: they stand alone, say what was found, and hold out when there is nothing."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from tests.twin.study_data import columns, dataset, study_of
+from twin.study.report import write_study_report
+from twin.study.report.study_runs import StudyRuns
+
+TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"
+
+
+def page(folder, study, values, failed=None) -> str:
+    """The report's text, after checking what every report must fulfil."""
+    write_study_report(dataset(study, values, failed), study, folder)
+    text = (folder / "report.html").read_text("utf-8")
+    # one file: nothing is fetched from elsewhere
+    assert not re.search(r"""(src|href)=["'](https?:|//)""", text)
+    assert "<script" not in text
+    for name in re.findall(r'href="(artefacts/[^"]+|statistics.json)"', text):
+        assert (folder / name).stat().st_size > 0, name
+    json.loads((folder / "statistics.json").read_text("utf-8"))
+    words = re.sub(r"<svg.*?</svg>|<style>.*?</style>", "", text, flags=re.DOTALL)
+    words = re.sub(r"<[^>]+>", " ", words)
+    for wrong in ("nan", "None", "inf", "np.float"):
+        assert not re.search(rf"(?<![A-Za-z]){wrong}(?![A-Za-z])", words), wrong
+    return words
+
+
+def test_grid_of_two_numbers(tmp_path) -> None:
+    study = study_of(
+        "{a: {key: [job, a], values: [30 mm, 40 mm, 50 mm]}, b: {key: [job, b], range: [10 um, 80 um], count: 8}}",
+        "{kind: grid}",
+        TWO,
+        "{sobol: true, pareto: [{x: y, y: z, best_y: max}]}",
+    )
+    x = columns(study)
+    words = page(tmp_path, study, {"y": x["a"] * x["b"], "z": np.log(x["b"])})
+    assert "Main effects" in words
+    assert "exact for the grid" in words
+    assert "is the knee" in words
+    assert "no sample" in words
+    assert "Enough runs?" not in words
+
+
+def test_latin_hypercube_of_four(tmp_path) -> None:
+    study = study_of(
+        "{a: {key: [job, a], normal: {mean: 0 um, sigma: 2 um}}, b: {key: [job, b], uniform: [-9 arcsec, 9 arcsec]}, "
+        "c: {key: [job, c], uniform: [0 K, 1 K]}, d: {key: [job, d], values: [1, 9, 36]}}",
+        "{kind: latin_hypercube, runs: 200, seed: 2}",
+        "{y: {key: [t, y_um], sigma: [t, y_um_sigma]}, z: {key: [t, z]}}",
+        "{sobol: true, scatter: [[a, y]], thresholds: {t: {response: y, at_most: 3, magnitude: true}}}",
+    )
+    x = columns(study)
+    y = x["a"] + 0.1 * x["b"]
+    words = page(tmp_path, study, {"y": y, "y_sigma": 1.0 / np.sqrt(x["d"]), "z": x["a"] * x["b"]}, np.arange(200) < 3)
+    met = int(np.sum(np.abs(y[3:]) <= 3.0))
+    assert f"{met} of 197" in words
+    assert "3 of 200 runs failed" in words
+    assert "no ray arrives" in words
+    assert "y_sigma" in words
+    assert re.search(r"z: .* mostly together", words)
+    assert "polynomial chaos" in words
+    found = json.loads((tmp_path / "statistics.json").read_text("utf-8"))["responses"]
+    # the stated sigma depends on the number of frames alone
+    assert found["y_sigma"]["sobol"]["factors"]["d"]["total"]["value"] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_monte_carlo_is_the_same_each_time(tmp_path) -> None:
+    study = study_of(
+        "{a: {key: [job, a], normal: {mean: 0 um, sigma: 1 um}}, "
+        "b: {key: [job, b], normal: {mean: 0 um, sigma: 1 um}}}",
+        "{kind: monte_carlo, runs: 1500, seed: 2}",
+        TWO,
+    )
+    x = columns(study)
+    values = {"y": x["a"] + x["b"], "z": x["a"] ** 2}
+    words = page(tmp_path, study, values)
+    assert "y: nothing speaks against a normal distribution" in words
+    assert "z is not normal" in words
+    assert "y: 1500 runs are enough for mean, sigma" in words
+    assert "Sobol indices" not in words
+    before = {path.name: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    (tmp_path / "artefacts" / "old.svg").write_text("old", "utf-8")
+    page(tmp_path, study, values)
+    assert {path.name: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_texts(tmp_path) -> None:
+    study = study_of(
+        "{w: {key: [job, a], values: [paper_single, derived, model]}, g: {key: [job, b], values: [silica, zerodur]}}",
+        "{kind: grid}",
+        TWO,
+        "{sobol: true, pareto: [{x: g, y: y}], scatter: [[w, y]]}",
+    )
+    w = np.array([{"paper_single": 3.0, "derived": 1.0, "model": 0.5}[v] for v in columns(study)["w"]])
+    words = page(tmp_path, study, {"y": w, "z": w + 100.0 * (columns(study)["g"] == "silica")})
+    assert "texts have no order" in words
+    assert "Largest main effects" in words or "Total shares" in words
+
+
+CASES = {
+    "all failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 30, "no run has a number"),
+    "all but one failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 29, "29 of 30 runs failed"),
+    "constant": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: 0.0 * x + 2.5, 0, "is the same in all 30 runs"),
+    "few": ("{kind: monte_carlo, runs: 8, seed: 1}", lambda x: x**2, 0, "8 runs are few"),
+    "one": ("{kind: monte_carlo, runs: 1, seed: 1}", lambda x: x, 0, "1 run"),
+    "not finite": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: np.where(x > 0.5, np.nan, x), 0, "no finite"),
+    "infinite": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: np.where(x > 0.5, np.inf, x), 0, "no finite"),
+    "tiny": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: 1e-30 * x, 0, "e−3"),
+    "large": ("{kind: monte_carlo, runs: 40, seed: 1}", lambda x: 1e9 + x, 0, "1.00e9"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_when_there_is_little_to_say(tmp_path, case) -> None:
+    design, function, failed, expected = CASES[case]
+    report = "{sobol: true, scatter: [[a, y]], pareto: [{x: a, y: y}], thresholds: {t: {response: y, at_most: 1}}}"
+    study = study_of("{a: {key: [job, a], uniform: [0 mm, 1 mm]}}", design, report=report)
+    y = function(columns(study)["a"])
+    assert expected in page(tmp_path, study, {"y": y}, np.arange(len(y)) < failed)
+
+
+def test_a_grid_with_holes_has_no_indices(tmp_path) -> None:
+    study = study_of("{a: {key: [job, a], values: [1, 2, 3]}, b: {key: [job, b], values: [1, 2, 3]}}", "{kind: grid}",
+                     report="{sobol: true}")  # fmt: skip
+    x = columns(study)
+    assert "runs of the grid are missing" in page(tmp_path, study, {"y": x["a"] + x["b"]}, np.arange(9) == 4)
+
+
+def test_columns_of_one_table_are_one_axis(tmp_path) -> None:
+    table = "table: {{file: t.csv, column: {0}, values: [{1}]}}"
+    study = study_of(
+        f"{{a: {{key: [job, a], {table.format('a', '0, 1, 2, 3, 5')}}}, "
+        f"b: {{key: [job, b], {table.format('b', '0, 2, 4, 6, 10')}}}, c: {{key: [job, c], uniform: [0, 1]}}}}",
+        "{kind: monte_carlo, runs: 100, seed: 1}",
+        report="{sobol: true}",
+    )
+    x = columns(study)
+    data = dataset(study, {"y": x["a"] + x["c"]})
+    assert [len(axis) for axis in StudyRuns.of(data, study).axes] == [2, 1]
+    words = page(tmp_path, study, {"y": x["a"] + x["c"]})
+    # b = 2a: a straight line cannot tell them apart, and says so
+    assert "left out of the model: b" in words
+    found = json.loads((tmp_path / "statistics.json").read_text("utf-8"))["responses"]["y"]["sobol"]["factors"]
+    spread = np.var([0.0, 1.0, 2.0, 3.0, 5.0])
+    assert found["a + b"]["first"]["value"] == pytest.approx(spread / (spread + 1.0 / 12.0), abs=1e-9)

@@ -1,0 +1,1 @@
+"""Design trade studies: a base job run many times with varied values, and what its results say."""

@@ -1,0 +1,210 @@
+"""``python -m twin.study``: design trade studies."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from twin.cli import BACKEND_HELP, FAILURE, explained, print_error, print_place, print_whole
+from twin.study.cluster import ClusterError
+from twin.study.command import Broken, StudyOptions, StudyRun, run_study
+from twin.study.engine import Estimate, IncompleteError
+from twin.study.engine import Progress as EngineProgress
+
+TICK_SECONDS = 10.0
+"""How often a line of progress is written where there is no terminal."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    file: Annotated[Path, typer.Argument(readable=False, help="YAML file of the study, or the config.yaml of one.")],
+    out: Annotated[
+        Path | None, typer.Option(readable=False, help="Folder of the study. Default: runs/STUDY-001, -002, ...")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Number of worker processes. Default: one for each core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Use a running Dask cluster: tcp://host:8786. Its workers need the twin installed."),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the folder if it exists.")] = False,
+    gradient: Annotated[
+        bool,
+        typer.Option("--gradient", help="Differentiate the responses by the factors at the base, instead of the runs."),
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Run more runs than the study's limit.")] = False,
+    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
+    as_json: Annotated[bool, typer.Option("--json", help="Print study.json on stdout, and nothing else.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
+) -> None:
+    """Run a job many times with varied values and keep the numbers that matter.
+
+    The study's file names a base job (render, lab ..., orbit ...), the factors that vary in it, a design and the
+    responses that are kept; scenes/examples/study_smoke.yaml is a small one.
+
+    The folder gets study.nc (netCDF, one dimension `run`), study.csv, study.json, report.html and config.yaml, which
+    can be given in place of the file. The numbers do not depend on the number of workers.
+
+    While it runs, finished pieces are kept below DIR/chunks. A study that was broken off, by Ctrl-C or a power
+    failure, is gone on with by the same command and --resume.
+
+    With --gradient it runs no design: the folder gets the Jacobian at the base's own values, gradient.json and
+    gradient.csv, by automatic differentiation and beside it by differences.
+
+    Exit codes: 0 success, 2 bad input (nothing is lost), 130 or 143 interrupted, 1 anything else.
+    """
+    errors = Console(stderr=True)
+    options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
+    place: list[Path] = []
+    if gradient:
+        _differentiate(file, options, errors, as_json, quiet)
+        return
+    with explained(errors):
+        display = _Display(errors, quiet or as_json)
+        try:
+            with display:
+                run = run_study(file, options, display.progress(), place.append)
+        except Broken as broken:
+            print_error(errors, f"{broken}{_how_to_go_on(file, place)}")
+            raise typer.Exit(broken.code) from None
+        except (IncompleteError, ClusterError) as error:
+            print_error(errors, f"{error}{_how_to_go_on(file, place)}")
+            raise typer.Exit(FAILURE) from None
+        except OSError as error:
+            print_error(errors, f"{error.strerror or error}{_how_to_go_on(file, place)}")
+            raise typer.Exit(FAILURE) from None
+    if as_json:
+        json.dump(run.numbers, sys.stdout, allow_nan=False)
+        sys.stdout.write("\n")
+    elif not quiet:
+        _print_result(run)
+
+
+def _differentiate(file: Path, options: StudyOptions, errors: Console, as_json: bool, quiet: bool) -> None:
+    from twin.study.gradient_command import run_gradient
+    from twin.study.gradient_table import terminal_tables
+
+    with explained(errors):
+        try:
+            with errors.status("reading the study") if not (quiet or as_json) else nullcontext() as status:
+                run = run_gradient(file, options, lambda text: status.update(text) if status is not None else None)
+        except Broken as broken:
+            print_error(errors, f"{broken}: nothing was kept")
+            raise typer.Exit(broken.code) from None
+        except OSError as error:
+            print_error(errors, error.strerror or str(error))
+            raise typer.Exit(FAILURE) from None
+    if as_json:
+        json.dump(run.numbers, sys.stdout, allow_nan=False)
+        sys.stdout.write("\n")
+    elif not quiet:
+        console = Console()
+        for table in terminal_tables(run.gradient):
+            print_whole(console, table)
+        print_place(console, run.folder)
+
+
+def _how_to_go_on(file: Path, place: list[Path]) -> str:
+    if not place:
+        return ""
+    return f"; what is done is kept, go on with: python -m twin.study {file} --out {place[0]} --resume"
+
+
+class _Display:
+    """What the user sees while a study runs: lines on stderr, and a bar where it is a terminal."""
+
+    def __init__(self, console: Console, silent: bool) -> None:
+        self.console, self.silent = console, silent
+        self.bar = Progress(
+            TextColumn("runs"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=False),
+            console=console,
+            disable=silent or not console.is_terminal,
+            transient=True,
+        )
+        self._task = self.bar.add_task("runs", total=None, rate="")
+        self._began: tuple[float, int] | None = None
+        self._said = time.monotonic()
+
+    def __enter__(self) -> _Display:
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+    def progress(self) -> EngineProgress:
+        """What the engine calls."""
+        return EngineProgress(start=self._start, done=self._done, warn=self._warn)
+
+    def _say(self, text: str) -> None:
+        if not self.silent:
+            self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def _warn(self, text: str) -> None:
+        self.console.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
+
+    def _start(self, estimate: Estimate) -> None:
+        there = f" ({estimate.there} are there already)" if estimate.there else ""
+        self._say(
+            f"{estimate.runs} runs{there} in {estimate.blocks} blocks and {estimate.chunks} chunks on "
+            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {_time_text(estimate.seconds)}, "
+            f"{1e-9 * estimate.memory:.1f} GB; {1e3 * estimate.state_seconds:.3g} ms a run"
+        )
+
+    def _done(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if self._began is None:
+            self._began = (now, done)
+        rate = (done - self._began[1]) / max(now - self._began[0], 1e-9)
+        text = f"{rate:.3g}/s" if done > self._began[1] else ""
+        self.bar.update(self._task, completed=done, total=total, rate=text)
+        if not self.console.is_terminal and text and now - self._said > TICK_SECONDS:
+            self._said = now
+            self._say(f"{done} of {total} runs, {text}, {_time_text((total - done) / rate)} left")
+
+
+def _time_text(seconds: float | None) -> str:
+    if seconds is None:
+        return "an unknown time"
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def _print_result(run: StudyRun) -> None:
+    from twin.report.page import cell_text
+
+    numbers = run.numbers
+    title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
+        table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
+    for name, r in numbers["responses"].items():
+        table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
+    console = Console()
+    print_whole(console, table)
+    print_place(console, run.folder)
+
+
+if __name__ == "__main__":
+    app()

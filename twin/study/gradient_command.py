@@ -1,0 +1,131 @@
+"""What ``python -m twin.study --gradient`` does between its options and its files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from optics.backend import load_backend
+from twin.artefact import Artefact, SvgFigure
+from twin.cli import InputErrorText, check_backend
+from twin.run_folder import MANIFEST, RunFolder, next_free
+from twin.study.command import StudyOptions, broken_by_signals
+from twin.study.folder import PROGRAM
+from twin.study.gradient import AD, Gradient, study_gradient
+from twin.study.setup import StudySetup, resolve_study
+from twin.versions import versions
+
+TEMPLATE = "gradient.html.j2"
+
+
+@dataclass(frozen=True, eq=False)
+class GradientRun:
+    """A differentiated study.
+
+    Attributes:
+        gradient: the Jacobian.
+        numbers: contents of gradient.json.
+        folder: where it is.
+    """
+
+    gradient: Gradient
+    numbers: dict[str, Any]
+    folder: Path
+
+
+def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], None] = lambda text: None) -> GradientRun:
+    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report.
+
+    Args:
+        file: of the study, or a config.yaml.
+        options: what the user chose.
+        advance: told what is being done.
+
+    Raises:
+        InputError, InputErrorText, RunFolderError: bad input; nothing that was there is lost.
+        Broken: SIGINT or SIGTERM; nothing is kept.
+    """
+    check_backend(options.backend)
+    for given, name in (
+        (options.workers is not None, "--workers"),
+        (options.scheduler is not None, "--scheduler"),
+        (options.resume, "--resume"),
+        (options.confirmed, "--yes"),
+    ):
+        if given:
+            raise InputErrorText(f"--gradient differentiates at the base in this process, so {name} has no meaning")
+    setup = resolve_study(file)
+    target = options.out if options.out is not None else next_free(Path("runs"), f"{file.stem}-gradient")
+    started, began = time.time(), time.perf_counter()
+    with broken_by_signals(), RunFolder(target, options.force) as folder:
+        found = study_gradient(setup, load_backend(options.backend), advance)
+        advance("writing the report")
+        from twin.study.gradient_table import plain_data, whole_table
+
+        numbers = plain_data(found)
+        folder.write_text("config.yaml", setup.to_yaml())
+        folder.write_json("gradient.json", numbers)
+        folder.write_bytes("gradient.csv", whole_table(found).content())
+        _write_report(found, setup, folder)
+        manifest = {
+            "program": PROGRAM,
+            "gradient": True,
+            "versions": versions(),
+            "backend": options.backend,
+            "started_unix_s": started,
+            "wall_time_s": time.perf_counter() - began,
+            "worst_relative": found.worst,
+            "sha256": folder.checksums(),
+        }
+        folder.write_json(MANIFEST, manifest)
+    return GradientRun(found, numbers, target)
+
+
+def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None:
+    # drawing libraries are not needed before
+    from twin.report.numbers import significant
+    from twin.report.page import artefact_content, environment
+    from twin.report.svg import look, to_svg
+    from twin.study.gradient_figure import heat_map, tornado
+    from twin.study.gradient_table import doubtful, factor_rows, response_table
+    from twin.trial.output import place
+
+    with look("gradient"):
+        figures = [
+            SvgFigure(
+                "heat-map",
+                "Which factor moves which response",
+                "Change of each response per spread of each factor, as a share of the response's largest one; the "
+                "scale is logarithmic above 0.001.",
+                to_svg(heat_map(found)),
+            ),
+            SvgFigure(
+                "tornado",
+                "Largest changes",
+                "Change of each response when a factor rises by its spread, the largest first; in brackets the root of "
+                "the sum of squares over all factors.",
+                to_svg(tornado(found)),
+            ),
+        ]
+    tables: list[Artefact] = [response_table(found), factor_rows(found)]
+    for artefact in (*figures, *tables):
+        folder.write_bytes(place(artefact), artefact.content())
+    page = (
+        environment("twin.study.report")
+        .get_template(TEMPLATE)
+        .render(
+            study=setup.study,
+            found=found,
+            exact=int((found.method == AD).sum()),
+            entries=found.method.size,
+            worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
+            doubtful=doubtful(found),
+            tables=[artefact_content(a, place(a)) for a in tables],
+            figures=[artefact_content(a, place(a)) for a in figures],
+            versions=versions(),
+        )
+    )
+    folder.write_text("report.html", page)
