@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,8 @@ Array = NDArray[np.float64]
 _CONVERGED = 1e-6
 _ROUNDS = 50
 _HUBER_ROUNDS = 6
+# From then on the weights of "igg" only fall: two rays of a point that are doubted in turns would never come to rest.
+_FREE_ROUNDS = 12
 _SETTLED = 1e-3
 
 
@@ -50,7 +53,8 @@ class Adjustment:
         gauge: what was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were
             solved for all the same.
         cameras: with the adjusted interior, in the reference state.
-        ground: field -> (m, 3) adjusted points. ground_covariance: field -> (m, 3, 3).
+        ground: field -> (m, 3) adjusted points; NaN for those that robust weights gave up. ground_covariance:
+            field -> (m, 3, 3), likewise.
         residual: field -> line -> (n, 2) standardised residuals of image points. weight: field -> line -> (n,) robust.
         chi_square, degrees_of_freedom: weighted, points left out do not count.
         factors: variance group -> estimated factor (1 where not estimated). redundancy: of each group. Noise that image
@@ -134,7 +138,8 @@ def adjust(
         start: values by name where not the cameras' interior and zero.
         priors: pseudo-observations, for example of an on-board monitor of the cameras.
         gauge: how open combinations are closed.
-        robust: "huber" takes weight from image points with large residuals, "igg" leaves the worst out.
+        robust: "huber" takes weight from image points with large residuals, "igg" leaves the worst out, and with them
+            points without coordinates that fewer than two rays are left of.
         variance_components: estimate a factor on the variances of "image", "control", each group of priors and, where
             image points share them, "attitude", "slow attitude" and "station".
         iterations: most Gauss-Newton steps of one round.
@@ -149,7 +154,8 @@ def adjust(
     parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
     gauge = gauge or Gauge()
     shared = SharedNoise.of(fields, noise)
-    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations)
+    none = np.zeros(sum(len(f.ground) for f in fields), bool)
+    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations, none)
     groups = ("image", "control", *shared.groups, *dict.fromkeys(p.group for p in priors))
     count = sum(len(r.point) for f in fields for r in f.rays.values())
     start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
@@ -165,17 +171,21 @@ def adjust(
         if not robust and not variance_components:
             break
         cofactors = equations.image_cofactors(covariance)
+        before = problem
         if robust:
             kind: Robust = "huber" if turn < _HUBER_ROUNDS else robust
             image = robust_weights(standardised(equations, cofactors, old), kind)
-            state = replace(state, weights=replace(state.weights, image=image))
+            if robust == "igg" and turn >= _FREE_ROUNDS:
+                image = np.minimum(image, old.image)
+            problem, state = problem.without_lost(replace(state, weights=replace(old, image=image)))
         if variance_components:
             factor, _ = components(equations, covariance, cofactors, old, priors)
             factors.append(factor)
             state = replace(state, weights=replace(state.weights, factor=factor))
         change = float(np.abs(state.weights.image - old.image).max())
         change = max(change, *(abs(state.weights.factor[g] / old.factor[g] - 1.0) for g in groups))
-        if change < _SETTLED and not (robust == "igg" and turn < _HUBER_ROUNDS):
+        settled = change < _SETTLED and problem is before
+        if settled and not (robust == "igg" and turn < _HUBER_ROUNDS):
             state = replace(state, weights=old)
             break
         if len(factors) == 3:
@@ -209,6 +219,32 @@ class _Problem:
     priors: tuple[Prior, ...]
     gauge: Gauge
     iterations: int
+    lost: NDArray[np.bool_]
+
+    @cached_property
+    def place(self) -> NDArray[np.intp]:
+        """(M,) point, of those of all fields, that each image point shows."""
+        first = np.concatenate([[0], np.cumsum([len(f.ground) for f in self.fields])])
+        return np.concatenate([a + r.point for a, f in zip(first, self.fields, strict=False) for r in f.rays.values()])
+
+    def without_lost(self, at: _Iteration) -> tuple[_Problem, _Iteration]:
+        """Points without coordinates and with fewer than two rays of any weight are given up, for good."""
+        control = np.concatenate([f.control for f in self.fields])
+        rays = np.bincount(self.place[at.weights.image > _SETTLED], minlength=len(control))
+        every = self.lost | (~control & (rays < 2))
+        weights = replace(at.weights, image=np.where(every[self.place], 0.0, at.weights.image))
+        new = every & ~self.lost
+        if not np.any(new):
+            return self, replace(at, weights=weights)
+        fields, grounds = [], []
+        cuts = np.cumsum([len(f.ground) for f in self.fields])[:-1]
+        for one, ground, gone in zip(self.fields, at.state.grounds, np.split(new, cuts), strict=True):
+            # kept loosely where they are, for their blocks must have an inverse; no image point sees them any more
+            kept = np.where(gone[:, None, None], np.eye(3), one.covariance)
+            fields.append(replace(one, control=one.control | gone, covariance=kept))
+            grounds.append(np.where(gone[:, None], one.ground, ground))
+        state = replace(at.state, grounds=tuple(grounds))
+        return replace(self, fields=fields, lost=every), replace(at, state=state, weights=weights)
 
     def equations(self, at: _Iteration) -> Equations:
         return assemble(
@@ -255,8 +291,10 @@ class _Problem:
         cofactors = equations.image_cofactors(covariance)
         _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
         standard = standardised(equations, cofactors, state.weights)
-        sides = [len(f.ground) for f in self.fields]
-        spreads = np.split(equations.point_covariance(covariance), np.cumsum(sides)[:-1])
+        cuts = np.cumsum([len(f.ground) for f in self.fields])[:-1]
+        spread = equations.point_covariance(covariance)
+        spread[self.lost] = np.nan
+        spreads, lost = np.split(spread, cuts), np.split(self.lost, cuts)
         used = int(np.sum(state.weights.image > 0))
         controls = sum(int(np.sum(f.control & np.any(f.covariance, axis=(1, 2)))) for f in self.fields)
         known = 2 * used + 3 * controls + len(self.priors)
@@ -281,7 +319,10 @@ class _Problem:
                 for k, c in self.cameras.items()
                 if k in f.rays
             },
-            ground={f.name: g for f, g in zip(self.fields, state.state.grounds, strict=True)},
+            ground={
+                f.name: np.where(gone[:, None], np.nan, g)
+                for f, g, gone in zip(self.fields, state.state.grounds, lost, strict=True)
+            },
             ground_covariance={f.name: s for f, s in zip(self.fields, spreads, strict=True)},
             residual=self._by_line(standard),
             weight=self._by_line(state.weights.image),

@@ -30,14 +30,19 @@ _LARGEST_RATIO = 0.9
 def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Array:
     """(M, 2) residuals of the image points over their own standard deviation.
 
-    The residual of an observation with weight w has the covariance C + (1 - 2w) G, C that of the observation and G that
-    of the adjusted one: less than C when it took part, more when it did not (exact for weights 0 and 1).
+    An observation of variance C that takes part with weight w, G that of the adjusted one: without it the others would
+    predict it with H = G / (1 - w G / C), and the residual is (1 - w G / C) times observed minus predicted. Its
+    variance is (1 - w G / C) (C + (1 - w) G): less than C with full weight, C + G without any. So the standardised
+    residual does not depend on the observation's own weight, which could otherwise swing for ever where others hardly
+    check it. It is exact where the weights of the others stand for their variances.
     """
-    spread = weights.factor["image"] * np.eye(2) + (1.0 - 2.0 * weights.image)[:, None, None] * cofactors
-    values, axes = np.linalg.eigh(spread)
+    values, axes = np.linalg.eigh(cofactors)
     along = np.einsum("nji,nj->ni", axes, equations.residuals.image)
-    checked = values > _UNCHECKED
-    along = np.where(checked, along / np.sqrt(np.where(checked, values, 1.0)), 0.0)
+    weight, unit = weights.image[:, None], weights.factor["image"]
+    left = 1.0 - weight * values / unit
+    checked = left > _UNCHECKED
+    spread = np.where(checked, left, 1.0) * (unit + (1.0 - weight) * np.maximum(values, 0.0))
+    along = np.where(checked, along / np.sqrt(spread), 0.0)
     return np.einsum("nij,nj->ni", axes, along)
 
 

@@ -270,7 +270,11 @@ def _pass(
         drawn = spec.points.model_copy(update={"control": 0, "check": spec.strip.ties, "length": spec.strip.length})
         own = stream(seed, _TIES)
         a, b, c = (np.random.default_rng(s) for s in own.spawn(3))
-        ties = _drawn(field, spec, drawn, sensors, pass_data, (a, b, c)).check_images
+        try:
+            ties = _drawn(field, spec, drawn, sensors, pass_data, (a, b, c)).check_images
+        except BenchError as error:
+            remedy = "a shorter strip, or a longer pass (`span`)"
+            raise BenchError(f"tie points: {error}", ("strip", "length"), remedy) from error
     drawn_errors = measured.errors
     assert drawn_errors is not None
     middle = float(earth.geodetic(trajectory.position(0.0))[1])

@@ -29,15 +29,14 @@ def monitoring_dict(found: Monitoring) -> dict[str, Any]:
 
 
 def strips_dict(found: Strips, before: Mapping[str, Mapping[str, CheckErrors]]) -> dict[str, Any]:
-    """Errors of every scheme and field before and after the strips' adjustment."""
+    """Errors of every scheme and field without tie points and with them."""
     return {
         "ties": dict(found.ties),
         "p_value": dict(found.p_values),
         "schemes": {
             scheme: {
-                "before": _pooled(PooledErrors.of(before[scheme].values())),
-                "adjusted": _pooled(PooledErrors.of(fields.values())),
-                "adjusted_and_calibrated_with_ties": _pooled(PooledErrors.of(found.tied[scheme].values())),
+                "without_ties": _pooled(PooledErrors.of(before[scheme].values())),
+                "with_ties": _pooled(PooledErrors.of(fields.values())),
             }
             for scheme, fields in found.schemes.items()
         },

@@ -159,7 +159,7 @@ def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance
         surprises(campaign, together),
         repeated(setup, others, advance),
         monitored(setup, shown, advance),
-        strips_adjusted(campaign, alone, advance),
+        strips_adjusted(campaign, advance),
     )
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.orbit.adjustment import Adjustment
-from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.residual_weights import REJECT
 from optics.frozen_map import FrozenMap
@@ -58,14 +57,8 @@ _Kept = dict[str, dict[str, np.ndarray]]
 
 
 def _robust(campaign: Campaign) -> tuple[Adjustment, _Kept]:
-    """The adjustment with robust weights, and field -> line -> which image points it keeps.
-
-    IGG's weights can swing between a point and its neighbour for ever. Huber's do not: then his, and the limit of IGG.
-    """
-    try:
-        found = simultaneous(campaign, robust="igg")
-    except CalibrationError:
-        found = simultaneous(campaign, robust="huber")
+    """The adjustment with robust weights, and field -> line -> which image points it keeps."""
+    found = simultaneous(campaign, robust="igg")
     kept: _Kept = {}
     for name, lines in found.residual.items():
         kept[name] = {}

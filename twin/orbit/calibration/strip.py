@@ -1,8 +1,9 @@
 """Passes adjusted on tie points before their check points are intersected (paper 003: calibrate with control points,
 adjust, intersect check points), by every scheme of parameters.
 
-Slow errors of the attitude over a field's control points go into its interior orientation, where no later adjustment
-finds them. So the calibration is also done with the tie points of its pass in it.
+Slow errors of the attitude over a field's control points go into its interior orientation and bias. To adjust the
+attitude afterwards, with these as if they were exact, counts that part twice and makes errors larger. So the
+calibration whose parameters are used has the tie points of its pass in it, and tells both apart.
 """
 
 from __future__ import annotations
@@ -30,26 +31,23 @@ class Strips:
 
     Attributes:
         ties: field -> how many tie points two lines or more see.
-        schemes: scheme -> field -> errors at its check points, calibrated on control points; the last lets each field
-            use its own parameters.
-        tied: likewise, calibrated on control and tie points.
-        p_values: field -> chance of the fit of its strip with its own parameters, from control and tie points.
+        schemes: scheme -> field -> errors at its check points, calibrated on control and tie points and adjusted on tie
+            points; the last lets each field use its own parameters.
+        p_values: field -> chance of the fit of its strip with its own parameters.
         datum: of the first field with these: turns of the whole pass, sigma before and after.
     """
 
     ties: Mapping[str, int]
     schemes: Mapping[str, Mapping[str, CheckErrors]]
-    tied: Mapping[str, Mapping[str, CheckErrors]]
     p_values: Mapping[str, float]
     datum: tuple[Datum, ...]
 
 
-def strips_adjusted(campaign: Campaign, alone: Mapping[str, Adjustment], advance: Advance) -> Strips | None:
+def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
     """Every field by every scheme; None for a file without a strip.
 
     Args:
         campaign: measurements and schemes.
-        alone: field -> it calibrated by itself.
         advance: how far it is.
 
     Raises:
@@ -58,15 +56,17 @@ def strips_adjusted(campaign: Campaign, alone: Mapping[str, Adjustment], advance
     spec = campaign.spec
     if spec.strip is None:
         return None
-    parts = 2 * (len(spec.schemes) + 1) * len(campaign.passes)
+    fields = len(campaign.passes)
+    parts = (len(spec.schemes) + 2) * fields
+    calibrated = {}
     with one_blas_thread():
-        schemes, _ = _by_scheme(campaign, alone, lambda done: advance("strips", done, parts))
-        with_ties = {p.name: calibrated_with_ties(campaign, p) for p in campaign.passes}
-        tied, own = _by_scheme(campaign, with_ties, lambda done: advance("strips", parts // 2 + done, parts))
+        for k, one in enumerate(campaign.passes):
+            calibrated[one.name] = calibrated_with_ties(campaign, one)
+            advance("strips", k + 1, parts)
+        schemes, own = _by_scheme(campaign, calibrated, lambda done: advance("strips", fields + done, parts))
     return Strips(
         FrozenMap({name: int(np.isfinite(s.ground[:, 0]).sum()) for name, s in own.items()}),
         schemes,
-        tied,
         FrozenMap({name: s.p_value for name, s in own.items()}),
         own[campaign.passes[0].name].datum,
     )
@@ -83,18 +83,20 @@ def calibrated_with_ties(campaign: Campaign, one: FieldPass) -> Adjustment:
 
 def field_with_ties(campaign: Campaign, one: FieldPass) -> CalibrationField:
     """Control and tie points of a pass; of points measured in images the field has both already."""
-    field = one.control
     if not one.ties:
-        return field
-    ground = intersect(one.ties, campaign.laboratory, campaign.noise).ground
-    count, ties = len(field.ground), len(ground)
-    rays = {line: _joined(row, one.ties[line], count) for line, row in field.rays.items()}
+        return one.control
+    return with_points(one.control, one.ties, intersect(one.ties, campaign.laboratory, campaign.noise).ground)
+
+
+def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.ndarray) -> CalibrationField:
+    """A field with more points (n, 3), ITRS, metres, without given coordinates; their rays are numbered from zero."""
+    count, more = len(field.ground), len(ground)
     return replace(
         field,
-        rays=rays,
+        rays={line: _joined(row, rays[line], count) for line, row in field.rays.items()},
         ground=np.concatenate([field.ground, ground]),
-        covariance=np.concatenate([field.covariance, np.zeros((ties, 3, 3))]),
-        control=np.concatenate([field.control, np.zeros(ties, bool)]),
+        covariance=np.concatenate([field.covariance, np.zeros((more, 3, 3))]),
+        control=np.concatenate([field.control, np.zeros(more, bool)]),
     )
 
 
@@ -129,7 +131,7 @@ def _joined(control: Rays, ties: Rays, count: int) -> Rays:
 
 
 def _by_scheme(
-    campaign: Campaign, alone: Mapping[str, Adjustment], advance: Callable[[int], None]
+    campaign: Campaign, calibrated: Mapping[str, Adjustment], advance: Callable[[int], None]
 ) -> tuple[FrozenMap[str, FrozenMap[str, CheckErrors]], dict[str, StripAdjustment]]:
     """Errors by scheme and field, and the strips with each field's own parameters."""
     found: dict[str, FrozenMap[str, CheckErrors]] = {}
@@ -139,7 +141,7 @@ def _by_scheme(
         errors = {}
         for one in campaign.passes:
             names = scheme or (one.name,)
-            cameras, bias = averaged(campaign, [alone[name] for name in names], names)
+            cameras, bias = averaged(campaign, [calibrated[name] for name in names], names)
             strip = adjusted_strip(campaign, one, cameras, bias)
             errors[one.name] = tested_in_strip(campaign, one, strip, cameras, bias)
             if scheme is None:

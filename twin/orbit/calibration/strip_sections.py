@@ -19,11 +19,11 @@ _ARCSEC = np.pi / 648000.0
 def gained(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -> str:
     """What the adjustment gains, in one sentence, from the scheme with most averaged parameters."""
     scheme = list(found.schemes)[-2]
-    old, plain, new = (PooledErrors.of(e[scheme].values()) for e in (before, found.schemes, found.tied))
+    old, new = (PooledErrors.of(e[scheme].values()) for e in (before, found.schemes))
     return (
-        f"Adjusting each pass on {min(found.ties.values())} tie points or more takes the height RMS of scheme {scheme} "
-        f"from {old.height:.2f} m to {plain.height:.2f} m, and to {new.height:.2f} m where the calibration uses the "
-        f"tie points, too; the plan RMS goes from {old.plan:.2f} m to {plain.plan:.2f} m and {new.plan:.2f} m."
+        f"Calibrating with {min(found.ties.values())} tie points of each pass or more, and adjusting each pass on "
+        f"them, takes the height RMS of scheme {scheme} from {old.height:.2f} m to {new.height:.2f} m and the plan RMS "
+        f"from {old.plan:.2f} m to {new.plan:.2f} m."
     )
 
 
@@ -31,17 +31,17 @@ def strips_section(run: CalibrationRun, found: Strips) -> Section:
     """Errors before and after, and what tie points cannot tell."""
     rows: list[tuple[Cell, ...]] = []
     for scheme, fields in found.schemes.items():
-        old, plain, new = (PooledErrors.of(e.values()) for e in (run.schemes[scheme], fields, found.tied[scheme]))
-        rows.append((scheme, old.plan, plain.plan, new.plan, old.height, plain.height, new.height))
+        old, new = (PooledErrors.of(e.values()) for e in (run.schemes[scheme], fields))
+        rows.append((scheme, old.plan, new.plan, old.height, new.height))
     table = Table(
         "strips",
-        "Check points with and without adjustment of the strip",
-        "RMS at check points of all fields without ground control, metres: as measured, adjusted with cameras "
-        "calibrated on control points, adjusted with cameras calibrated on control and tie points. The last scheme "
-        "lets each field use its own parameters.",
-        ("scheme", "plan", "adjusted", "calibrated with ties", "height", "adjusted", "calibrated with ties"),
+        "Check points with and without tie points",
+        "RMS at check points of all fields without ground control, metres: calibrated on control points and "
+        "intersected as measured; calibrated on control and tie points and intersected with the adjusted attitude and "
+        "orbit. The last scheme lets each field use its own parameters.",
+        ("scheme", "plan", "plan, with ties", "height", "height, with ties"),
         rows,
-        (None, 2, 2, 2, 2, 2, 2),
+        (None, 2, 2, 2, 2),
     )
     turns: list[tuple[Cell, ...]] = [
         (d.name, d.before / _ARCSEC, d.after / _ARCSEC, d.after / d.before) for d in found.datum
@@ -73,9 +73,10 @@ def strips_section(run: CalibrationRun, found: Strips) -> Section:
         "whatever repeats itself from one line's view of a place to the next, for as long as two such views last. It "
         "shifts heights, and only a strip that is long against this, with errors slower than it is long, gains much.",
         "Slow errors during the seconds in which a line sees the control points look like a change of its interior "
-        "orientation or of the bias, and the calibration takes part of them for one. Where a field is tested with its "
-        "own parameters in its own pass, this part cancels at the check points, and adjusting the attitude alone "
-        "brings it back. With the tie points of the whole strip in the calibration, interior and attitude are "
-        "told apart better, and bias and attitude belong together.",
+        "orientation or of the bias, and a calibration on control points alone takes part of them for one. Adjusting "
+        "the attitude afterwards would count this part twice, and errors would grow. With the tie points of the whole "
+        "strip in the calibration, interior and attitude are told apart, and the adjusted attitude belongs to them. A "
+        "single campaign of few fields scatters: each slow error that a pass keeps is shared by all of its points, so "
+        "that one scheme may lose by chance where it gains on average.",
     )
     return Section("Adjustment of the strips", text, (table, common))
