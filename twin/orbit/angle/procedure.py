@@ -29,6 +29,7 @@ from analysis.orbit.angles import (
 from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneError, PlaneFit, Strip, fit_plane
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
 from analysis.orbit.sensitivity import Sensitivity, sensitivity
+from optics.threads import one_blas_thread
 from scenes.orbit_angle import PAPER_ANGLES
 from twin.orbit.angle.camera import angle_camera
 from twin.orbit.angle.flight import AnglePass, Measurement, fly
@@ -215,6 +216,7 @@ def values_of(angles: Mapping[str, float]) -> np.ndarray:
     return np.array(list(angles.values()))
 
 
+@one_blas_thread()  # of small matrices: threads would only wait for each other
 def run_passes(
     setup: AngleSetup, seed: int, advance: Callable[[str, int, int], None], backend: Backend | None = None
 ) -> AngleRun:

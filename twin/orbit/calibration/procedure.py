@@ -17,6 +17,7 @@ from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.frozen_map import FrozenMap
+from optics.threads import one_blas_thread
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
 from twin.orbit.calibration.influences import (
     OFFSET,
@@ -105,6 +106,7 @@ class CalibrationRun:
     strips: Strips | None
 
 
+@one_blas_thread()  # of small matrices: threads would only wait for each other
 def run_calibration_passes(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun:
     """Fly, calibrate, test.
 
