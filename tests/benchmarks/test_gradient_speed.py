@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import drjit as dr
 import numpy as np
+import pytest
 
 from optics import quadrature
 from optics.system import assemble
@@ -29,6 +30,7 @@ def processor_time(work: Callable[[], object]) -> float:
     return min(spent)
 
 
+@pytest.mark.slow
 def test_jacobian_of_the_spots(benchmark, gf7_pair, backend) -> None:
     """8 coordinates by 95 and by 618 motions with 100 000 rays in each of 4 channels: at most 30 forward traces."""
     path = MonitorPath(gf7_pair, backend, quadrature.disk(RINGS, ARMS))

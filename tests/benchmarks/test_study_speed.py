@@ -43,6 +43,7 @@ def warm(workers, plan, count):
     assert workers.count == count
 
 
+@pytest.mark.slow
 def test_engine_adds_less_than_a_millisecond(tmp_path, benchmark) -> None:
     """Wall time of one worker less the time that it was busy: plan, hand-over, store; at most 1 ms a state."""
     plan = Plan.of(resolve_study(write_study(tmp_path / "in", ("runs: 100", "runs: 525"))))
@@ -75,7 +76,7 @@ def test_ten_thousand_states(tmp_path, benchmark) -> None:
     """The pair's monitor with nine frames: at most 200 s and 4 GiB in all processes on two cores.
 
     The states share their noise, so that the frames before are taken and measured once; noise of its own, with frames
-    before and after for each state, costs half as much again.
+    before and after for each state, costs 1.7 times as much.
     """
     changes = (
         ("runs: 100", f"runs: {LARGE}"),

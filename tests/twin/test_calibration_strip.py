@@ -61,6 +61,7 @@ def mean_squares(before: np.ndarray, after: np.ndarray, passes: int) -> np.ndarr
     return np.mean(both.reshape(2, drawn, -1) ** 2, axis=2)
 
 
+@pytest.mark.slow
 def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
     """Four passes with the true camera, 5 arcsec every 20 s, 200 ties; false alarm 1e-3 for each limit.
 
@@ -108,6 +109,7 @@ def test_what_a_user_gets_is_better_on_average_than_without_ties(elsewhere: bool
     assert control.rms(True)[0] > control.rms(False)[0]
 
 
+@pytest.mark.slow
 def test_errors_with_ties_are_those_of_the_covariances() -> None:
     """Three passes, each by its own parameters; plan and height, two-sided false alarm 1e-3 each."""
     squares = []

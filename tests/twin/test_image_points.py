@@ -100,6 +100,7 @@ def write(folder: Path, source: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_simulate_lists_its_points(tmp_path: Path) -> None:
     few = POINTS.replace("200", "40").replace("100", "20")
     path = write(

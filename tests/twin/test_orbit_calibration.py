@@ -354,6 +354,7 @@ def write(folder: Path, old: str, new: str, repeats: int = 0) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_command(full, tmp_path: Path) -> None:
     path = write(tmp_path, "control: 60, check: 100", "control: 20, check: 20", repeats=2)
     result = run("calibrate", path, "--out", tmp_path / "run", "--seed", 5, "--json")

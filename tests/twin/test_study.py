@@ -226,9 +226,8 @@ def test_a_scheduler_that_is_not_there(tmp_path) -> None:
     assert "tcp://" in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     """To the whole group of processes, as the terminal's Ctrl-C is, and to the command alone, as kill is."""
     path = write_study(tmp_path / "in", ("runs: 100", "runs: 4000"))
