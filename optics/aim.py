@@ -62,6 +62,8 @@ def transverse_axes(direction: np.ndarray, first: np.ndarray) -> np.ndarray:
     return np.stack([e1, np.cross(direction, e1)], axis=-2)
 
 
+# what is no number is told by AimError alone
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def aim(
     backend: Backend,
     systems: SystemBatch,

@@ -46,7 +46,3 @@ class Element:
     def with_aperture(self, aperture: Aperture | None) -> Element:
         """The same element with another aperture."""
         return replace(self, aperture=aperture)
-
-    def with_surface(self, surface: Surface) -> Element:
-        """The same element with another surface."""
-        return replace(self, surface=surface)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from optics.scatter import ABg, Scatter
 
@@ -50,10 +50,6 @@ class Finish:
         """reflectance, transmission, bare, diffuse, and the lobe's share, scale, exponent, kind."""
         lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers
         return (self.reflectance, self.transmission, float(self.bare), self.diffuse, *lobe)
-
-    def with_scatter(self, scatter: Scatter | None) -> Finish:
-        """The same finish with another scatter lobe."""
-        return replace(self, scatter=scatter)
 
 
 POLISH = ABg(2.0e-6, 1.0e-6, 2.0)

@@ -41,11 +41,6 @@ class Material:
         if not -1.0 < self.poisson_ratio < 0.5:
             raise ValueError(f"{self.name}: Poisson's ratio must lie between -1 and 0.5, found {self.poisson_ratio}")
 
-    @property
-    def shear_modulus(self) -> float:
-        """E / (2 (1 + nu)), Pa."""
-        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
-
 
 _ALL = (
     Material(

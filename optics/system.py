@@ -6,7 +6,7 @@ order) can be batched together: the two cameras of an instrument, left and right
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,12 +75,6 @@ class SystemBatch:
             uploaded.append(arrays)
         grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
         return UploadedSystems(self.structure, tuple(uploaded), grids, self.count, self.tangents is not None)
-
-    def slices(self, size: int) -> Iterator[tuple[slice, SystemBatch]]:
-        """Consecutive pieces of at most ``size`` systems, to bound memory."""
-        for start in range(0, self.count, size):
-            piece = slice(start, min(start + size, self.count))
-            yield piece, self.take(np.arange(piece.start, piece.stop))
 
     def take(self, systems: np.ndarray) -> SystemBatch:
         """The systems of the given indices."""
@@ -231,7 +225,7 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
         (
             e.interaction,
             e.surface.is_plane,
-            len(e.surface.even),
+            0 if e.surface.is_plane else len(e.surface.even),  # a plane may have terms that are zero
             isinstance(e.surface.figure, GridFigure),
             _aperture_kind(e),
         )

@@ -33,7 +33,7 @@ class Rays:
     """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still alive.
 
     Attributes:
-        position, direction, path, valid: of width systems * N.
+        position, direction, path, valid: of width systems * N; a direction that all rays share is of width 1.
         systems: number of systems that the rays are for, system by system; 1: every system gets all of them.
     """
 
@@ -88,15 +88,18 @@ def rows(vector: Any, count: int) -> np.ndarray:
 def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, path: np.ndarray | None = None) -> Rays:
     """Upload rays given by positions in metres and unit directions, broadcastable to each other.
 
-    Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own.
+    Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own. A direction (3,)
+    is kept as one vector: a trace through conics is held up by the memory that it reads.
     """
     import drjit as dr
 
+    shared = np.ndim(direction) == 1
     position, direction = np.broadcast_arrays(np.asarray(position, np.float64), np.asarray(direction, np.float64))
     systems = position.shape[0] if position.ndim == 3 else 1
     n = position.size // 3
-    start = backend.opaque(np.zeros(n) if path is None else np.asarray(path, dtype=np.float64).ravel())
-    return Rays(backend.vector(position), backend.vector(direction), start, dr.full(backend.Bool, True, n), systems)
+    start = dr.zeros(backend.Float, n) if path is None else backend.opaque(path)
+    heading = backend.vector(direction.reshape(-1, 3)[:1] if shared else direction)
+    return Rays(backend.vector(position), heading, start, dr.full(backend.Bool, True, n), systems)
 
 
 def trace(
@@ -149,6 +152,7 @@ def trace(
             valid = valid & ok
         if i in keep:
             hits[i] = p
+    d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
     local = Rays(p, d, path, valid, uploaded.count)
     outside = None
     if world:
@@ -194,7 +198,7 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
         ray = index % dr.opaque(backend.UInt, shared)
         rays = Rays(
             dr.gather(backend.Vector3, rays.position, ray),
-            dr.gather(backend.Vector3, rays.direction, ray),
+            rays.direction if dr.width(rays.direction) == 1 else dr.gather(backend.Vector3, rays.direction, ray),
             dr.gather(backend.Float, rays.path, ray),
             dr.gather(backend.Bool, rays.valid, ray),
         )
@@ -237,8 +241,7 @@ def _distance(
         discriminant = b * b - a * e
         ok = discriminant >= 0.0
         root = dr.sqrt(dr.select(ok, discriminant, 1.0))
-        # of the two crossings the one on the vertex sheet: the denominator keeps the sign of d.z and never cancels
-        # there
+        # of the two crossings the one on the vertex sheet: the denominator keeps d.z's sign and never cancels there
         t = e / (dr.copysign(root, d.z) - b)
         if not bent:
             return t, ok & (q * c * dr.fma(t, d.z, p.z) < 1.0)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.aim import transverse_axes
+from optics.aim import AimError, transverse_axes
 from optics.aperture import Aperture, Circle, Rectangle
 from optics.assembly import Assembly
 from optics.backend import Backend
@@ -24,7 +24,7 @@ from optics.imaging import aim_collimated
 from optics.pose import Pose
 from optics.surface import Surface, plane
 from optics.system import SystemBatch, assemble
-from optics.trace import make_rays, require_some, trace
+from optics.trace import BeamMissedError, make_rays, require_some, trace
 from optics.tree import Body, RigidTree
 
 if TYPE_CHECKING:
@@ -116,8 +116,19 @@ def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
     """Trace a prescription and work out frames, stop, apertures and first-order numbers.
 
     Raises:
-        AimError: the prescription does not bring the centre's chief ray through the stop.
+        InputError: the prescription does not bring the light of its field through the stop to the image.
     """
+    try:
+        return _derived(spec, backend)
+    except (AimError, BeamMissedError) as error:
+        reason = str(error).partition(";")[0]
+        problem = f"no light of the whole field comes through the stop to the image: {reason}"
+        allowed = "mirrors, image, field and stop that belong together"
+        raise spec.error(problem, ("mirrors",), allowed=allowed) from error
+
+
+def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
+    """What `derive_camera` says. Raises AimError, BeamMissedError."""
     surfaces = {name: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for name, m in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)

@@ -2,8 +2,9 @@
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from scenes.errors import Problem
 from scenes.spec import Name, Number, Spec, Text, Whole
 
 
@@ -30,8 +31,16 @@ class DetectorSpec(Spec):
     system_gain_dn_per_e: Annotated[Number, Field(gt=0.0, le=1e4)]
     dark_noise_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     dark_current_e_per_s: Annotated[Number, Field(ge=0.0, le=1e9)]
-    full_well_e: Annotated[Number, Field(gt=0.0, le=1e9)]
-    prnu: Annotated[Number, Field(ge=0.0, le=0.5)]
+    full_well_e: Annotated[Number, Field(ge=1.0, le=1e9)]
+    prnu: Annotated[Number, Field(ge=0.0, le=0.2)]
     dsnu_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     bit_depth: Annotated[Whole, Field(ge=1, le=16)]
     offset_dn: Annotated[Number, Field(ge=0.0, le=65535.0)]
+
+    @model_validator(mode="after")
+    def _leaves_grey_values(self) -> "DetectorSpec":
+        most = 2**self.bit_depth - 1
+        if self.offset_dn >= most:
+            found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {most}"
+            raise Problem("no grey values are left above the offset", found, allowed, within=("offset_dn",))
+        return self

@@ -50,7 +50,7 @@ class Issue:
             text += f", allowed: {self.allowed}" if self.found is not None else f"; allowed: {self.allowed}"
         if self.suggestion is not None:
             text += f"; did you mean {self.suggestion!r}?"
-        return text
+        return printable(text)
 
 
 class InputError(Exception):
@@ -151,6 +151,11 @@ def shown(value: object) -> str:
     else:
         text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 3] + "..."
+
+
+def printable(text: str) -> str:
+    """Text on one line without what a terminal would act upon: control characters come out as escapes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def names_text(names: Iterable[object]) -> str:

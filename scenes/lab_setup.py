@@ -1,5 +1,6 @@
 """A laboratory test together with everything it refers to, so that one file says all that went into a run."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from optics.frozen_map import FrozenMap
@@ -59,6 +60,7 @@ def resolve_focus(path: str | Path) -> FocusSetup:
     """
     if (again := read_setup(FocusSetup, path)) is not None:
         _require_plane(again.test, again.camera)
+        _require_detectors(again, again.camera, again.detectors)
         return again
     test = load_lab_test(FocusTestSpec, path)
     camera = load_camera(find_camera(test))
@@ -74,6 +76,7 @@ def resolve_distortion(path: str | Path) -> DistortionSetup:
     """
     if (again := read_setup(DistortionSetup, path)) is not None:
         _require_bands(again.test, again.camera, again.test.band)
+        _require_detectors(again, again.camera, again.detectors)
         return again
     test = load_lab_test(DistortionTestSpec, path)
     camera = load_camera(find_camera(test))
@@ -104,6 +107,15 @@ def _require_plane(test: Spec, camera: CameraSpec) -> None:
             ("camera",),
             allowed="a camera with bands at different offsets",
         )
+
+
+def _require_detectors(setup: Spec, camera: CameraSpec, detectors: Mapping[str, DetectorSpec]) -> None:
+    """Of a config.yaml, which may have been changed by hand."""
+    for name, band in camera.bands.items():
+        if band.detector not in detectors:
+            key = ("camera", "bands", name, "detector")
+            allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
+            raise setup.error("no such detector in this file", key, found=band.detector, allowed=allowed)
 
 
 def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> None:

@@ -8,7 +8,7 @@ from pydantic import Field
 from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
 from scenes.detector import DetectorSpec
-from scenes.errors import names_text, nearest
+from scenes.errors import KeyPath, names_text, nearest
 from scenes.experiment import ExperimentSetup, read_setup
 from scenes.instrument import InstrumentSpec
 from scenes.job import DEFAULT_PIVOT
@@ -122,7 +122,8 @@ def _checked_angles(setup: AngleSetup) -> AngleSetup:
                 raise test.error("no such line", key, found=line, allowed=names_text(lines), suggestion=meant)
     if setup.camera is not None:
         _require_turns(test, lines)
-    _require_pixels(test, "strips", (test.strips.first, test.strips.last), setup.usual_pixels, setup.camera_name)
+    ends = (test.strips.first, test.strips.last)
+    _require_ends(test, "strips", ends, setup.usual_pixels, f"the lines of {setup.camera_name}")
     return setup.model_copy(update={"test": test.model_copy(update={"angles": FrozenMap(angles)})})
 
 
@@ -168,6 +169,8 @@ def resolve_calibration(path: str | Path) -> CalibrationSetup:
         detectors = FrozenMap(load_line_detectors(camera)) if test.images is not None else FrozenMap()
         setup = CalibrationSetup.model_construct(test=test, camera=camera, detectors=detectors)
     _require_calibration(setup.test, setup.camera)
+    if setup.test.images is not None:
+        _require_detectors(setup, tuple(setup.camera.lines), setup.camera, setup.detectors)
     return setup
 
 
@@ -240,11 +243,8 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
     if abs(looks[0] - looks[1]) < _LEAST_ANGLE:
         found = " and ".join(format_quantity(look, ANGLE) for look in looks)
         raise test.error("the cameras look the same way", ("cameras",), found=found, allowed="1 deg apart or more")
-    line = cameras[instrument.cameras[pair[1]].camera].line
-    for key, pixel in zip(("first", "last"), (test.ground.first, test.ground.last), strict=True):
-        if not -0.5 <= pixel <= line.pixels - 0.5:
-            allowed = f"-0.5 to {line.pixels - 0.5:g}, the ends of the line of {pair[1]}"
-            raise test.error("outside the line", ("ground", key), found=f"pixel {pixel:g}", allowed=allowed)
+    pixels = cameras[instrument.cameras[pair[1]].camera].line.pixels
+    _require_ends(test, "ground", (test.ground.first, test.ground.last), pixels, f"the line of {pair[1]}")
 
 
 _LEAST_ANGLE = 0.0174
@@ -276,6 +276,7 @@ def resolve_simulate(path: str | Path) -> SimulateSetup:
         detectors = FrozenMap(load_line_detectors(camera))
         setup = SimulateSetup.model_construct(test=test, camera=camera, detectors=detectors)
     _require_images(setup.test, setup.camera)
+    _require_detectors(setup, setup.test.lines, setup.camera, setup.detectors)
     return setup
 
 
@@ -287,14 +288,9 @@ def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> Non
         if name not in names:
             allowed = f"{names_text(names)}, the lines of {camera.name}"
             raise test.error("no such line", key, found=name, allowed=allowed, suggestion=nearest(name, names))
-    for name in test.lines:
-        if camera.image_of(name) is None:
-            problem = f"{camera.name} does not say how its line {name} forms an image"
-            raise test.error(problem, ("camera",), found=camera.name, allowed="a payload with a section `image`")
-    last = camera.pixels_of(test.patch.line) - 0.5
-    if not -0.5 <= test.patch.pixel <= last:
-        allowed = f"-0.5 to {last:g}, the ends of the line {test.patch.line} of {camera.name}"
-        raise test.error("outside the line", ("patch", "pixel"), found=f"pixel {test.patch.pixel:g}", allowed=allowed)
+    _require_images_of(test, test.lines, camera)
+    line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
+    _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
     first, end = -test.orbit.before, test.orbit.after
     if not first < test.patch.time < end:
         allowed = f"between {format_quantity(first, MOMENT)} and {format_quantity(end, MOMENT)}, or a longer orbit"
@@ -317,18 +313,13 @@ def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec
         )
     fewest = min(camera.pixels_of(name) for name in LINES)
     if test.points is not None:
-        _require_pixels(test, "points", (test.points.first, test.points.last), fewest, camera.name)
+        _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
     if test.images is None:
         return
-    for name in LINES:
-        if camera.image_of(name) is None:
-            problem = f"{camera.name} does not say how its line {name} forms an image"
-            raise test.error(problem, ("camera",), found=camera.name, allowed="a payload with a section `image`")
+    _require_images_of(test, LINES, camera)
     for k, place in enumerate(test.images.patches):
-        if not -0.5 <= place.pixel <= camera.pixels_of("nadir") - 0.5:
-            key, last = ("images", "patches", k, "pixel"), camera.pixels_of("nadir") - 0.5
-            allowed = f"-0.5 to {last:g}, the ends of the nadir line of {camera.name}"
-            raise test.error("outside the line", key, found=f"pixel {place.pixel:g}", allowed=allowed)
+        key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
+        _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
 
 
 _THREE_LINES = "a camera with lines forward, nadir and aft"
@@ -343,10 +334,36 @@ def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...] = 
             )
 
 
-def _require_pixels(test: Spec, section: str, ends: tuple[float, float], pixels: int, camera: str) -> None:
+def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:
+    """InputError unless the camera says of each line how it forms its image."""
+    for name in lines:
+        if camera.image_of(name) is None:
+            problem = f"{camera.name} does not say how its line {name} forms an image"
+            raise test.error(problem, ("camera",), found=camera.name, allowed="a payload with a section `image`")
+
+
+def _require_detectors(
+    setup: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec, detectors: Mapping[str, DetectorSpec]
+) -> None:
+    """InputError unless all data sheets are there; a config.yaml may have been changed by hand."""
+    for name in lines:
+        image = camera.image_of(name)
+        if image is not None and image.detector not in detectors:
+            own = ("lines", name, "image") if camera.lines[name].image is not None else ("image",)
+            allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
+            key = ("camera", *own, "detector")
+            raise setup.error("no such detector in this file", key, found=image.detector, allowed=allowed)
+
+
+def _require_ends(test: Spec, section: str, ends: tuple[float, float], pixels: int, line: str) -> None:
     """InputError unless ``first`` and ``last`` of a section lie on a line of so many pixels."""
-    last = pixels - 0.5
     for key, pixel in zip(("first", "last"), ends, strict=True):
-        if not -0.5 <= pixel <= last:
-            allowed = f"-0.5 to {last:g}, the ends of the lines of {camera}"
-            raise test.error("outside the line", (section, key), found=f"pixel {pixel:g}", allowed=allowed)
+        _require_pixel(test, (section, key), pixel, pixels, line)
+
+
+def _require_pixel(test: Spec, key: KeyPath, pixel: float, pixels: int, line: str) -> None:
+    """InputError unless a place lies on a line of so many pixels, which is told as the text says."""
+    last = pixels - 0.5
+    if not -0.5 <= pixel <= last:
+        allowed = f"-0.5 to {last:g}, the ends of {line}"
+        raise test.error("outside the line", key, found=f"pixel {pixel:g}", allowed=allowed)

@@ -23,10 +23,8 @@ from scenes.units import (
     PER_LENGTH3,
     PER_LENGTH5,
     PER_LENGTH7,
-    POWER,
     SCALE,
     TEMPERATURE,
-    TEMPERATURE_DIFFERENCE,
     TIME,
     Kind,
     format_quantity,
@@ -160,12 +158,8 @@ Scale = Annotated[float, Quantity(SCALE)]
 """A relative change, dimensionless: 1e-6 for 1 ppm."""
 Time = Annotated[float, Quantity(TIME)]
 """Seconds."""
-Power = Annotated[float, Quantity(POWER)]
-"""Watts."""
 Temperature = Annotated[float, Quantity(TEMPERATURE, smallest="0 K")]
 """Kelvin, absolute."""
-TemperatureDifference = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE)]
-"""Kelvin."""
 AsphereTerms = Annotated[
     Mapping[str, float],
     Terms({"A4": Quantity(PER_LENGTH3), "A6": Quantity(PER_LENGTH5), "A8": Quantity(PER_LENGTH7)}),

@@ -68,10 +68,6 @@ class Scenery:
         """Number of the surface on which an element lies; KeyError when there is none."""
         return self._by_element[element]
 
-    def has_element(self, element: str) -> bool:
-        """Whether some surface carries that element (elements that only mark a place have none)."""
-        return element in self._by_element
-
 
 def build_scenery(
     instrument: Instrument,

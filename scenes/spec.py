@@ -102,7 +102,7 @@ class Spec(BaseModel):
 
     @property
     def source(self) -> Source:
-        """Where it was read; only what a loader returned knows, its parts do not."""
+        """Where it was read; defaults and what was made in other ways do not know."""
         return self._source
 
     def with_source(self, source: Source) -> "Spec":

@@ -4,6 +4,7 @@ on.
 
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -29,7 +30,26 @@ def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     except ValidationError as error:
         issues = [_issue(model, detail, source) for detail in error.errors(include_url=False)]
         raise InputError(*sorted(issues, key=lambda issue: issue.line or 0)) from None
-    return typing.cast(SpecType, spec.with_source(source))
+    spec = typing.cast(SpecType, spec.with_source(source))
+    _tell_parts(spec, source)
+    return spec
+
+
+def _tell_parts(value: Any, source: Source) -> None:
+    """Let every specification below ``value`` know where it was read; defaults were not, and are shared."""
+    parts: typing.Iterable[tuple[Any, Any]] = ()
+    if isinstance(value, Spec):
+        parts = [(name, getattr(value, name)) for name in type(value).model_fields if name in value.model_fields_set]
+    elif isinstance(value, Mapping):
+        parts = value.items()
+    elif isinstance(value, tuple | list):
+        parts = enumerate(value)
+    for name, part in parts:
+        own = Source(source.file, source.lines, (*source.prefix, name))
+        if isinstance(part, Spec):
+            part._source = own
+        if isinstance(part, Spec | Mapping | tuple | list):
+            _tell_parts(part, own)
 
 
 def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
@@ -71,6 +91,8 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
         problem, allowed = "not a number", "a plain number, without a unit"
     elif kind == "finite_number":
         problem, allowed = "not a finite number", "a plain number, without a unit"
+    elif kind in ("bool_type", "bool_parsing"):
+        problem, allowed = "neither true nor false", "true or false"
     elif kind == "string_type":
         problem, allowed = "not text", "text"
     elif kind == "string_pattern_mismatch":

@@ -1,16 +1,48 @@
 """Fixtures that every test may use. They last the session, so that kernels compile and cameras are derived once."""
 
+import os
 from functools import cache
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from optics.backend import Backend, load_backend
+from optics.threads import cores
 from scenes.camera_model import CameraModel, derive_camera
 from scenes.instrument_model import Instrument, build_instrument
 from scenes.job import JobSpec
 from scenes.load import load_camera, load_instrument
 from scenes.resolved import resolve_job
 from twin.experiment import MonitorExperiment
+
+# Properties are tried on the same examples every time, on every machine. Kernels compile with the first of them.
+settings.register_profile(
+    "twin", derandomize=True, deadline=None, max_examples=25, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("twin")
+
+MOST_PROCESSES, GIBIBYTES_EACH = 4, 3
+"""Of the default's test processes: how many at most, and what memory the machine has for each at least."""
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """How many processes run the tests: 0 for the one that was started, also when it is asked for one file only."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
+    most = min(cores(), MOST_PROCESSES, int(memory / GIBIBYTES_EACH))
+    chosen = {config.invocation_params.dir / argument.split("::")[0] for argument in config.args}
+    if all(place.is_file() for place in chosen):
+        most = min(most, len(chosen))
+    return most if most > 1 else 0
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Leave linear algebra one thread in each of several processes, before they are started and load it.
+
+    Several threads of OpenBLAS wait actively, for each other's processor. Dr.Jit's wait asleep and stay as they are.
+    """
+    if getattr(config.option, "numprocesses", None):
+        for library in ("OPENBLAS", "OMP", "MKL"):
+            os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 
 @pytest.fixture(scope="session")

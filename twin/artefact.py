@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import csv
-import io
 import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from twin.data_file import csv_table
 from twin.report.numbers import fixed
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
@@ -122,14 +121,10 @@ class Table(Artefact):
 
     def content(self) -> bytes:
         """The table with all its digits."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.heads)
         for row in self.rows:
             if len(row) != len(self.heads):
                 raise ValueError(f"artefact {self.name!r}: a row of {len(row)} cells under {len(self.heads)} heads")
-            writer.writerow(row)
-        return text.getvalue().encode()
+        return csv_table([self.heads, *self.rows])
 
 
 @dataclass(frozen=True, eq=False)

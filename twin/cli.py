@@ -22,7 +22,7 @@ from rich.table import Table
 
 from optics.backend import NAMES, BackendUnavailable
 from optics.llvm import LibraryMissing
-from scenes.errors import InputError
+from scenes.errors import InputError, printable
 from twin.run_folder import RunFolderError
 
 FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
@@ -85,7 +85,8 @@ def print_place(console: Console, target: Path) -> None:
 
 
 def print_error(errors: Console, text: str) -> None:
-    """One error message, as it is: no markup, no wrapping."""
+    """One error message, as it is: no markup, no wrapping; control characters as escapes."""
+    text = "\n".join(printable(line) for line in text.split("\n"))
     errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
 
 

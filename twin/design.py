@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import typer
 
+from optics.aim import AimError
 from optics.backend import Backend
 from optics.design import Design, DesignError, optimise
 from optics.design_merit import Goals, Judge, Judgement
+from optics.trace import BeamMissedError
 from scenes.camera_design import (
     CameraDesignSetup,
     beams_of,
@@ -54,11 +56,16 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
     """Optimise the camera; nothing is drawn, the seed is not used.
 
     Raises:
-        BenchError: the constraints cannot be held, or the camera passes no light.
+        InputError: the camera passes no light.
+        BenchError: the constraints cannot be held.
     """
     test, camera = setup.test, setup.camera
     start, beams = prescription_of(camera), beams_of(camera)
-    first = Judge.of(backend, start, beams, Goals(camera.wavelength)).judge(start)
+    try:
+        first = Judge.of(backend, start, beams, Goals(camera.wavelength)).judge(start)
+    except (AimError, BeamMissedError) as error:
+        problem = f"no beams to design with come through: {str(error).partition(';')[0]}"
+        raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
     goals = goals_of(setup, first.principal_distance, first.envelope)
     try:
         found = optimise(

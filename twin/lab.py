@@ -8,7 +8,7 @@ from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntabl
 from twin.laboratory.distortion import run_distortion
 from twin.laboratory.focus_result import run_focus
 from twin.laboratory.turntable_result import run_turntable_test
-from twin.trial.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
+from twin.trial.command import add_test
 
 PROGRAM = "twin.lab"
 
@@ -29,60 +29,43 @@ def main() -> None:
     """
 
 
-@app.command()
-def focus(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+add_test(
+    app,
+    PROGRAM,
+    "focus",
+    resolve_focus,
+    run_focus,
     """Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
     shims, and the same again.
 
     focus.json holds, for every round, the confocal error, the line's level, MTF at Nyquist by band and the shims,
     and under `truth` what the exact trace says.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "focus", file, resolve_focus, run_focus, options)
+    """,
+)
 
-
-@app.command()
-def distortion(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+add_test(
+    app,
+    PROGRAM,
+    "distortion",
+    resolve_distortion,
+    run_distortion,
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
 
     distortion.json: `rms_raw_um` and `rms_compensated_um` are what a laboratory can state, the scatter of the points
     about a smooth curve; how wrong the distortion is stands under `truth`, `error_rms_raw_um` and
     `error_rms_compensated_um`.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "distortion", file, resolve_distortion, run_distortion, options)
+    """,
+)
 
-
-@app.command()
-def turntable(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
-    """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles."""
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "turntable", file, resolve_turntable, run_turntable_test, options)
+add_test(
+    app,
+    PROGRAM,
+    "turntable",
+    resolve_turntable,
+    run_turntable_test,
+    """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.""",
+)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from twin.course import CourseRun
+from twin.data_file import netcdf
 from twin.image_file import SPOT_STRETCH, preview_png, tiff
 from twin.report import write_report
 from twin.results import RenderRun, quality_dict
@@ -42,7 +43,7 @@ def write_run(
             stem = f"images/{channel.camera}_{channel.side}_{when}"
             folder.write_bytes(f"{stem}.tiff", tiff(frames))
             folder.write_bytes(f"{stem}.png", preview_png(frames))
-    folder.write_bytes("irradiance.nc", _netcdf(_irradiance(run)))
+    folder.write_bytes("irradiance.nc", netcdf(_irradiance(run)))
     if run.stray is not None:
         folder.write_json("stray.json", run.stray.to_dict())
     if run.course is not None:
@@ -75,7 +76,7 @@ def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
     for i, channel in enumerate(run.experiment.path.channels):
         folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", tiff(course.frames[:, i]))
     time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
-    folder.write_bytes("course.nc", _netcdf(_images(run, "time", time, course.photons)))
+    folder.write_bytes("course.nc", netcdf(_images(run, "time", time, course.photons)))
 
 
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
@@ -84,16 +85,6 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
     for stem, name, frames in targets.images():
         folder.write_bytes(f"images/{stem}.tiff", tiff(frames))
         folder.write_bytes(f"images/{stem}.png", preview_png(frames, SPOT_STRETCH if name == "pinhole" else None))
-
-
-def _netcdf(data: xr.Dataset) -> bytes:
-    """A data set as the contents of a netCDF-4 file."""
-    view = data.to_netcdf(engine="h5netcdf")
-    content = bytes(view)
-    # xarray hands out a window on its buffer, which complains when it is thrown away with the window still open
-    if isinstance(view, memoryview):
-        view.release()
-    return content
 
 
 def _irradiance(run: RenderRun) -> xr.Dataset:

@@ -126,8 +126,15 @@ def principle_checks(
     for n in range(benches):
         say(f"bench {n + 1} of {benches}")
         real.append(run_principle_experiment(setup, backend, seed=seed + n, reader=reader))
-    checks = [_relation(setup.spec, series, ideal, real) for series in table_2(setup.spec)]
-    return (*checks, _z_columns(setup.spec, real))
+    return compare(setup.spec, ideal, real)
+
+
+def compare(
+    spec: PrincipleExperimentSpec, ideal: PrincipleTable, real: Sequence[PrincipleTable]
+) -> tuple[PrincipleCheck, ...]:
+    """The printed Table 2 beside rendered ones: of the ideal bench and of at least one with errors."""
+    checks = [_relation(spec, series, ideal, real) for series in table_2(spec)]
+    return (*checks, _z_columns(spec, real))
 
 
 def _relation(

@@ -138,7 +138,7 @@ def render_job(
         recovery=recovery,
         crosstalk=tables,
         warnings=(
-            *_warnings(experiment, resolved, nominal, photons[0], before, after[0]),
+            *_warnings(experiment, nominal, photons[0], before, after[0]),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(targets.warnings if targets is not None else ()),
@@ -218,7 +218,6 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
 
 def _warnings(
     experiment: MonitorExperiment,
-    resolved: ResolvedJob,
     nominal: np.ndarray,
     photons: np.ndarray,
     before: np.ndarray,

@@ -28,13 +28,19 @@ from twin.cli import (
 )
 from twin.run_folder import RunFolder
 from twin.validation import registry
-from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, Verdict
+from twin.validation.check import CONFIRMED, CORRECTED, FAILED, NOT_CHECKABLE, REFUTED, VERDICTS, Verdict
 from twin.validation.output import write_validation
 from twin.validation.registry import Selection, UnknownCheck, select
 from twin.validation.report import measured_text, printed_text, sigma_text
 from twin.validation.runner import Validation, rough_seconds, run_checks
 
-STYLES: dict[Verdict, str] = {AGREES: "green", DIFFERS: "cyan", DOUBTFUL: "yellow", FAILED: "bold red"}
+STYLES: dict[Verdict, str] = {
+    CONFIRMED: "green",
+    CORRECTED: "yellow",
+    REFUTED: "cyan",
+    NOT_CHECKABLE: "dim",
+    FAILED: "bold red",
+}
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -45,6 +51,12 @@ def main(
         str | None,
         typer.Option(help="Check ids or their beginnings, separated by commas, e.g. 001.eq1,001.table1. Default: all."),
     ] = None,
+    fast: Annotated[
+        bool,
+        typer.Option(
+            "--fast", help="Fewer trials, larger sigmas, the same verdicts: minutes, not the best part of an hour."
+        ),
+    ] = False,
     list_checks: Annotated[
         bool, typer.Option("--list", help="Print the ids with their statements and rough times; run nothing.")
     ] = False,
@@ -63,20 +75,22 @@ def main(
     Every check has a dotted id that begins with the paper's number, a tolerance that is fixed beforehand, and a
     verdict that follows from the numbers:
 
-    - **agrees**: the simulation gives the printed value within the tolerance plus three sigma.
+    - **confirmed**: the simulation gives the printed value within the tolerance plus three sigma.
 
-    - **differs**: it does not; the printed maths may be sound, but the simulated instrument is another one than the
-    paper assumes, or the cause is not known.
+    - **confirmed with correction**: it does not, and it does give the value that follows when a named fault, gap or
+    ambiguity of the print is put right.
 
-    - **paper doubtful**: it does not, and it does give the value that follows when a named fault or ambiguity of the
-    printed maths is put right.
+    - **refuted**: it does not, and no correction of the print would make it do so.
+
+    - **not checkable**: the text does not print what a comparison needs.
 
     - **failed**: the check could not be computed; this says nothing about the paper.
 
-    The run folder gets validation.json, a self-contained report.html, and figures and tables in artefacts/.
+    The run folder gets validation.json, a self-contained validation.html, a summary in summary/, and figures and
+    tables in artefacts/.
 
-    Exit codes: 0 all checks ran, whatever their verdict; 1 a check failed, or the backend cannot be used; 2 bad
-    input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is left behind.
+    Exit codes: 0 every verdict is the expected one; 1 a verdict is another one, a check failed, or the backend cannot
+    be used; 2 bad input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is left behind.
     """
     errors = Console(stderr=True)
     with explained(errors):
@@ -86,20 +100,21 @@ def main(
         except UnknownCheck as error:
             raise InputErrorText(str(error)) from error
         if list_checks:
-            _print_list(selections, as_json)
+            _print_list(selections, fast, as_json)
             return
         folder = None if out is None else RunFolder(out, force)
         with exit_on_terminate():
-            validation = _run(selections, backend, seed, only, folder, errors)
+            validation = _run(selections, backend, seed, only, fast, folder, errors)
     if as_json:
         _print_json(validation.to_dict())
     else:
         _print_result(validation, None if folder is None else folder.target)
-    for result in validation.results:
+    for result, expected in validation.unexpected:
+        text = f"{result.id} is {result.verdict}, not {expected} as expected: {result.how}"
         if result.verdict == FAILED:
             text = f"{result.id} failed: {result.how}"
-            errors.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
-    if validation.failed:
+        errors.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
+    if validation.unexpected:
         raise typer.Exit(FAILURE)
 
 
@@ -108,6 +123,7 @@ def _run(
     backend: str,
     seed: int,
     only: str | None,
+    fast: bool,
     folder: RunFolder | None,
     errors: Console,
 ) -> Validation:
@@ -120,16 +136,17 @@ def _run(
     )
     tracer = load_backend(backend)
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
-        task = bar.add_task("start", total=rough_seconds(selections))
+        total = rough_seconds(selections, fast)
+        task = bar.add_task("start", total=total)
 
         def show(done: float, text: str) -> None:
             bar.update(task, completed=done, description=text)
 
         if folder is None:
-            return run_checks(selections, tracer, seed, only, show)
+            return run_checks(selections, tracer, seed, only, fast, show)
         with folder:
-            validation = run_checks(selections, tracer, seed, only, show, folder.path)
-            show(rough_seconds(selections), "write the run folder")
+            validation = run_checks(selections, tracer, seed, only, fast, show, folder.path)
+            show(total, "write the run folder")
             write_validation(validation, folder)
         return validation
 
@@ -151,7 +168,7 @@ def _print_json(data: Any) -> None:
     sys.stdout.write("\n")
 
 
-def _print_list(selections: Sequence[Selection], as_json: bool) -> None:
+def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> None:
     """Ids, statements and rough times of the selected checks."""
     if as_json:
         rows = [
@@ -163,8 +180,9 @@ def _print_list(selections: Sequence[Selection], as_json: bool) -> None:
                 "printed": check.printed,
                 "unit": check.unit,
                 "tolerance": check.tolerance,
+                "expected": check.expected,
                 "group": selection.group.prefix,
-                "group_seconds": selection.group.seconds,
+                "group_seconds": selection.group.rough_seconds(fast),
             }
             for selection in selections
             for check in selection.group.checks
@@ -176,7 +194,7 @@ def _print_list(selections: Sequence[Selection], as_json: bool) -> None:
     for selection in selections:
         group = selection.group
         console.print(
-            f"{group.prefix}: {group.title} (together about {group.seconds:g} s)",
+            f"{group.prefix}: {group.title} (together about {group.rough_seconds(fast):g} s)",
             style="bold", markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
         for check in group.checks:
@@ -201,13 +219,13 @@ def _print_result(validation: Validation, target: Path | None) -> None:
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
     console = Console()
     print_whole(console, table)
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in validation.counts.items() if count)
+    counts = ", ".join(f"{validation.counts[verdict]} {verdict}" for verdict in VERDICTS if validation.counts[verdict])
     number = len(validation.results)
     console.print(f"{number} check{'' if number == 1 else 's'}: {counts}", markup=False, highlight=False)
     if target is None:
         console.print("How each was done: --out DIR writes a report, --json prints it.", style="dim", soft_wrap=True)
     else:
-        console.print(f"report: {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"report: {target / 'validation.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -150,7 +150,7 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
         reason[going[far]] = Reason.MOVED
         going = going[~((rest & moved) | far | bent)]
     reason[going] = Reason.DIVERGED
-    return _summary(grey, anchor + shift, affine, linear, design, residual, iterations, reason, stack, reach)
+    return _summary(grey, anchor + shift, affine, linear, design, residual, iterations, reason, reach)
 
 
 def _windows(
@@ -228,7 +228,6 @@ def _summary(
     residual: Array,
     iterations: Index,
     reason: NDArray[np.int8],
-    stack: SplineStack,
     reach: int,
 ) -> Fits:
     none = np.isin(reason, (Reason.TEMPLATE, Reason.OUTSIDE, Reason.IMAGE, Reason.FLAT, Reason.SATURATED))

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import angles_between
 from analysis.orbit.planes import Method, PlaneFit, Station, Strip, fit_plane
 
@@ -25,7 +26,6 @@ __all__ = ["STATEMENTS", "Judgement", "Sensitivity", "Statement", "judge", "sens
 Array = NDArray[np.float64]
 Kind = Literal["increases", "decreases", "largest", "far_larger", "close", "little", "steepens", "opposite"]
 AXES = ("x", "y", "z")
-_ARCSEC = np.pi / 648000
 _FAR, _CLOSE, _LITTLE = 2.0, 1.25, 0.25
 
 
@@ -49,7 +49,7 @@ class Sensitivity:
     def to_dict(self) -> dict[str, Any]:
         """what, axis, and the linear answer to 10 m in arcseconds."""
         answers = {
-            f"{name}_arcsec_per_10m": float(s) * 10.0 / _ARCSEC + 0.0
+            f"{name}_arcsec_per_10m": float(s) * 10.0 / ARCSEC + 0.0
             for name, s in zip(self.angles, self.slope, strict=True)
         }
         return {"what": self.what, "axis": self.axis, **answers}
@@ -149,7 +149,7 @@ def _curvature(steps: Array, change: Array) -> Array:
 def judge(statement: Statement, table: Sequence[Sensitivity]) -> Judgement:
     """Whether a statement of the paper holds in a table with alpha and beta of forward, nadir and aft."""
     rows = {row.axis: row for row in table if row.what == statement.what}
-    slope = {axis: rows[axis].slope_of(statement.angle) * 10.0 / _ARCSEC for axis in AXES}
+    slope = {axis: rows[axis].slope_of(statement.angle) * 10.0 / ARCSEC for axis in AXES}
     chosen = [slope[axis] for axis in statement.axes]
     size = [abs(v) for v in chosen]
     rest = max((abs(slope[axis]) for axis in statement.others), default=float("nan"))

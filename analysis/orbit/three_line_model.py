@@ -36,7 +36,6 @@ __all__ = [
     "Partials",
     "Rays",
     "bias_rotation",
-    "look_rotation",
     "misclosure",
     "partials",
 ]
@@ -190,11 +189,6 @@ class Partials:
     ground: Array
     attitude: Array
     drift: Array
-
-
-def look_rotation(look: float) -> Array:
-    """Rotation from a camera that looks forward by `look` (radians, about the body's Y) to the body."""
-    return np.asarray(_turn(1, look))
 
 
 def bias_rotation(bias: ArrayLike) -> Array:

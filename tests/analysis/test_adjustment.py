@@ -341,9 +341,9 @@ def test_seven_fields_are_quick_and_check_points_gain():
     names = [f.name for f in fields]
     spent = []
     for _ in range(2):
-        start = time.perf_counter()
+        start = time.process_time()  # of the processor: other processes do not count
         found = adjust(fields, LABORATORY, NOISE, unknowns=OFFSETS, priors=priors(*names), gauge=HOLD_XY)
-        spent.append(time.perf_counter() - start)
+        spent.append(time.process_time() - start)
     assert min(spent) < 2.0
     # interior to the 0.01 mm and bias to the 1 arcsec class (paper 003), in the gauge of a known nadir principal point
     assert max(found.sigma[n] for n in INNER) < 0.01e-3

@@ -143,9 +143,9 @@ def test_seven_fields_are_quick():
     fields, _ = campaign(flight(60), np.random.default_rng(23))
     spent = []
     for _ in range(2):
-        start = time.perf_counter()
+        start = time.process_time()  # of the processor: other processes do not count
         solve(fields)
-        spent.append(time.perf_counter() - start)
+        spent.append(time.process_time() - start)
     assert min(spent) < 2.0
 
 

@@ -232,9 +232,9 @@ def test_speed():
     image = edge_image(5)
     times = []
     for _ in range(30):
-        start = time.perf_counter()
+        start = time.process_time()  # of the processor: other processes do not count
         measure_edge(image)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     # 3 ms alone on a core; the limit leaves room for a busy machine
     assert min(times) < 0.015
 

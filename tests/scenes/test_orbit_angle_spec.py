@@ -1,7 +1,6 @@
 """Files of the intersection angle test: units, defaults, the way to its camera, and what is said of mistakes."""
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from scenes.load import LIBRARY, ORBIT, PAYLOADS, load_camera, load_instrument, 
 from scenes.orbit_setup import AngleSetup, resolve_angle
 from scenes.schema import json_schema
 from scenes.yaml_file import dump_yaml, parse_yaml
+from tests.scenes.orbit_files import assert_told, write
 
 EXAMPLE = LIBRARY / ORBIT / "angle.yaml"
 SMALL = """
@@ -19,12 +19,6 @@ camera: th1
 orbit: {epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}
 strips: {points: 3, first: 0, last: 11999}
 """
-
-
-def write(folder: Path, text: str) -> Path:
-    path = folder / "test.yaml"
-    path.write_text(text, "utf-8")
-    return path
 
 
 def test_example() -> None:
@@ -121,16 +115,7 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_mistakes_are_told(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    assert SMALL.count(old) == 1
-    path = write(tmp_path, SMALL.replace(old, new))
-    with pytest.raises(InputError) as caught:
-        resolve_angle(path)
-    found = re.search(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}", str(caught.value))
-    assert found, caught.value
-    assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[int(found[1]) - 1]
-    for word in words:
-        assert word in str(caught.value)
+    assert_told(resolve_angle, tmp_path, SMALL, BAD[case])
 
 
 def test_a_camera_without_the_lines(tmp_path: Path) -> None:

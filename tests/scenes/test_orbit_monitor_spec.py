@@ -1,7 +1,6 @@
 """Files of a monitored orbit: units, defaults, the way to the instrument, and what is said of mistakes."""
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from scenes.load import LIBRARY, ORBIT, load_instrument
 from scenes.orbit_monitor import MotionSpec
 from scenes.orbit_setup import MonitorSetup, resolve_monitor
 from scenes.schema import json_schema
+from tests.scenes.orbit_files import assert_told, write
 
 EXAMPLE = LIBRARY / ORBIT / "monitor.yaml"
 SMALL = """
@@ -31,12 +31,6 @@ orbit:
   passing: {longitude: 116 deg, latitude: 60 deg}
 ground: {points: 4, first: 3000, last: 29000}
 """
-
-
-def write(folder: Path, text: str) -> Path:
-    path = folder / "test.yaml"
-    path.write_text(text, "utf-8")
-    return path
 
 
 def test_example() -> None:
@@ -103,21 +97,19 @@ BAD = {
     "two motions": ("duration: 10 min", "duration: 10 min, period: 1 h", "motion.base/backward", ["either duration"]),
     "pixel": ("last: 29000", "last: 32768", "ground.last", ["outside the line", "32767.5"]),
     "apply": ("interval: 10", "apply: []\ninterval: 10", "apply", ["at least one of d_alpha"]),
-    "no temperatures": ("change: [0 K, 0.1 K, 0.2 K, 0.1 K, 0 K]", "change: [0 K]", "course", ["not one entry"]),
+    "no temperatures": (
+        "change: [0 K, 0.1 K, 0.2 K, 0.1 K, 0 K]",
+        "change: [0 K]",
+        "course.temperature.base/forward.change",
+        ["not one entry"],
+    ),
     "unknown key": ("interval: 10", "intervall: 10", "intervall", ["did you mean 'interval'"]),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_mistakes_are_told(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    assert SMALL.count(old) == 1
-    path = write(tmp_path, SMALL.replace(old, new))
-    with pytest.raises(InputError) as caught:
-        resolve_monitor(path)
-    assert re.search(rf"{re.escape(str(path))}:\d+: {re.escape(key)}", str(caught.value)), caught.value
-    for word in words:
-        assert word in str(caught.value)
+    assert_told(resolve_monitor, tmp_path, SMALL, BAD[case])
 
 
 def test_an_instrument_of_one_camera(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """Files of a simulated pass: units, defaults, the way to its camera and detectors, and what is said of mistakes."""
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ from scenes.errors import InputError
 from scenes.load import DETECTORS, LIBRARY, ORBIT, PAYLOADS, load_three_line_camera
 from scenes.orbit_setup import SimulateSetup, resolve_simulate
 from scenes.schema import json_schema
+from tests.scenes.orbit_files import assert_told, write
 
 EXAMPLE = LIBRARY / ORBIT / "simulate.yaml"
 SMALL = """
@@ -18,12 +18,6 @@ camera: th1
 orbit: {epoch: 2011-03-05T03:05:00Z, passing: {longitude: 116 deg, latitude: 40 deg}}
 patch: {pixel: 6000}
 """
-
-
-def write(folder: Path, text: str) -> Path:
-    path = folder / "test.yaml"
-    path.write_text(text, "utf-8")
-    return path
 
 
 def test_example() -> None:
@@ -85,14 +79,7 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_mistakes_are_told(case: str, tmp_path: Path) -> None:
-    old, new, key, words = BAD[case]
-    assert SMALL.count(old) == 1
-    path = write(tmp_path, SMALL.replace(old, new))
-    with pytest.raises(InputError) as caught:
-        resolve_simulate(path)
-    assert re.search(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}", str(caught.value)), caught.value
-    for word in words:
-        assert word in str(caught.value)
+    assert_told(resolve_simulate, tmp_path, SMALL, BAD[case])
 
 
 def test_an_odd_wavefront_term(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
+from analysis.monitoring import ARCSEC
 from optics.frozen_map import FrozenMap
 from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_angle import LINES
@@ -20,7 +21,6 @@ from twin.orbit.calibration.campaign import fly_fields, line_model
 from twin.orbit.calibration.drift import drifted_payload
 from twin.orbit.calibration.influences import simultaneous
 from twin.orbit.calibration.monitor import (
-    ARCSEC,
     PooledErrors,
     all_told,
     flown,

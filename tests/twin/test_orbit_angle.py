@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
+from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import STATEMENTS, judge
 from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_angle import LINES
@@ -21,7 +22,7 @@ from tests.analysis.test_sensitivity import REFUTED
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.angle.camera import angle_camera
 from twin.orbit.angle.flight import AnglePass, fly
-from twin.orbit.angle.procedure import ARCSEC, estimated, frame_rows, run_passes, tls_angles
+from twin.orbit.angle.procedure import estimated, frame_rows, run_passes, tls_angles
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.line_camera import look_angle
 from twin.trial.result import silent

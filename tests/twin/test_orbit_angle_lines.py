@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
+from analysis.monitoring import ARCSEC
 from optics.tree import Motion
 from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_setup import AngleSetup, resolve_angle
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.angle.camera import AngleCamera, angle_camera
 from twin.orbit.angle.flight import AnglePass, fly
-from twin.orbit.angle.procedure import ARCSEC, estimated, run_passes, values_of
+from twin.orbit.angle.procedure import estimated, run_passes, values_of
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.line_camera import traced_line_cameras
 from twin.trial.result import silent

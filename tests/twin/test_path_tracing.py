@@ -21,7 +21,8 @@ from scenes.scenery import FACING_THE_LIGHT, Scenery, build_scenery
 from tests.optics.bench import disk_points
 from tests.twin.path_bench import scene_beam
 from twin.monitor import MonitorPath
-from twin.path_tracing.families import nominal_codes, nominal_signature
+from twin.path_tracing.events import signature
+from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.integrator import BALANCED, FAINT, NAME, Sampling, make_integrator
 from twin.path_tracing.scene import VARIANTS, VariantUnavailable, load_mitsuba
 from twin.path_tracing.sinks import NOMINAL
@@ -221,7 +222,7 @@ def test_another_variant_is_not_taken_silently(backend, monkeypatch) -> None:
 def test_signatures_differ(gf7_pair) -> None:
     scenery = build_scenery(gf7_pair, {})
     names = [n for n in gf7_pair.assembly.sequences if n.endswith(("monitor", "imaging"))]
-    assert len({nominal_signature(scenery, gf7_pair.assembly, name) for name in names}) == len(names) == 6
+    assert len({signature(nominal_codes(scenery, gf7_pair.assembly, name)) for name in names}) == len(names) == 6
 
 
 def test_impossible_sampling_and_sources() -> None:

@@ -15,9 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.noise import NoiseModel
+from optics.aim import AimError
 from optics.backend import Backend
 from optics.rotation import rotation_matrix
 from optics.targets import pinhole
+from optics.trace import BeamMissedError
 from optics.tree import State
 from scenes.camera_under_test import ROOT, build_camera_under_test
 from scenes.lab_setup import DistortionSetup
@@ -149,7 +151,7 @@ class DistortionBench:
             )
             nodes = directions(at_nodes(reach))
             offsets = [centroid_offset(*way, nodes) for way in ((design, {}), (path, camera.as_built))]
-        except ValueError as error:
+        except (AimError, BeamMissedError, ValueError) as error:
             raise BenchError(
                 f"the camera's beam cannot be traced: {error}", ("collimator",), "a wider one, or smaller `as_built`"
             ) from error

@@ -9,7 +9,7 @@ from twin.orbit.angle.result import run_angle
 from twin.orbit.calibration.result import run_calibration
 from twin.orbit.images.result import run_simulation
 from twin.orbit.monitoring.result import run_monitor
-from twin.trial.command import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed, run_test
+from twin.trial.command import add_test
 
 PROGRAM = "twin.orbit"
 
@@ -29,84 +29,61 @@ def main() -> None:
     """
 
 
-@app.command()
-def angle(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+add_test(
+    app,
+    PROGRAM,
+    "angle",
+    resolve_angle,
+    run_angle,
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points, with the paper's sentences on it judged.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "angle", file, resolve_angle, run_angle, options)
+    """,
+)
 
-
-@app.command()
-def calibrate(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+add_test(
+    app,
+    PROGRAM,
+    "calibrate",
+    resolve_calibration,
+    run_calibration,
     """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
     parameters tested on all fields without ground control (paper 003).
 
     calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
     plan and height of every field before calibration and by each scheme.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "calibrate", file, resolve_calibration, run_calibration, options)
+    """,
+)
 
-
-@app.command()
-def monitor(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+add_test(
+    app,
+    PROGRAM,
+    "monitor",
+    resolve_monitor,
+    run_monitor,
     """Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
     monitor, heights as in papers 000 and 003).
 
     monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
     time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "monitor", file, resolve_monitor, run_monitor, options)
+    """,
+)
 
-
-@app.command()
-def simulate(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
+add_test(
+    app,
+    PROGRAM,
+    "simulate",
+    resolve_simulate,
+    run_simulation,
     """Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 
     simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
     truth knows is in artefacts/truth.json.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "simulate", file, resolve_simulate, run_simulation, options)
+    """,
+)
 
 
 if __name__ == "__main__":

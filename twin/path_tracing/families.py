@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from optics.assembly import Assembly
 from optics.element import Interaction
 from scenes.scenery import Scenery
-from twin.path_tracing.events import OUTSIDE, Event, code, decode, signature
+from twin.path_tracing.events import OUTSIDE, Event, code, decode
 
 MARKS = {
     Event.REFLECT: "",
@@ -51,11 +51,6 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
     return tuple(out)
 
 
-def nominal_signature(scenery: Scenery, assembly: Assembly, sequence: str) -> int:
-    """Signature of paths that follow a sequence; raises as ``nominal_codes``."""
-    return signature(nominal_codes(scenery, assembly, sequence))
-
-
 def touches(scenery: Scenery, codes: tuple[int, ...]) -> tuple[Touch, ...]:
     """Events in words."""
     parts = scenery.parts
@@ -66,4 +61,4 @@ def touches(scenery: Scenery, codes: tuple[int, ...]) -> tuple[Touch, ...]:
     return tuple(out)
 
 
-__all__ = ["MARKS", "OUTSIDE", "Touch", "nominal_codes", "nominal_signature", "touches"]
+__all__ = ["MARKS", "OUTSIDE", "Touch", "nominal_codes", "touches"]

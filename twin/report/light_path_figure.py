@@ -79,7 +79,7 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
         away = (centre - middle)[[0, 2]]
         away = 15.0 * away / np.linalg.norm(away)
         _label(axes, mirror, centre[[0, 2]], (float(away[0]), float(away[1])), "center", bold=True)
-    _focal_plane(axes, instrument, paths, camera)
+    _focal_plane(axes, paths, camera)
     for channel in instrument.channels:
         if channel.camera == camera:
             pose = placed.pose(channel.face_body)
@@ -124,7 +124,7 @@ def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
     return np.asarray(corners[ConvexHull(corners).vertices])
 
 
-def _focal_plane(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str) -> None:
+def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
     """Seen along the line CCD a focal plane is a point: it is drawn as a bar wide enough to be seen."""
     pose = paths.placed.pose(f"{BASE}/{camera}/focal_plane")
     bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))

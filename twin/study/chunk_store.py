@@ -18,6 +18,7 @@ import numpy as np
 
 from twin.study.block_result import BlockResult
 from twin.study.plan import Plan
+from twin.study.safe_file import PARTIAL, write_safely
 
 FOLDER, INDEX = "chunks", "index.txt"
 
@@ -67,7 +68,7 @@ class ChunkStore:
     def open(self) -> None:
         """Read the index and check every chunk in it; corrupt ones are moved aside, their names kept in ``corrupt``."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        for left in self.folder.glob("*.partial"):
+        for left in self.folder.glob(f"*{PARTIAL}"):
             left.unlink(missing_ok=True)
         listed = self._listed()
         for entry in listed:
@@ -113,7 +114,7 @@ class ChunkStore:
         whole = BlockResult.joined(parts)
         content = _packed(first, len(parts), whole)
         name = f"{first:05d}.npz"
-        _write_safely(self.folder / name, content)
+        write_safely(self.folder / name, content)
         entry = Entry(name, first, len(parts), len(whole.messages), hashlib.sha256(content).hexdigest())
         with (self.folder / INDEX).open("ab") as index:
             index.write(_line(entry))
@@ -182,7 +183,7 @@ class ChunkStore:
             place.replace(place.with_name(f"{entry.file}.corrupt"))
 
     def _rewrite_index(self) -> None:
-        _write_safely(self.folder / INDEX, b"".join(_line(entry) for entry in self.entries.values()))
+        write_safely(self.folder / INDEX, b"".join(_line(entry) for entry in self.entries.values()))
 
 
 def _packed(first: int, blocks: int, result: BlockResult) -> bytes:
@@ -210,18 +211,3 @@ def _entry(line: bytes) -> Entry | None:
         return None
     data: dict[str, Any] = json.loads(text)
     return Entry(**data)
-
-
-def _write_safely(place: Path, content: bytes) -> None:
-    """Write a file so that under its name it is whole or not there, whenever the power fails."""
-    partial = place.with_name(f"{place.name}.partial")
-    with partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(place)
-    folder = os.open(place.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib.util
 import io
 import math
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from twin.data_file import csv_table
 from twin.study.block_result import BlockResult
 from twin.study.plan import Plan
 
@@ -65,24 +65,11 @@ def _path(key: tuple[str | int, ...]) -> str:
     return " ".join(str(part) for part in key)
 
 
-def netcdf(data: xr.Dataset) -> bytes:
-    """The data set as the contents of a netCDF-4 file; the same data give the same bytes."""
-    # made in memory: on a full disk HDF5 crashes the process
-    view = data.to_netcdf(engine="h5netcdf")
-    content = bytes(view)
-    if isinstance(view, memoryview):
-        view.release()
-    return content
-
-
 def table(data: xr.Dataset) -> bytes:
     """The data set as CSV, a line for each run; heads are the names, with the unit in brackets."""
     names = [RUN, *(str(name) for name in data.data_vars)]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([_head(data, name) for name in names])
-    writer.writerows(zip(*(_cells(data[name].values) for name in names), strict=True))
-    return out.getvalue().encode()
+    rows = zip(*(_cells(data[name].values) for name in names), strict=True)
+    return csv_table([[_head(data, name) for name in names], *rows])
 
 
 def _head(data: xr.Dataset, name: str) -> str:

@@ -14,6 +14,7 @@ from typing import Any, TextIO
 
 from twin.run_folder import MANIFEST, RunFolderError, is_run_folder
 from twin.study.chunk_store import FOLDER, INDEX
+from twin.study.safe_file import write_safely
 from twin.study.setup import StudySetup
 
 IDENTITY = "study_state.json"
@@ -141,13 +142,7 @@ class StudyFolder:
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file so that under its name it is whole or not there."""
-        place = self.path / name
-        partial = place.with_name(f".{place.name}.partial")
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(place)
+        write_safely(self.path / name, content)
 
     def write_json(self, name: str, data: Any) -> None:
         """Write plain data."""

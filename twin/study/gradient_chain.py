@@ -13,10 +13,9 @@ from analysis.recovery import Recovery, angles, estimates
 from optics.tree import State
 from scenes.resolved import ResolvedJob
 from twin.experiment import MonitorExperiment
-from twin.results import RenderRun
+from twin.study.monitor_results import monitor_results
 from twin.truth import trace_sight, truth_of_sight
 
-NOTHING = np.empty(0)
 SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
 """Steps of the derivative of the formulas, px and 1: so small that what is left of them after Richardson's
 extrapolation, to the fifth power, is below rounding, and so large that rounding is below 1e-11."""
@@ -65,22 +64,8 @@ class Chain:
         none = np.zeros_like(end)
         recovery = Recovery(start, end, none, none, joint, parameters, angles(parameters, cameras))
         truth = truth_of_sight(self.experiment.instrument, np.stack([self.nominal[1][0], sight], axis=1), self._axes)
-        run = RenderRun(
-            resolved=self.resolved,
-            experiment=self.experiment,
-            state=state,
-            frames=self.resolved.frames,
-            seed=self.resolved.job.render.seed,
-            truth=truth,
-            photons_before=NOTHING,
-            photons_after=NOTHING,
-            before=NOTHING,
-            after=NOTHING,
-            recovery=recovery,
-            crosstalk={},
-            warnings=(),
-        )
-        return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
+        exposures = self.resolved.frames, self.resolved.job.render.seed
+        return monitor_results(self.resolved, self.experiment, state, *exposures, truth, recovery)
 
     def moved(
         self, state: State, at: tuple[np.ndarray, np.ndarray], spots: np.ndarray, sight: np.ndarray

@@ -21,13 +21,12 @@ from optics.trace import BeamMissedError
 from optics.tree import State
 from scenes.resolved import ResolvedJob
 from twin.experiment import MonitorExperiment
-from twin.results import RenderRun
 from twin.study.base_job import Failure, Outcome
+from twin.study.monitor_results import monitor_results
 from twin.truth import Truth, trace_truth
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
-NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,8 @@ def run_together(
             good = [i for i in good if i not in lost]
             continue
         for j, i in enumerate(good):
-            out[left[i]] = _results(experiment, runs[left[i]], _truth_of(truth, i), _recovery_of(recovery, j))
+            run, one = runs[left[i]], (_truth_of(truth, i), _recovery_of(recovery, j))
+            out[left[i]] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *one)
         break
     return [outcome for outcome in out if outcome is not None]
 
@@ -134,26 +134,6 @@ def _lost(error: SpotError, experiment: MonitorExperiment, good: Sequence[int]) 
         state, spot = divmod(index, len(channels))
         out.setdefault(good[state], f"{channels[spot].key}: {error.reasons[index]}")
     return out
-
-
-def _results(experiment: MonitorExperiment, run: MonitorRun, truth: Truth, recovery: Recovery) -> dict[str, Any]:
-    """As a run folder's truth.json and recovered.json hold them, made by the same code."""
-    whole = RenderRun(
-        resolved=run.resolved,
-        experiment=experiment,
-        state=run.state,
-        frames=run.frames,
-        seed=run.seed,
-        truth=truth,
-        photons_before=NOTHING,
-        photons_after=NOTHING,
-        before=NOTHING,
-        after=NOTHING,
-        recovery=recovery,
-        crosstalk={},
-        warnings=(),
-    )
-    return {"truth": whole.truth_dict(), "recovered": whole.recovered_dict()}
 
 
 def _truth_of(truth: Truth, i: int) -> Truth:

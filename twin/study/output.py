@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from twin.data_file import netcdf
 from twin.run_folder import MANIFEST
 from twin.study.block_result import BlockResult
-from twin.study.dataset import make_dataset, netcdf, parquet, summary, table
+from twin.study.dataset import make_dataset, parquet, summary, table
 from twin.study.folder import PROGRAM, StudyFolder
 from twin.study.plan import Plan
 from twin.study.report import write_report

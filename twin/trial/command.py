@@ -66,6 +66,38 @@ class Options:
     quiet: bool
 
 
+def add_test(
+    app: typer.Typer,
+    program: str,
+    command: str,
+    resolve: Callable[[Path], Any],
+    run: Callable[[Any, Backend, int, Advance], LabResult],
+    about: str,
+) -> None:
+    """Add a test to a program as a subcommand with the options that all tests have.
+
+    Args:
+        app: of the program.
+        program: as the user calls it, ``twin.lab``.
+        command: the subcommand, ``focus``.
+        resolve: as for `run_test`.
+        run: as for `run_test`.
+        about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+    """
+
+    @app.command(command, help=about)
+    def test(
+        file: File,
+        out: Out = None,
+        seed: Seed = None,
+        backend: BackendName = "llvm",
+        force: Force = False,
+        as_json: AsJson = False,
+        quiet: Quiet = False,
+    ) -> None:
+        run_test(program, command, file, resolve, run, Options(out, seed, backend, force, as_json, quiet))
+
+
 def run_test(
     program: str,
     command: str,

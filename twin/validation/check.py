@@ -7,20 +7,22 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-Verdict = Literal["agrees", "differs", "paper doubtful", "failed"]
-AGREES: Verdict = "agrees"
-DIFFERS: Verdict = "differs"
-DOUBTFUL: Verdict = "paper doubtful"
+Verdict = Literal["confirmed", "confirmed with correction", "refuted", "not checkable", "failed"]
+CONFIRMED: Verdict = "confirmed"
+CORRECTED: Verdict = "confirmed with correction"
+REFUTED: Verdict = "refuted"
+NOT_CHECKABLE: Verdict = "not checkable"
 FAILED: Verdict = "failed"
 VERDICTS: dict[Verdict, str] = {
-    AGREES: "The simulation gives the printed value within the check's tolerance plus three sigma.",
-    DIFFERS: "It does not. The printed maths may be sound: the simulated instrument is another one than the paper "
-    "assumes, or the cause is not known. What was found stands beside it.",
-    DOUBTFUL: "It does not, and it does give the value that follows when a named fault or ambiguity of the printed "
-    "maths is put right.",
+    CONFIRMED: "The simulation gives the printed value within the check's tolerance plus three sigma.",
+    CORRECTED: "It does not, and it does give the value that follows when a named fault, gap or ambiguity of what is "
+    "printed is put right; the correction stands beside it.",
+    REFUTED: "It does not, and no correction of the print would make it do so: the statement does not hold for the "
+    "simulated instrument, or the cause is not known. What was found stands beside it.",
+    NOT_CHECKABLE: "The text does not print what a comparison needs; the reason stands beside it.",
     FAILED: "The check could not be computed; this says nothing about the paper.",
 }
-"""The four verdicts and what they mean."""
+"""The verdicts and what they mean."""
 
 SIGMAS = 3.0
 """The noise allowance of a comparison, in standard deviations of the measured value."""
@@ -46,11 +48,11 @@ class CheckResult:
         equation: where it is printed: equation, table or section.
         statement: what the paper says, in one sentence.
         printed: the paper's number; None where it prints none.
-        measured: the simulation's number; None when it failed.
+        measured: the simulation's number; None when it failed or nothing can be compared.
         sigma: standard deviation of ``measured``; None where there is no noise.
         unit: of the three numbers; "1" for a ratio.
         verdict: one of VERDICTS.
-        how: lines: how it was measured; the reason, unless it agrees; the comparison that makes the verdict.
+        how: lines: how it was measured; the reason, unless it is confirmed; the comparison that makes the verdict.
         seconds: computing time since the group's result before; the first one holds the work that all share.
     """
 
@@ -79,8 +81,11 @@ class CheckResult:
             object.__setattr__(self, name, float(value))
         if (self.sigma is not None and self.sigma < 0) or self.seconds < 0:
             raise ValueError(f"{self.id}: sigma and seconds cannot be negative")
-        if (self.measured is None) != (self.verdict == FAILED):
-            raise ValueError(f"{self.id}: a measured value goes with every verdict but {FAILED!r}, and with no other")
+        if (self.measured is None) != (self.verdict in (FAILED, NOT_CHECKABLE)):
+            raise ValueError(
+                f"{self.id}: a measured value goes with every verdict but {FAILED!r} and {NOT_CHECKABLE!r}, and with "
+                "no other"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -97,7 +102,7 @@ class Explanation:
 
     Attributes:
         value: what the measurement should then be, in the check's unit.
-        verdict: DOUBTFUL if the reason is a fault or an ambiguity of the printed maths, else DIFFERS.
+        verdict: CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
         text: the reason, a sentence.
     """
 
@@ -107,8 +112,8 @@ class Explanation:
 
     def __post_init__(self) -> None:
         """Only these two can be explained."""
-        if self.verdict not in (DIFFERS, DOUBTFUL):
-            raise ValueError(f"an explanation is of {DIFFERS!r} or {DOUBTFUL!r}, not of {self.verdict!r}")
+        if self.verdict not in (CORRECTED, REFUTED):
+            raise ValueError(f"an explanation is of {CORRECTED!r} or {REFUTED!r}, not of {self.verdict!r}")
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,7 @@ class Check:
         tolerance: how far apart printed and measured may be and still agree, without the noise.
         because: why that tolerance.
         comparison: ``equal``, or what the paper claims of the measured value: ``at most`` or ``at least`` the printed.
+        expected: the verdict that is known from earlier work; any other one is reported and fails the command.
     """
 
     id: str
@@ -134,6 +140,7 @@ class Check:
     tolerance: float
     because: str
     comparison: Comparison = "equal"
+    expected: Verdict = CONFIRMED
 
     def __post_init__(self) -> None:
         """Refuse ids that nobody can select and tolerances that are none."""
@@ -142,6 +149,8 @@ class Check:
             raise ValueError(f"check id {self.id!r} must be a paper ({', '.join(PAPERS)}) and names, joined by dots")
         if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
             raise ValueError(f"{self.id}: the tolerance must be finite and >= 0, found {self.tolerance!r}")
+        if self.expected not in VERDICTS or self.expected == FAILED:
+            raise ValueError(f"{self.id}: {self.expected!r} is no verdict to expect")
 
     @property
     def paper(self) -> str:
@@ -158,8 +167,9 @@ class Check:
     ) -> CheckResult:
         """The result, with the verdict that the numbers give.
 
-        It agrees if ``measured`` is the printed value within ``tolerance`` + 3 ``sigma``; else the first explanation
-        whose value it is within the same limit gives verdict and reason; else it differs for no known reason.
+        It is confirmed if ``measured`` is the printed value within ``tolerance`` + 3 ``sigma``; else the first
+        explanation whose value it is within the same limit gives verdict and reason; else it is refuted for no known
+        reason.
 
         Args:
             measured: the simulation's number.
@@ -190,18 +200,22 @@ class Check:
         """The result when it could not be computed."""
         return self._result(None, None, FAILED, f"Could not be computed: {why}")
 
+    def not_checkable(self, why: str) -> CheckResult:
+        """The result where the text does not print what a comparison needs."""
+        return self._result(None, None, NOT_CHECKABLE, why)
+
     def _verdict(
         self, measured: float, goal: float, allowed: float, explanations: Sequence[Explanation]
     ) -> tuple[Verdict, str]:
         distance = measured - goal
         outside = {"equal": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
         if outside <= allowed:
-            return AGREES, ""
+            return CONFIRMED, ""
         for reason in explanations:
             if abs(measured - reason.value) <= allowed:
                 return reason.verdict, f"{reason.text} That gives {reason.value:.6g}."
         tried = ", ".join(f"{e.value:.6g}" for e in explanations)
-        return DIFFERS, f"The cause is not known{f'; what was thought of gives {tried}' if tried else ''}."
+        return REFUTED, f"The cause is not known{f'; what was thought of gives {tried}' if tried else ''}."
 
     def _result(self, measured: float | None, sigma: float | None, verdict: Verdict, how: str) -> CheckResult:
         return CheckResult(

@@ -26,6 +26,7 @@ class Context:
     Attributes:
         backend: where to trace.
         seed: of all noise; the same seed must give the same results.
+        fast: whether fewer trials have to do; the verdicts must not depend on it.
         selected: ids that are wanted; others need no work, and their results are not kept.
         checks: id -> check, of the whole group.
         report_progress: takes the fraction of the group's work that is done, and what is being done.
@@ -38,6 +39,7 @@ class Context:
     seed: int
     selected: frozenset[str]
     checks: Mapping[str, Check]
+    fast: bool = False
     report_progress: Callable[[float, str], None] = lambda fraction, text: None
     folder: Path | None = None
     experiments: dict[str, MonitorExperiment] = field(default_factory=dict)
@@ -46,6 +48,10 @@ class Context:
     def wants(self, *prefixes: str) -> bool:
         """Whether any selected id lies under one of the prefixes."""
         return any(matches(identifier, prefix) for identifier in self.selected for prefix in prefixes)
+
+    def count(self, full: int, fast: int) -> int:
+        """How many trials to make, by the length of the run."""
+        return fast if self.fast else full
 
     def check(self, identifier: str) -> Check:
         """One of the group's checks, to be judged.
@@ -89,6 +95,7 @@ class CheckGroup:
         seconds: rough computing time on two cores.
         checks: everything it checks.
         run: does it; yields one result for every selected check, as soon as it has it.
+        fast_seconds: rough time of the fast run, None where that is the same.
     """
 
     prefix: str
@@ -96,15 +103,20 @@ class CheckGroup:
     seconds: float
     checks: tuple[Check, ...]
     run: Run
+    fast_seconds: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse groups that cannot be told apart or shown."""
-        if not self.checks or self.seconds <= 0:
+        if not self.checks or self.seconds <= 0 or (self.fast_seconds is not None and self.fast_seconds <= 0):
             raise ValueError(f"group {self.prefix!r} needs checks and a rough time > 0")
         if not self.prefix.replace(".", "").replace("_", "").isalnum():
             raise ValueError(f"group prefix {self.prefix!r}: only letters, digits, _ and dots can be used")
         if any(check.paper != self.prefix.partition(".")[0] for check in self.checks):
             raise ValueError(f"group {self.prefix!r} holds checks of another paper")
+
+    def rough_seconds(self, fast: bool) -> float:
+        """Rough computing time of the full or the fast run."""
+        return self.seconds if self.fast_seconds is None or not fast else self.fast_seconds
 
     @property
     def ids(self) -> tuple[str, ...]:

@@ -7,14 +7,26 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from scenes.errors import nearest
-from twin.validation import error_budget_001, formulas_001, laboratory_004, principle_001
 from twin.validation.group import CheckGroup, matches
+from twin.validation.paper_000 import groups as paper_000
+from twin.validation.paper_001 import error_budget, formulas, joint, principle, ranges
+from twin.validation.paper_003 import fields, model
+from twin.validation.paper_004 import distortion, equations, focus, turntable, unprinted
 
 GROUPS: tuple[CheckGroup, ...] = (
-    formulas_001.GROUP,
-    principle_001.GROUP,
-    error_budget_001.GROUP,
-    *laboratory_004.GROUPS,
+    *paper_000.GROUPS,
+    formulas.GROUP,
+    ranges.GROUP,
+    joint.GROUP,
+    principle.GROUP,
+    error_budget.GROUP,
+    model.GROUP,
+    fields.GROUP,
+    focus.GROUP,
+    equations.GROUP,
+    turntable.GROUP,
+    distortion.GROUP,
+    unprinted.GROUP,
 )
 """Every group, in the order in which they run. A new one is added here."""
 

@@ -1,4 +1,4 @@
-"""``report.html`` of a validation: one self-contained page with every check, printed beside measured."""
+"""``validation.html`` of a validation: one self-contained page with every check, printed beside measured."""
 
 from __future__ import annotations
 
@@ -7,15 +7,27 @@ from typing import Any
 
 from twin.report.numbers import decimals_for, fixed, plain, significant
 from twin.report.page import artefact_content, environment
-from twin.validation.check import AGREES, DIFFERS, DOUBTFUL, FAILED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
+from twin.validation.check import (
+    CONFIRMED,
+    CORRECTED,
+    FAILED,
+    NOT_CHECKABLE,
+    PAPERS,
+    REFUTED,
+    SIGMAS,
+    VERDICTS,
+    CheckResult,
+    Verdict,
+)
 from twin.validation.runner import GroupRun, Validation
 from twin.versions import versions
 
 TEMPLATE = "validation.html.j2"
 MARKS: dict[Verdict, tuple[str, str]] = {
-    AGREES: ("=", "agrees"),
-    DIFFERS: ("≠", "differs"),
-    DOUBTFUL: ("?", "doubtful"),
+    CONFIRMED: ("=", "confirmed"),
+    CORRECTED: ("≈", "corrected"),
+    REFUTED: ("≠", "refuted"),
+    NOT_CHECKABLE: ("?", "silent"),
     FAILED: ("✕", "failed"),
 }
 """Verdict -> mark, so that no meaning hangs on a colour, and class in the page."""
@@ -38,6 +50,8 @@ def render_report(validation: Validation) -> str:
             for v, meaning in VERDICTS.items()
         ],
         total=len(results),
+        unexpected=[{"id": r.id, "verdict": r.verdict, "expected": expected} for r, expected in validation.unexpected],
+        fast=validation.fast,
         sigmas=f"{SIGMAS:g}",
         command=command(validation),
         backend=validation.backend,
@@ -50,7 +64,8 @@ def render_report(validation: Validation) -> str:
 def command(validation: Validation) -> str:
     """What repeats this validation."""
     only = "" if validation.only is None else f" --only {validation.only.replace(' ', '')}"
-    return f"python -m twin.validate{only} --seed {validation.seed} --backend {validation.backend} --out again"
+    fast = " --fast" if validation.fast else ""
+    return f"python -m twin.validate{only}{fast} --seed {validation.seed} --backend {validation.backend} --out again"
 
 
 def measured_text(result: CheckResult) -> str:

@@ -12,10 +12,14 @@ from typing import Any
 from optics.backend import Backend
 from twin.artefact import Artefact
 from twin.experiment import MonitorExperiment
-from twin.validation.check import FAILED, VERDICTS, CheckResult, Verdict
+from twin.validation.check import VERDICTS, CheckResult, Verdict
 from twin.validation.group import CheckGroup, Context
 from twin.validation.registry import Selection
 from twin.versions import versions
+
+SCHEMA = "space-camera-twin/validation"
+SCHEMA_VERSION = 1
+"""Of validation.json; the version rises when a key changes its meaning or goes."""
 
 FILES = "artefacts"
 """Folder, in the run folder, of what the groups add; each has a folder of its prefix there."""
@@ -47,6 +51,7 @@ class Validation:
         runs: group by group.
         backend, seed: what it ran with.
         only: the selection as it was given, None for everything.
+        fast: whether with fewer trials.
         started: time of the start, seconds since the epoch.
         seconds: computing time.
         written: whether it goes into a run folder.
@@ -58,6 +63,7 @@ class Validation:
     only: str | None
     started: float
     seconds: float
+    fast: bool = False
     written: bool = False
 
     @property
@@ -71,16 +77,23 @@ class Validation:
         return {verdict: sum(r.verdict == verdict for r in self.results) for verdict in VERDICTS}
 
     @property
-    def failed(self) -> bool:
-        """Whether any check could not be computed."""
-        return self.counts[FAILED] > 0
+    def unexpected(self) -> tuple[tuple[CheckResult, Verdict], ...]:
+        """Results whose verdict is not the expected one, with that one; what could not be computed is among them."""
+        expected = {check.id: check.expected for run in self.runs for check in run.group.checks}
+        return tuple((r, expected[r.id]) for r in self.results if r.verdict != expected[r.id])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for validation.json."""
         return {
+            "schema": SCHEMA,
+            "version": SCHEMA_VERSION,
             "checks": [result.to_dict() for result in self.results],
             "counts": dict(self.counts),
             "verdicts": dict(VERDICTS),
+            "unexpected": [
+                {"id": result.id, "verdict": result.verdict, "expected": expected}
+                for result, expected in self.unexpected
+            ],
             "groups": [
                 {
                     "prefix": run.group.prefix,
@@ -95,6 +108,7 @@ class Validation:
                 for run in self.runs
             ],
             "only": self.only,
+            "fast": self.fast,
             "seed": self.seed,
             "backend": self.backend,
             "versions": versions(),
@@ -103,9 +117,9 @@ class Validation:
         }
 
 
-def rough_seconds(selections: Sequence[Selection]) -> float:
+def rough_seconds(selections: Sequence[Selection], fast: bool = False) -> float:
     """About how long these groups take."""
-    return sum(selection.group.seconds for selection in selections)
+    return sum(selection.group.rough_seconds(fast) for selection in selections)
 
 
 def run_checks(
@@ -113,6 +127,7 @@ def run_checks(
     backend: Backend,
     seed: int,
     only: str | None = None,
+    fast: bool = False,
     progress: Progress = lambda done, text: None,
     folder: Path | None = None,
 ) -> Validation:
@@ -123,6 +138,7 @@ def run_checks(
         backend: where to trace.
         seed: of all noise.
         only: the selection as the user gave it, kept in the results.
+        fast: make fewer trials, as continuous integration wants it.
         progress: called whenever a group gets on.
         folder: the open run folder, None when nothing is written.
     """
@@ -131,12 +147,12 @@ def run_checks(
     runs = []
     done = 0.0
     for selection in selections:
-        share = _Share(progress, done, selection.group)
-        runs.append(_run_group(selection, backend, seed, share, folder, experiments))
-        done += selection.group.seconds
+        share = _Share(progress, done, selection.group, selection.group.rough_seconds(fast))
+        runs.append(_run_group(selection, backend, seed, fast, share, folder, experiments))
+        done += share.seconds
     progress(done, "done")
     took = time.monotonic() - clock
-    return Validation(tuple(runs), backend.name, seed, only, started, took, written=folder is not None)
+    return Validation(tuple(runs), backend.name, seed, only, started, took, fast, written=folder is not None)
 
 
 @dataclass(frozen=True)
@@ -146,15 +162,17 @@ class _Share:
     progress: Progress
     start: float
     group: CheckGroup
+    seconds: float
 
     def __call__(self, fraction: float, text: str) -> None:
-        self.progress(self.start + fraction * self.group.seconds, f"{self.group.prefix}: {text}")
+        self.progress(self.start + fraction * self.seconds, f"{self.group.prefix}: {text}")
 
 
 def _run_group(
     selection: Selection,
     backend: Backend,
     seed: int,
+    fast: bool,
     share: _Share,
     folder: Path | None,
     experiments: dict[str, MonitorExperiment],
@@ -164,7 +182,7 @@ def _run_group(
     if own is not None:
         own.mkdir(parents=True)
     checks = {check.id: check for check in group.checks}
-    context = Context(backend, seed, selection.ids, checks, share, own, experiments)
+    context = Context(backend, seed, selection.ids, checks, fast, share, own, experiments)
     found: dict[str, CheckResult] = {}
     begin = last = time.monotonic()
     why = "the group gave no result for it"

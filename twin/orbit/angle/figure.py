@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import AXES
-from twin.orbit.angle.procedure import ARCSEC, AngleRun, Scatter
+from twin.orbit.angle.procedure import AngleRun, Scatter
 from twin.report.svg import (
     BLUE,
     GREEN,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import (
     AlongTrackAngles,
     AngleError,
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from optics.backend import Backend
     from scenes.orbit_setup import AngleSetup
 
-ARCSEC = np.pi / 648000.0
-"""Radians."""
 EFFECTS = ("light_time", "aberration", "refraction")
 BEND = 0.01 * ARCSEC
 """How far the ends of a line may have bent since the laboratory, one sigma. A micrometre's shift of a mirror bends the

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from optics.backend import Backend
 from scenes.job import DEFAULT_PIVOT, PerturbationSpec
 from scenes.units import LENGTH, format_quantity
 from twin.artefact import Cell, Table
 from twin.orbit.angle.figure import signs
-from twin.orbit.angle.procedure import ARCSEC, AngleRun, run_passes, values_of
+from twin.orbit.angle.procedure import AngleRun, run_passes, values_of
 from twin.orbit.angle.sections import listed, sections
 from twin.orbit.angle.to_json import PRINTED_DIFFERENCE_ARCSEC, to_dict
 from twin.report.numbers import fixed

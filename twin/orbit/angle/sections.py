@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import STATEMENTS, Judgement, judge
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.angle.figure import drawn, panels, signs
-from twin.orbit.angle.procedure import ARCSEC, AngleRun, Scatter, values_of
+from twin.orbit.angle.procedure import AngleRun, Scatter, values_of
 from twin.orbit.angle.to_json import PRINTED_DIFFERENCE_ARCSEC
 from twin.orbit.light_effects import SPEED_OF_LIGHT
 from twin.report.numbers import fixed

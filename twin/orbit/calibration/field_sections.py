@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.calibration.figure import drawn
@@ -11,16 +12,14 @@ from twin.orbit.calibration.procedure import CalibrationRun
 from twin.orbit.calibration.repeatability import repeatability
 from twin.trial.section import Section
 
-_ARCSEC = np.pi / 648000.0
-
 
 def fields_section(run: CalibrationRun) -> Section:
     """Every field by itself, and the scatter over the fields."""
     rows: list[tuple[Cell, ...]] = []
     for one in run.campaign.passes:
         alone = run.fields[one.name].adjustment
-        bias = alone.bias(one.name) / _ARCSEC
-        errors = bias - one.bias / _ARCSEC
+        bias = alone.bias(one.name) / ARCSEC
+        errors = bias - one.bias / ARCSEC
         rows.append((one.name, float(np.degrees(one.latitude)), *map(float, bias), *map(float, errors), alone.p_value))
     table = Table(
         "fields",
@@ -37,7 +36,7 @@ def fields_section(run: CalibrationRun) -> Section:
     scatter: list[tuple[Cell, ...]] = []
     for r in found:
         angle = r.name in BIAS
-        scale, shown = (_ARCSEC, "arcsec") if angle else (1e-3, "mm")
+        scale, shown = (ARCSEC, "arcsec") if angle else (1e-3, "mm")
         held = r.sigma == 0.0
         scatter.append(
             (
@@ -56,7 +55,7 @@ def fields_section(run: CalibrationRun) -> Section:
     text = [
         f"From field to field the interior orientation repeats to {1e3 * worst.scatter:.4f} mm or better (standard "
         f"deviation, {worst.name}); the paper says 0.01 mm. The biases scatter by up to "
-        f"{largest.scatter / _ARCSEC:.2f}″ ({largest.name}); the paper says the 1″ class.",
+        f"{largest.scatter / ARCSEC:.2f}″ ({largest.name}); the paper says the 1″ class.",
     ]
     failed = [r.name for r in inner if not r.holds]
     if failed:
@@ -92,12 +91,12 @@ def biases_section(run: CalibrationRun) -> Section:
         return Section("Biases against latitude", (few,), (figure,))
     spec = run.campaign.spec
     # measured to true is the inverse of the drift of the measured attitude
-    true = -np.array(spec.errors.star_tracker.thermal.amplitude) * spec.errors.switched_on / _ARCSEC
-    season = np.array(spec.errors.season) / _ARCSEC
+    true = -np.array(spec.errors.star_tracker.thermal.amplitude) * spec.errors.switched_on / ARCSEC
+    season = np.array(spec.errors.season) / ARCSEC
     rows: list[tuple[Cell, ...]] = []
     for k, fit in enumerate(run.latitude):
         numbers = (fit.amplitude, fit.amplitude_sigma, fit.constant, fit.constant_sigma, fit.remainder)
-        amplitude, amplitude_sigma, constant, constant_sigma, left = (float(v / _ARCSEC) for v in numbers)
+        amplitude, amplitude_sigma, constant, constant_sigma, left = (float(v / ARCSEC) for v in numbers)
         rows.append(
             (
                 fit.axis,
@@ -141,13 +140,13 @@ def biases_section(run: CalibrationRun) -> Section:
     weak = [f.axis for f in run.latitude if abs(f.amplitude) < 2.0 * f.amplitude_sigma]
     seen = f"in this campaign the drift does not show in {', '.join(weak)}" if weak else "the drift shows in all axes"
     reach = np.ptp(np.sin(run.latitude[0].latitude - run.latitude[0].reference))
-    rest = ", ".join(f"{f.remainder / _ARCSEC:.2f}″ in {f.axis}" for f in run.latitude)
+    rest = ", ".join(f"{f.remainder / ARCSEC:.2f}″ in {f.axis}" for f in run.latitude)
     degrees = np.degrees(np.ptp(run.latitude[0].latitude))
     text = (
         f"The fields lie within {degrees:.0f}° of latitude, where the sine changes by {reach:.2f}, so that a drift of "
         f"1″ amplitude makes {reach:.2f}″ between the first and the last. Beside it there remain {rest}, the season of "
         f"each field: {seen} at two sigmas. More fields, or the same ones in all seasons, would tell them apart.",
-        f"Roll and pitch of the fields scatter by {spread / _ARCSEC:.2f}″ together, {metres:.1f} m on the ground. By "
+        f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f}″ together, {metres:.1f} m on the ground. By "
         f"the rules of a mean, one field's bias leaves another field {np.sqrt(2.0) * metres:.1f} m RMS in plan, and "
         f"the mean of {most} fields {np.sqrt(1.0 + 1.0 / most) * metres:.1f} m, beside the noise of its own: averaging "
         "helps by less than a third, and no number of fields goes below the scatter itself. Only a field's own "

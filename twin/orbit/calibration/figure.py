@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS, misclosure
 from scenes.orbit_angle import LINES
 from twin.orbit.calibration.campaign import true_bias
@@ -28,7 +29,6 @@ from twin.report.svg import (
     to_svg,
 )
 
-_ARCSEC = np.pi / 648000.0
 COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GREY)
 MARKERS = "osD^vP"
 
@@ -77,12 +77,12 @@ def latitude_figure(run: CalibrationRun) -> Figure:
     reach = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
     truth = true_bias(spec, reach)
     for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
-        value = np.array([run.together.value(f"{p.name} {axis}") for p in passes]) / _ARCSEC
-        sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / _ARCSEC
-        true = np.array([p.bias[k] for p in passes]) / _ARCSEC
-        axes.plot(np.degrees(reach), truth[:, k] / _ARCSEC, color=GREY, lw=1.0, ls="--", label="truth, no season")
+        value = np.array([run.together.value(f"{p.name} {axis}") for p in passes]) / ARCSEC
+        sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / ARCSEC
+        true = np.array([p.bias[k] for p in passes]) / ARCSEC
+        axes.plot(np.degrees(reach), truth[:, k] / ARCSEC, color=GREY, lw=1.0, ls="--", label="truth, no season")
         for fit in run.latitude[k : k + 1]:
-            axes.plot(np.degrees(reach), fit.curve(reach) / _ARCSEC, color=VERMILION, lw=1.3, label="fit")
+            axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=VERMILION, lw=1.3, label="fit")
         axes.plot(np.degrees(latitude), true, "x", color=INK, ms=6, label="truth of the field", zorder=4)
         axes.errorbar(
             np.degrees(latitude), value, sigma, fmt="o", color=BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"

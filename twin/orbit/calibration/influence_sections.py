@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
 from scenes.orbit_angle import LINES
 from scenes.units import ANGLE, LENGTH, format_quantity
@@ -11,8 +10,6 @@ from twin.artefact import Cell, Table
 from twin.orbit.calibration.influences import INNER, OFFSET, SURPRISE, LightRow
 from twin.orbit.calibration.procedure import CalibrationRun
 from twin.trial.section import Section
-
-_ARCSEC = np.pi / 648000.0
 
 
 def light_section(run: CalibrationRun) -> Section:
@@ -83,7 +80,7 @@ def datum_section(run: CalibrationRun) -> Section:
     for row in run.datum:
         name, change = row.most
         where = ", ".join(f"{v:g} {axis}" for v, axis in zip(row.shift, ("east", "north", "up"), strict=True) if v)
-        bias = [float(v / _ARCSEC) for v in row.bias]
+        bias = [float(v / ARCSEC) for v in row.bias]
         rows.append(
             (where, *bias, f"{name} {1e6 * change:+.1f} µm", *map(float, row.offset), row.fit, row.p_value, *row.after)
         )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.adjustment import Adjustment, adjust
 from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
@@ -28,7 +29,6 @@ from twin.trial.result import Advance
 if TYPE_CHECKING:
     from scenes.orbit_setup import CalibrationSetup
 
-ARCSEC = np.pi / 648000.0
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Sizes of the drift against the file's."""
 

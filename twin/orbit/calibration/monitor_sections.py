@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from analysis.monitoring import ARCSEC
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Artefact, Cell, SvgFigure, Table
-from twin.orbit.calibration.monitor import ARCSEC, Monitoring, Treatment
+from twin.orbit.calibration.monitor import Monitoring, Treatment
 from twin.orbit.calibration.monitor_figure import drift_drawn
 from twin.orbit.calibration.procedure import CalibrationRun
 from twin.trial.section import Section

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.procedure import CalibrationRun
 
 PAPER_INTERIOR = 1e-5
 """Metres: "stable to 0.01 mm"."""
-PAPER_BIAS = np.pi / 648000.0
+PAPER_BIAS = ARCSEC
 """Radians: the 1 arcsec class."""
 _CLASS = 3.0
 """A scatter of the class of 1 arcsec lies below this many arcseconds."""

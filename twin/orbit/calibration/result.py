@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from analysis.monitoring import ARCSEC
 from optics.backend import Backend
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Cell, Table
@@ -18,8 +17,6 @@ from twin.orbit.calibration.sections import said, scheme_names, sections
 from twin.orbit.calibration.strip_sections import gained
 from twin.orbit.calibration.to_json import meets, to_dict, unit
 from twin.trial.result import Advance, LabResult
-
-_ARCSEC = np.pi / 648000.0
 
 if TYPE_CHECKING:
     from scenes.orbit_setup import CalibrationSetup
@@ -125,7 +122,7 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
         )
     if run.surprises:
         first = run.surprises[0]
-        scale, shown = (_ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "um")
+        scale, shown = (ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "um")
         if "offset" in first.name:
             scale, shown = 1.0, "m"
         others = len(run.surprises) - 1

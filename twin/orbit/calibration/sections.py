@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from scenes.orbit_angle import LINES
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.calibration.field_sections import biases_section, fields_section
@@ -17,8 +18,6 @@ from twin.orbit.calibration.schemes import RMS, STATEMENTS, Finding, Repeats, va
 from twin.orbit.calibration.strip_sections import strips_section
 from twin.orbit.calibration.to_json import meets, unit
 from twin.trial.section import Section
-
-_ARCSEC = np.pi / 648000.0
 
 
 def sections(run: CalibrationRun) -> tuple[Section, ...]:
@@ -186,7 +185,7 @@ def _parameters(run: CalibrationRun) -> Section:
         rows.append((name, float(change), None if held else 1e6 * sigma[name], float(true), z))
     others: list[tuple[Cell, ...]] = []
     for name in (n for n in found.names if n not in INNER):
-        scale, shown = (_ARCSEC, "arcsec") if unit(name) == "rad" else (1.0, "m")
+        scale, shown = (ARCSEC, "arcsec") if unit(name) == "rad" else (1.0, "m")
         value, true, s = found.value(name) / scale, truth[name] / scale, sigma[name] / scale
         others.append((name, shown, float(value), float(s), float(true), float((value - true) / s)))
     drift = np.abs(run.campaign.spec.errors.star_tracker.thermal.amplitude).max()
@@ -266,7 +265,7 @@ def _rank(run: CalibrationRun) -> Section:
 def _data(run: CalibrationRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for name, result in run.fields.items():
-        orbit, attitude = result.orbit.rms, result.attitude.rms / _ARCSEC
+        orbit, attitude = result.orbit.rms, result.attitude.rms / ARCSEC
         rows.append((name, *map(float, orbit), *map(float, attitude)))
     table = Table(
         "third-differences",

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
+from analysis.monitoring import ARCSEC
 from analysis.orbit.forward_intersection import CheckErrors
 from twin.artefact import Cell, Table
 from twin.orbit.calibration.monitor import PooledErrors
 from twin.orbit.calibration.procedure import CalibrationRun
 from twin.orbit.calibration.strip import Strips
 from twin.trial.section import Section
-
-_ARCSEC = np.pi / 648000.0
 
 
 def gained(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -> str:
@@ -44,7 +41,7 @@ def strips_section(run: CalibrationRun, found: Strips) -> Section:
         (None, 2, 2, 2, 2),
     )
     turns: list[tuple[Cell, ...]] = [
-        (d.name, d.before / _ARCSEC, d.after / _ARCSEC, d.after / d.before) for d in found.datum
+        (d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in found.datum
     ]
     common = Table(
         "strip-datum",
@@ -56,8 +53,8 @@ def strips_section(run: CalibrationRun, found: Strips) -> Section:
         (None, 4, 4, 3),
     )
     tracker = run.campaign.spec.errors.star_tracker
-    slow = max(tracker.slow.noise) / _ARCSEC
-    noise = f"{max(tracker.noise) / _ARCSEC:g}″ from reading to reading"
+    slow = max(tracker.slow.noise) / ARCSEC
+    noise = f"{max(tracker.noise) / ARCSEC:g}″ from reading to reading"
     if slow:
         noise += f" and {slow:g}″ that change within {tracker.slow.interval:g} s"
     counts = ", ".join(f"{k} {n}" for k, n in found.ties.items())

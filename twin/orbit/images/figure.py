@@ -10,6 +10,7 @@ from matplotlib.image import AxesImage
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.flight import Simulation
 from twin.orbit.images.patch import LineImage
+from twin.orbit.images.pixel_axes import pixel_axes
 from twin.report.svg import (
     BLUE,
     GREEN,
@@ -100,13 +101,8 @@ def _show_image(axes: Axes, name: str, image: LineImage) -> None:
     first, left = window.first_line - 0.5, window.first_pixel - 0.5
     ends = (left, left + window.pixels, first + window.lines, first)
     axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased")
-    axes.set(title=name, xlabel="pixel", ylabel="line")
-    axes.ticklabel_format(useOffset=False)
-    axes.locator_params(axis="x", nbins=4)
-    axes.locator_params(axis="y", nbins=6)
-    axes.tick_params(axis="y", labelrotation=90)
-    for label in axes.get_yticklabels():
-        label.set_verticalalignment("center")
+    axes.set(title=name)
+    pixel_axes(axes)
 
 
 def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:

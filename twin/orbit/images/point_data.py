@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from twin.artefact import Data
+from twin.data_file import csv_table
 from twin.orbit.images.patch import Patch
 from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
 from twin.orbit.images.points import CONSENSUS, MatchedLine, MatchedPoints, PatchPoints, status_text
@@ -50,10 +49,7 @@ class PointListing(Data):
 
     def content(self) -> bytes:
         """The rows with all their digits; what there is not is empty."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerows([HEADS, *self.data])
-        return text.getvalue().encode()
+        return csv_table([HEADS, *self.data])
 
 
 def listing(patch: Patch, points: PatchPoints) -> list[list[Any]]:

@@ -13,6 +13,7 @@ from matplotlib.patheffects import Normal, Stroke
 from scenes.orbit_points import ImagePointsSpec
 from twin.artefact import Cell, PngFigure, Table
 from twin.orbit.images.patch import LineImage, Patch
+from twin.orbit.images.pixel_axes import pixel_axes
 from twin.orbit.images.point_data import PointListing, listing, median_sigma, median_way, reasons
 from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS, judged
 from twin.orbit.images.points import CONSENSUS, MatchedPoints, PatchPoints
@@ -166,17 +167,10 @@ def _panel(axes: Axes, name: str, image: LineImage, points: MatchedPoints) -> No
     axes.plot(at[lost, 1] + middle[1], at[lost, 0] + middle[0], ".", color=SKY, ms=5, mec="black", mew=0.4)
     axes.set(
         title=f"{name}: moved by {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nrest shown {enlarged:g} × enlarged",
-        xlabel="pixel",
-        ylabel="line",
         xlim=ends[:2],
         ylim=ends[2:],
     )
-    axes.ticklabel_format(useOffset=False)
-    axes.locator_params(axis="x", nbins=4)
-    axes.locator_params(axis="y", nbins=6)
-    axes.tick_params(axis="y", labelrotation=90)
-    for label in axes.get_yticklabels():
-        label.set_verticalalignment("center")
+    pixel_axes(axes)
 
 
 def _round(value: float) -> float:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.monitoring import CameraParameters
+from analysis.monitoring import ARCSEC, CameraParameters
 from analysis.orbit.monitored_camera import CalibratedLine, Sightings
 from optics.aim import AimError
 from optics.backend import Backend
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from scenes.orbit_monitor import OrbitMonitorSpec
     from scenes.orbit_setup import MonitorSetup
 
-ARCSEC = np.pi / 648000.0
-"""Radians."""
 HALF_SPAN = 60.0
 """Seconds of the orbit to either side of a time of the course that its images take; two views 53 degrees apart from 500
 km are 70 s apart."""

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.intersection_angle import exact
-from analysis.monitoring import CameraParameters
+from analysis.monitoring import ARCSEC, CameraParameters
 from analysis.orbit.forward_intersection import check_errors
 from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, between, intersect_pair
 from optics.frozen_map import FrozenMap
 from scenes.orbit_monitor import PARAMETERS
 from twin.orbit.line_camera import look_angle
-from twin.orbit.monitoring.flight import ARCSEC, MonitorFlight, fly_monitored, in_analysis
+from twin.orbit.monitoring.flight import MonitorFlight, fly_monitored, in_analysis
 from twin.trial.bench_error import BenchError
 
 if TYPE_CHECKING:

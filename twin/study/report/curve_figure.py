@@ -13,7 +13,7 @@ from twin.report.svg import BLUE, GREY, SKY
 from twin.study.report.analysis import StudyAnalysis
 from twin.study.report.panels import COLOURS, MARKS, bins, finish, jitter, name_texts, panels, positions, short, some
 from twin.study.report.statistics import mean_interval
-from twin.study.report.study_runs import Factor, Response, StudyRuns
+from twin.study.report.study_runs import Factor, Response
 
 MOST_LINES = 6
 MOST_PANELS = 6
@@ -33,7 +33,7 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
         if not factor.numeric:
             _bars(axes, factor, other, response)
         elif found.runs.drawn:
-            _binned(axes, found.runs, factor, response)
+            _binned(axes, factor, response)
         else:
             _lines(axes, factor, other, response)
         axes.set_xlabel(factor.label)
@@ -52,7 +52,7 @@ def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
     return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
 
 
-def _binned(axes: Axes, runs: StudyRuns, factor: Factor, response: Response) -> None:
+def _binned(axes: Axes, factor: Factor, response: Response) -> None:
     """Mean of neighbouring runs, its interval, the middle 68% of the runs, and the runs."""
     shown = some(response.good)
     axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=2.0, alpha=0.5, zorder=1)

@@ -105,7 +105,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | Untold
         return Untold(str(error))
     if chaos is None:
         return Untold(f"{n} runs are too few for {len(axes)} factors")
-    return Indices("chaos", chaos.indices(runs, response), chaos.degree, len(chaos.coefficients), chaos.held_out,
+    return Indices("chaos", chaos.indices(runs), chaos.degree, len(chaos.coefficients), chaos.held_out,
                    chaos.rest, noise)  # fmt: skip
 
 
@@ -223,7 +223,7 @@ class _Chaos:
         total = float(np.sum(coefficients[1:] ** 2)) + rest
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
-    def indices(self, runs: StudyRuns, response: Response) -> tuple[Index, ...]:
+    def indices(self, runs: StudyRuns) -> tuple[Index, ...]:
         first, total = self._shares(self.y[:, None])
         # what is left at each run is turned at random; it is first made as large as that of a run left out
         fit = self.q @ (self.q.T @ self.y)

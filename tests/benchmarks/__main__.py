@@ -1,0 +1,98 @@
+"""The benchmarks page: `python -m tests.benchmarks [--only trace,psf] [--quick] [--json]`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from tests.benchmarks.machine import Machine
+from tests.benchmarks.number import Speed
+from tests.benchmarks.page import Page
+from tests.benchmarks.registry import BENCHMARKS, Benchmark, running_order
+from tests.benchmarks.workbench import Workbench
+from twin.cli import FAILURE, InputErrorText, exit_on_terminate, explained, progress_columns
+
+HELP = """Measure how fast everything is, in one run, and hold it against its limits.
+
+Ratios to other people's software are taken in turns with it, so that a busy machine is busy for both; software that is
+not installed is skipped by name (pip install '.[oracles]'). For numbers to quote, let nothing else run.
+
+Examples:
+
+  python -m tests.benchmarks                        all, some ten minutes on two cores\n
+  python -m tests.benchmarks --list                 what there is\n
+  python -m tests.benchmarks --only trace,psf       some of it\n
+  python -m tests.benchmarks --quick                small sizes: does everything run?\n
+  python -m tests.benchmarks --json > speed.json    numbers on stdout, progress on stderr
+
+Exit code: 0 all limits are met (a quick run judges none), 1 one is missed, 2 bad input.
+"""
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+def chosen(only: str | None) -> list[Benchmark]:
+    """The benchmarks of a list of names, in the page's order.
+
+    Raises:
+        InputErrorText: there is none of that name.
+    """
+    if only is None:
+        return list(BENCHMARKS)
+    known = [one.name for one in BENCHMARKS]
+    names = [name.strip() for name in only.split(",") if name.strip()]
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        raise InputErrorText(f"no benchmark {', '.join(unknown) or repr(only)}; choose from {', '.join(known)}")
+    return [one for one in BENCHMARKS if one.name in names]
+
+
+def run(todo: list[Benchmark], quick: bool, errors: Console) -> dict[str, Speed]:
+    """Measure one after the other and tell how long it still takes."""
+    bench, found = Workbench(), {}
+    cost = {one.name: one.quick_seconds if quick else one.seconds for one in todo}
+    left = sum(cost.values())
+    with Progress(*progress_columns(28), console=errors, disable=not errors.is_terminal, transient=True) as bar:
+        task = bar.add_task("benchmarks", total=left)
+        for number, one in enumerate(running_order(todo), start=1):
+            bar.update(task, description=one.name)
+            if not errors.is_terminal:
+                errors.print(f"{number}/{len(todo)} {one.name}: {one.text}; about {left:.0f} s left", soft_wrap=True)
+            found[one.name] = one.measure(bench, quick)
+            left -= cost[one.name]
+            bar.advance(task, cost[one.name])
+    return {one.name: found[one.name] for one in todo}
+
+
+@app.command(help=HELP)
+def main(
+    only: Annotated[str | None, typer.Option(help="Names with commas between them; see --list.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small sizes, about a second or some each.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout, and nothing else.")] = False,
+    show: Annotated[bool, typer.Option("--list", help="Print the names and what they measure.")] = False,
+) -> None:
+    """Measure, print, judge."""
+    console, errors = Console(), Console(stderr=True)
+    with explained(errors), exit_on_terminate():
+        todo = chosen(only)
+        if show:
+            for one in todo:
+                console.print(f"{one.name:12} {one.text}, about {one.seconds:.0f} s", highlight=False, soft_wrap=True)
+            return
+        machine = Machine.here()
+        page = Page(machine, run(todo, quick, errors), quick)
+    if as_json:
+        json.dump(page.data, sys.stdout, indent=2, allow_nan=False)
+        sys.stdout.write("\n")
+    else:
+        page.print(console)
+    if page.missed:
+        raise typer.Exit(FAILURE)
+
+
+if __name__ == "__main__":
+    app(prog_name="python -m tests.benchmarks")

@@ -1,0 +1,55 @@
+"""A study of ten thousand states: the pair's monitor with nine frames, two workers.
+
+The states share their noise, so that the frames before are taken and measured once; noise of its own, with frames
+before and after for each state, costs 1.7 times as much.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.workbench import Workbench
+from tests.twin.study_bench import write_study
+from twin.study.chunk_store import ChunkStore
+from twin.study.cluster import local_workers
+from twin.study.engine import Engine, Progress
+from twin.study.plan import Plan
+from twin.study.setup import resolve_study
+
+RUNS, QUICK_RUNS = 10_000, 200
+LIMIT_S, LIMIT_GIB = 200.0, 4.0
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Seconds for all states, start of the workers and compilation not included; memory of all processes together."""
+    runs = QUICK_RUNS if quick else RUNS
+    changes = (("runs: 100", f"runs: {runs}"), ("file: job.yaml", "file: perturb"))
+    largest = [0]
+
+    def look(done: int, total: int) -> None:
+        own = psutil.Process()
+        largest[0] = max(largest[0], sum(p.memory_info().rss for p in (own, *own.children(recursive=True))))
+
+    with tempfile.TemporaryDirectory() as name:
+        study = write_study(Path(name) / "in", *changes, ("responses:", "noise: shared\nresponses:"))
+        plan = Plan.of(resolve_study(study))
+        store = ChunkStore(Path(name), plan)
+        store.open()
+        with local_workers(2) as workers:
+            begun = time.monotonic()
+            Engine(plan, store, progress=Progress(done=look)).run(workers)
+            seconds = time.monotonic() - begun
+        assert np.isfinite(store.result().values).all()
+    return Speed(
+        (
+            Number("states_per_s", runs / seconds, f"study of {runs} monitor states, nine frames", "states/s"),
+            Number("seconds", seconds, "  all of them", "s", Limit(LIMIT_S)),
+            Number("memory_gib", largest[0] / 2**30, "  memory of all processes", "GiB", Limit(LIMIT_GIB)),
+        )
+    )

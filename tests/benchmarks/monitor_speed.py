@@ -1,0 +1,53 @@
+"""A batch of states of the pair's monitor: 2 cameras, 4 spots, 9 frames, centroids and all estimators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from analysis.monitoring import ARCSEC
+from optics.tree import Motion, State
+from scenes.channel import BASE
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.stopwatch import Work, in_turns
+from tests.benchmarks.workbench import Workbench
+
+STATES, QUICK_STATES = 200, 25
+FRAMES = 9
+ROUNDS = 3
+LIMIT_MS = 20.0
+"""Wall time on two cores."""
+
+
+def random_states(count: int, seed: int) -> list[State]:
+    """Both focal planes turned and shifted."""
+    rng = np.random.default_rng(seed)
+
+    def motion() -> Motion:
+        x, y, z = 1e-5 * rng.normal(size=3)
+        return Motion(rotate=(0.0, 0.0, 5 * ARCSEC * rng.normal()), shift=(x, y, z))
+
+    return [{f"{BASE}/{c}/focal_plane": motion() for c in ("forward", "backward")} for _ in range(count)]
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Milliseconds per state, amortised over a batch; calibration and kernels are not what is timed."""
+    setup = bench.experiment("gf7_pair")
+    list(setup.measure(random_states(QUICK_STATES, 1), FRAMES, 1))
+    count = QUICK_STATES if quick else STATES
+    states = random_states(count, 2)
+
+    def batch(_: Any) -> list[Any]:
+        return list(setup.measure(states, FRAMES, 1))
+
+    spent = in_turns({"batch": Work(batch)}, 1 if quick else ROUNDS)["batch"]
+    assert sum(len(recovery.after) for _, recovery in spent.result) == count
+    wall, cpu = 1e3 * spent.wall_s / count, 1e3 * spent.cpu_s / count
+    return Speed(
+        (
+            Number("states_per_s", 1e3 / wall, f"monitor states, batch of {count}", "states/s"),
+            Number("ms_per_state", wall, "  wall time of a state", "ms", Limit(LIMIT_MS)),
+            Number("cpu_ms_per_state", cpu, "  processor time of a state", "ms"),
+        )
+    )

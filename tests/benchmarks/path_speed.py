@@ -1,0 +1,85 @@
+"""Path tracer: paths per second through three mirrors, and out and back through all prisms.
+
+A path per second of two cores is counted in the processor time of all threads: what the neighbours on a shared machine
+take does not count.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+from scenes.instrument_model import Instrument
+from scenes.scene_surface import IDEAL
+from scenes.scenery import build_scenery
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.stopwatch import Work, in_turns
+from tests.benchmarks.workbench import Workbench
+from tests.twin.path_bench import scene_beam
+from twin.path_tracing.families import nominal_codes
+from twin.path_tracing.source import DiskSource
+from twin.path_tracing.stray import monitor_families, pinhole
+from twin.path_tracing.tracer import PathTracer
+
+INSTRUMENTS = ("gf7_pair", "monitor_pair")
+PATHS, PATHS_BACK, QUICK_PATHS = 1 << 19, 1 << 18, 1 << 15
+CORES = 2
+ROUNDS, MOST_ROUNDS = 3, 15
+LEAST_IMAGING, LEAST_OUT_AND_BACK = 3.0e6, 0.5e6
+
+
+def imaging(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int], Any]:
+    """Light of a far point into the forward camera; most of it has to reach the focal plane."""
+    scenery = build_scenery(chosen, {}, IDEAL, whole_focal_planes=True)
+    detector = "forward/focal_plane"
+    tracer = PathTracer(bench.backend, scenery, {detector: nominal_codes(scenery, chosen.assembly, "forward/imaging")})
+    middle, heading, across = scene_beam(chosen, bench.backend)
+    source = DiskSource(middle, heading, across, 0.28)
+
+    def work(seed: int) -> Any:
+        return tracer.run(source, paths, seed, look_up=0)
+
+    assert work(0).nominal(detector).count > 0.8 * paths  # the prisms stand in the rest
+    return work
+
+
+def out_and_back(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int], Any]:
+    """Light of a reticle through camera and prisms and back, 25 surfaces; all paths go into the return face."""
+    channel = chosen.channels[0]
+    scenery = build_scenery(chosen, {}, IDEAL)
+    tracer = PathTracer(bench.backend, scenery, monitor_families(scenery, chosen))
+    wide = pinhole(chosen, bench.backend, {}, channel)
+    assert wide.narrow is not None
+    source = DiskSource(wide.centre, wide.axis, wide.across, wide.radius, wide.cone, wide.narrow, 1.0 - 1e-9)
+
+    def work(seed: int) -> Any:
+        return tracer.run(source, paths, seed, look_up=0)
+
+    assert work(0).nominal(f"{channel.key}/area_ccd").count > 0.6 * paths
+    return work
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Paths per second of two cores."""
+    numbers = []
+    kinds = (("imaging", imaging, PATHS, LEAST_IMAGING), ("out_and_back", out_and_back, PATHS_BACK, LEAST_OUT_AND_BACK))
+    for name, (kind, prepare, full, least) in itertools.product(INSTRUMENTS[:1] if quick else INSTRUMENTS, kinds):
+        paths = QUICK_PATHS if quick else full
+        run, seeds = prepare(bench, bench.instrument(name), paths), itertools.count()
+        limit = Limit(least, least=True)
+        work = Work(lambda _, run=run, seeds=seeds: run(next(seeds)))
+
+        def rate(best: Any, paths: int = paths) -> float:
+            return paths * CORES / float(best["paths"].cpu_s)
+
+        spent = in_turns(
+            {"paths": work},
+            1 if quick else ROUNDS,
+            0 if quick else MOST_ROUNDS,
+            lambda best, rate=rate, limit=limit: limit.met(rate(best) / 1.05),
+        )
+        key = "" if name == INSTRUMENTS[0] else f"{name}_"
+        text = f"paths of {name}, {kind.replace('_', ' ')}, two cores"
+        numbers.append(Number(f"{key}{kind}_paths_per_s", rate(spent), text, "paths/s", limit))
+    return Speed(tuple(numbers))

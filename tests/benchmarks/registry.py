@@ -1,0 +1,58 @@
+"""All benchmarks, in the order of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tests.benchmarks import (
+    geolocation_speed,
+    jacobian_speed,
+    large_speed,
+    monitor_speed,
+    path_speed,
+    psf_speed,
+    pushbroom_speed,
+    start_speed,
+    study_speed,
+    trace_speed,
+)
+from tests.benchmarks.number import Speed
+from tests.benchmarks.workbench import Workbench
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """One part of the page.
+
+    Attributes:
+        name: as the user calls it.
+        text: what is measured.
+        measure: workbench and whether to be quick -> its numbers.
+        seconds, quick_seconds: that it takes on an idle machine of two cores, for the time left.
+    """
+
+    name: str
+    text: str
+    measure: Callable[[Workbench, bool], Speed]
+    seconds: float
+    quick_seconds: float
+
+
+BENCHMARKS = (
+    Benchmark("trace", "sequential trace beside batoid and optiland", trace_speed.measure, 45, 8),
+    Benchmark("psf", "image of a far point beside poppy", psf_speed.measure, 12, 2),
+    Benchmark("monitor", "a batch of states of the monitor", monitor_speed.measure, 18, 6),
+    Benchmark("jacobian", "derivatives in reverse and forward mode", jacobian_speed.measure, 60, 8),
+    Benchmark("paths", "paths of the path tracer", path_speed.measure, 25, 10),
+    Benchmark("geolocation", "ground points of all pixels", geolocation_speed.measure, 8, 2),
+    Benchmark("pushbroom", "images of the ground", pushbroom_speed.measure, 60, 15),
+    Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
+    Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),
+    Benchmark("start", "the main job with an empty and with a filled kernel cache", start_speed.measure, 30, 20),
+)
+
+
+def running_order(chosen: list[Benchmark]) -> list[Benchmark]:
+    """``large`` first: it counts this process's memory, which then holds nothing of the others."""
+    return sorted(chosen, key=lambda one: one.name != "large")

@@ -1,0 +1,136 @@
+"""Sequential trace, with apertures and path lengths, beside batoid and optiland.
+
+batoid takes as many threads as OMP_NUM_THREADS says, one if it says nothing, and so do its users; optiland on NumPy
+takes one. The twin takes all cores. The limit is on batoid as it is set up; beside it stands batoid with all cores.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from optics.system import assemble
+from optics.threads import cores
+from optics.trace import make_rays, trace
+from scenes.camera_model import LINE_AXIS, CameraModel, collimated, field_direction
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.stopwatch import Spent, Work, in_turns
+from tests.benchmarks.workbench import Workbench, absent, installed
+from tests.oracles.peers import batoid_camera, batoid_rays, optiland_camera, optiland_rays
+
+CAMERAS = ("gf7", "gf7_conic")
+SURFACES = 4
+RAYS, QUICK_RAYS = 1_000_000, 50_000
+ROUNDS, MOST_ROUNDS, REPEATS = 5, 15, 5
+LEAST_RATIO = 15.0
+
+
+def launch(bench: Workbench, model: CameraModel, rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """A beam on the axis of the field, a little wider than the pupil, so that the apertures have work to do."""
+    direction = field_direction(model.spec, 0.0, 0.0)
+    to_stop = assemble(model.bare_assembly(False), [model.mirrors[:2]])
+    middle = collimated(bench.backend, to_stop, direction[None], np.zeros((1, 2)))[0, 0]
+    place = np.random.default_rng(0).uniform(-0.3, 0.3, (rays, 2))
+    return middle + place @ np.stack([LINE_AXIS, np.cross(direction, LINE_AXIS)]), direction
+
+
+@contextmanager
+def batoid_threads(count: int) -> Iterator[None]:
+    """Let batoid take so many threads; it looks at every call."""
+    from batoid import global_vars
+
+    before = global_vars._batoid_max_threads
+    global_vars._batoid_max_threads = count
+    try:
+        yield
+    finally:
+        global_vars._batoid_max_threads = before
+
+
+def works(bench: Workbench, model: CameraModel, rays: int) -> dict[str, Work]:
+    """The same beam through the same camera in each software."""
+    position, direction = launch(bench, model, rays)
+    system = assemble(model.bare_assembly(), ["imaging"]).upload(bench.backend)
+    beam = make_rays(bench.backend, position, direction)
+
+    def twin(_: Any) -> Any:
+        out = trace(bench.backend, system, beam)
+        dr.sync_thread()
+        return out
+
+    out = {"twin": Work(twin, repeats=REPEATS)}
+    if installed("batoid"):
+        peer = batoid_camera(model, apertures=True)
+
+        def on_all_cores(given: Any) -> Any:
+            with batoid_threads(cores()):
+                return peer.trace(given)
+
+        out["batoid"] = Work(peer.trace, lambda: batoid_rays(position, direction))
+        out["batoid_all_cores"] = Work(on_all_cores, lambda: batoid_rays(position, direction))
+    if installed("optiland"):
+        optic = optiland_camera(model, apertures=True)
+
+        def optiland(given: Any) -> Any:
+            optic.surfaces.trace(given, record=False)
+            return given
+
+        optiland(optiland_rays(position[:100], direction))  # compiles
+        out["optiland"] = Work(optiland, lambda: optiland_rays(position, direction))
+    twin(None)
+    return out
+
+
+def check_same_work(spent: dict[str, Spent]) -> None:
+    """The comparison is one of equals: the same rays stopped, the same path lengths.
+
+    Raises:
+        AssertionError: they are not.
+    """
+    _, _, path, valid = (array[0] for array in spent["twin"].result.numpy())
+    assert 0.7 < valid.mean() < 0.9, valid.mean()
+    for name in spent.keys() & {"batoid", "batoid_all_cores"}:
+        theirs = spent[name].result
+        assert np.array_equal(valid, ~theirs.vignetted)
+        np.testing.assert_allclose(theirs.t[valid], path[valid], rtol=0, atol=1e-12)
+    if "optiland" in spent:
+        others = spent["optiland"].result
+        assert np.array_equal(valid, others.i > 0)
+        np.testing.assert_allclose(others.opd[valid], path[valid], rtol=0, atol=1e-5)  # its asphere stops early
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Ray-surfaces per second, and how many times those of the others."""
+    numbers: list[Number] = []
+    notes = [absent(peer) for peer in ("batoid", "optiland") if not installed(peer)]
+    rays = QUICK_RAYS if quick else RAYS
+    limit = Limit(LEAST_RATIO, least=True)
+    for name in CAMERAS:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numba's remarks on optiland's code
+
+            def enough(best: Any) -> bool:
+                named = [k for k in ("batoid", "optiland") if k in best]
+                return all(limit.met(best[k].wall_s / best["twin"].wall_s) for k in named)
+
+            todo = works(bench, bench.camera(name), rays)
+            spent = in_turns(todo, 1 if quick else ROUNDS, 0 if quick else MOST_ROUNDS, enough)
+        check_same_work(spent)
+        key = "" if name == CAMERAS[0] else f"{name}_"
+        twin = spent["twin"]
+        rate = rays * SURFACES / twin.wall_s
+        numbers.append(Number(f"{key}ray_surfaces_per_s", rate, f"trace of {name}", "ray-surfaces/s"))
+        numbers.append(Number(f"{key}threads", twin.threads, "  threads at work"))
+        for peer in [k for k in spent if k != "twin"]:
+            ratio = spent[peer].wall_s / twin.wall_s
+            judged = None if peer == "batoid_all_cores" else limit
+            numbers.append(Number(f"{key}ratio_{peer}", ratio, f"  times {peer.replace('_', ' ')}", "", judged))
+            numbers.append(
+                Number(f"{key}{peer}_threads", spent[peer].threads, f"  threads of {peer.replace('_', ' ')}")
+            )
+    return Speed(tuple(numbers), tuple(notes))

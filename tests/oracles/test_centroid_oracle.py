@@ -1,0 +1,71 @@
+"""Spot centres of rendered monitor frames against photutils' centroids."""
+
+import numpy as np
+import pytest
+
+from analysis.centroid import energy_centroid, gaussian_fit, mean_frames
+from optics.tree import Motion, State
+from scenes.channel import BASE
+
+centroids = pytest.importorskip("photutils.centroids", reason="photutils not installed (extra `oracles`)")
+pytestmark = pytest.mark.oracle
+
+FRAMES = 9
+BORDER = 4
+RADIUS = 20.0
+STATES: list[State] = [
+    {f"{BASE}/{c}/focal_plane": Motion(shift=(s * 7e-6, -s * 4e-6, 0.0)) for c in ("forward", "backward")}
+    for s in (-2.3, -1.0, 0.0, 0.4, 1.7)
+]
+
+
+@pytest.fixture(scope="module")
+def setup(experiment):
+    return experiment("gf7_pair")
+
+
+@pytest.fixture(scope="module")
+def spots(setup) -> np.ndarray:
+    """Mean frames (20, H, W) of four spots in five states, with all the noise of the CCDs."""
+    after = setup.frames_after(setup.path.expected_photons(STATES), FRAMES, 4)
+    return mean_frames(after).reshape(-1, *after.shape[-2:])
+
+
+def distance(shape: tuple[int, ...], place: tuple[float, float]) -> np.ndarray:
+    rows, columns = np.indices(shape)
+    return np.hypot(rows - place[0], columns - place[1])
+
+
+def test_energy_centroid(setup, spots) -> None:
+    """Ours is the first moment in a window about itself: photutils' moment of the same pixels has to be there.
+
+    What is left is the iteration's last step, 1e-7 px, and the moments' rounding.
+    """
+    found = energy_centroid(spots, FRAMES, setup.calibration.noise, RADIUS, border_px=BORDER)
+    assert found.converged.all()
+    for spot, row, column in zip(spots, found.row, found.column, strict=True):
+        inner = np.zeros(spot.shape, bool)
+        inner[BORDER:-BORDER, BORDER:-BORDER] = True
+        light = (spot - spot[~inner].mean()) * np.clip(RADIUS + 0.5 - distance(spot.shape, (row, column)), 0.0, 1.0)
+        x, y = centroids.centroid_com(light)
+        assert (y, x) == pytest.approx((row, column), abs=1e-6)
+    assert len(spots) == len(STATES) * 4 == 20
+    assert np.ptp(found.column.reshape(len(STATES), 4), axis=0).min() > 1.0  # the spots did move
+
+
+def test_gaussian_fit(setup, spots) -> None:
+    """photutils fits Gaussian and constant too, but with equal weights and in a window with a hard edge that stays.
+
+    A spot is no Gaussian, so each has a bias of its own. Spots of a diffraction image are so nearly symmetric that it
+    stays below what the noise of nine frames does to our centre; these images have no noise.
+    """
+    images = setup.expected_frames(setup.path.expected_photons(STATES)).reshape(spots.shape)
+    found = gaussian_fit(images, FRAMES, setup.calibration.noise, RADIUS, elliptical=True)
+    variance = np.diagonal(found.temporal_covariance + found.fixed_covariance, axis1=1, axis2=2)
+    difference = []
+    for spot, row, column in zip(images, found.row, found.column, strict=True):
+        x, y = centroids.centroid_2dg(spot, mask=distance(spot.shape, (row, column)) > RADIUS)
+        difference.append((y - row, x - column))
+    assert np.shape(difference) == (20, 2)
+    assert np.all(np.abs(difference) < np.sqrt(variance)), np.abs(difference).max()
+    assert 1e-4 < np.sqrt(variance).max() < 2e-3  # so that the comparison means something

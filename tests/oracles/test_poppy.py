@@ -1,0 +1,77 @@
+"""Diffraction images and transfer functions of a traced exit pupil against poppy."""
+
+import numpy as np
+import pytest
+
+from optics import quadrature, transfer
+from optics.diffraction import Grid, image
+from optics.tree import Motion, State
+from tests.oracles.pupil_grid import WAVELENGTH, FarPoint, fitted, pupil_grid
+
+poppy = pytest.importorskip("poppy", reason="poppy not installed (extra `oracles`)")
+pytestmark = pytest.mark.oracle
+
+ARCSEC = np.pi / 180 / 3600
+STATES: dict[str, State] = {
+    "nominal": {},
+    "moved": {
+        "M2": Motion(rotate=(20 * ARCSEC, -15 * ARCSEC, 0.0), shift=(20e-6, -30e-6, 15e-6)),
+        "M3": Motion(rotate=(-5 * ARCSEC, 8 * ARCSEC, 0.0)),
+    },
+}
+STEP, PIXELS = 1.5e-6, 96
+AXIS = Grid(-0.5 * (PIXELS - 1) * STEP, STEP, PIXELS)
+
+
+@pytest.fixture(scope="module", params=list(STATES))
+def point(request, backend, gf7) -> FarPoint:
+    return FarPoint(backend, gf7, np.radians(1.0), np.radians(0.05), STATES[request.param])
+
+
+def test_image_of_the_same_samples(point) -> None:
+    """The same sum by other code: rounding, 1e-16 times the root of some ten thousand terms and the phases' size."""
+    grid = pupil_grid(fitted(point), 128)
+    ours, theirs = image(grid.field(), AXIS, AXIS)[0], grid.poppy_irradiance(AXIS)
+    assert ours.shape == (PIXELS, PIXELS)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * theirs.max())
+
+
+def test_image_from_the_stops_quadrature(point) -> None:
+    """Some thousand traced nodes against poppy's samples on ever finer grids.
+
+    The edge of a cell's share is right to 1/8 of a cell and each cell stands for its middle: errors fall at least
+    with the cell's size, and 256 cells of gf7's pupil leave 1e-4 of the peak.
+    """
+    pupil = fitted(point)
+    nodes = quadrature.disk_for(pupil_grid(pupil, 64).largest_phase(AXIS))
+    ours, error = image(point.field(nodes), AXIS, AXIS)[0], []
+    for size in (64, 256):
+        theirs = pupil_grid(pupil, size).poppy_irradiance(AXIS)
+        error.append(np.max(np.abs(theirs - ours)) / ours.max())
+    assert error[1] < 1e-4, error
+    assert error[1] < error[0] / 4.0, error
+    assert ours.max() * STEP**2 > 0.01  # there is an image
+
+
+def test_transfer_function(point) -> None:
+    """MTF and phase by the transform of poppy's image on a large field against the pupil's autocorrelation.
+
+    A field of 1.2 mm holds all of the light but 1e-3; what lies outside bends the function at the lowest frequencies
+    only, where its kink is smeared over 1 / field, so frequencies from a tenth of the cut-off are compared.
+    """
+    pupil = fitted(point)
+    grid = pupil_grid(pupil, 256)
+    count, step = 512, 2.4e-6
+    axis = Grid(-0.5 * (count - 1) * step, step, count)
+    light = grid.poppy_irradiance(axis) * step**2
+    directions = np.array([[1.0, 0.0], [0.0, 1.0], [0.6, 0.8]])
+    cutoff = pupil.cutoff(directions, WAVELENGTH)
+    f = (np.array([0.1, 0.3, 0.5, 0.7, 0.9])[:, None, None] * directions * cutoff[:, None]).reshape(-1, 2)
+    assert np.max(f) < 0.5 / step  # the pixels sample the image finely enough
+    waves = [np.exp(-2j * np.pi * np.outer(f[:, i], axis.points())) for i in (0, 1)]
+    got = np.einsum("mr,rc,mc->m", waves[1], light, waves[0])
+    want = transfer.transfer(pupil, f, WAVELENGTH, np.array([0.0]))[0]
+    assert len(want) == 15
+    np.testing.assert_allclose(got, want, rtol=0, atol=2e-3)
+    assert np.max(np.abs(want)) > 0.8
+    assert np.min(np.abs(want)) < 0.1

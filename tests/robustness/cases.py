@@ -1,0 +1,248 @@
+"""What is fuzzed: every command that reads YAML, with every file of the library that it can read as one's own.
+
+A case is a folder of files of which one is changed, and the command that reads it. Commands run as they are up to where
+they have read, checked, resolved and built everything; there the long computation is replaced by `Reached`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+from unittest.mock import patch
+
+import typer
+from rich.console import Console
+
+from scenes.load import LIBRARY, load_error_budget, load_principle_experiment
+from twin.cli import explained
+from twin.design import app as design
+from twin.lab import app as lab
+from twin.orbit.__main__ import app as orbit
+from twin.render import app as render
+from twin.study.__main__ import app as study
+
+CUTS = (
+    "twin.render_job.trace_truth",
+    "twin.laboratory.focus_result.align",
+    "twin.laboratory.distortion_bench.DistortionBench.record",
+    "twin.laboratory.turntable.choose",
+    "twin.orbit.angle.procedure.estimated",
+    "twin.orbit.calibration.campaign._drawn",
+    "twin.orbit.calibration.images.Imager.measured",
+    "twin.orbit.monitoring.flight._changes",
+    "twin.orbit.images.flight.fly_patch",
+    "twin.study.command.local_workers",
+    "twin.study.gradient._Traced",
+    "twin.study.gradient._whole",
+    "twin.design.optimise",
+)
+"""Functions that begin the long computations."""
+SOONER = (
+    "scenes.thermal_model.ThermalModel._solid_response",
+    "optics.transfer._correlate",
+)
+"""Parts of building that take seconds, finite elements and transfer functions: most mutants stop before them."""
+
+
+class Reached(BaseException):
+    """A command has read and built everything and would now compute."""
+
+
+def _reach(*_: object, **__: object) -> None:
+    raise Reached
+
+
+@contextmanager
+def cut(soon: bool) -> Iterator[None]:
+    """Let no command compute, and not even build what takes seconds if ``soon``."""
+    with ExitStack() as stack:
+        for name in (*CUTS, *SOONER) if soon else CUTS:
+            stack.enter_context(patch(name, _reach))
+        yield
+
+
+bench = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+"""Two sorts of files have no command of their own; the validation reads them from the library."""
+
+
+@bench.command()
+def principle(file: Path, out: Annotated[Path | None, typer.Option()] = None) -> None:
+    with explained(Console(stderr=True)):
+        load_principle_experiment(file)
+    raise Reached
+
+
+@bench.command()
+def budget(file: Path, out: Annotated[Path | None, typer.Option()] = None) -> None:
+    with explained(Console(stderr=True)):
+        load_error_budget(file)
+    raise Reached
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command and its files.
+
+    Attributes:
+        name: of the case.
+        app: of the command.
+        words: before the file, such as the subcommand.
+        files: name in the case's folder -> text; the first is given to the command.
+        target: the file that is changed.
+        options: after the file.
+        weight: share of the mutants; slow commands get fewer.
+    """
+
+    name: str
+    app: typer.Typer
+    words: tuple[str, ...]
+    files: Mapping[str, str]
+    target: str
+    options: tuple[str, ...] = ()
+    weight: float = 1.0
+
+
+def _text(name: str) -> str:
+    return (LIBRARY / name).read_text("utf-8")
+
+
+def _with(text: str, *changes: tuple[str, str]) -> str:
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+def _of_one(name: str, app: typer.Typer, words: str, file: str, **more: object) -> Case:
+    """A case with one file of the library, unchanged."""
+    own = Path(file).name
+    return Case(name, app, tuple(words.split()), {own: _text(file)}, own, **more)  # type: ignore[arg-type]
+
+
+def _config(name: str, app: typer.Typer, words: str, resolve: Callable, file: str, **more: object) -> Case:
+    """A case with the config.yaml of a run."""
+    text = resolve(LIBRARY / file).to_yaml()
+    return Case(name, app, tuple(words.split()), {"config.yaml": text}, "config.yaml", **more)  # type: ignore[arg-type]
+
+
+def cases() -> dict[str, Case]:
+    """All cases by name."""
+    return {case.name: case for case in (*_renders(), *_labs(), *_orbits(), *_studies(), *_rest())}
+
+
+def _renders() -> Iterator[Case]:
+    from scenes.resolved import resolve
+
+    quick = ("--frames", "1")
+    for stem in ("perturb", "aligned", "steady", "image_quality", "targets"):
+        yield _of_one(f"render-{stem}", render, "", f"examples/{stem}.yaml", options=quick)
+    yield _of_one("render-orbit", render, "", "examples/orbit.yaml", options=quick, weight=0.5)
+    stray = _with(_text("examples/aligned.yaml"), ("frames: 9", "stray: {paths: 10000}, frames: 9"))
+    yield Case("render-stray", render, (), {"stray.yaml": stray}, "stray.yaml", quick)
+    own = {
+        "job.yaml": _with(_text("examples/targets.yaml"), ("instrument: gf7_pair", "instrument: ./pair.yaml")),
+        "pair.yaml": _with(
+            _text("instruments/gf7_pair.yaml"),
+            ("{camera: gf7, look: 26", "{camera: ./gf7.yaml, look: 26"),
+            ("{camera: gf7, look: -5", "{camera: conic.yaml, look: -5"),
+            ("monitor_ccd", "sub/ccd.yaml"),
+        ),
+        "gf7.yaml": _with(_text("cameras/gf7.yaml"), ("detector: gf7_pan", "detector: ./pan.yaml")),
+        "conic.yaml": _text("cameras/gf7_conic.yaml"),
+        "sub/ccd.yaml": _text("detectors/monitor_ccd.yaml"),
+        "pan.yaml": _text("detectors/gf7_pan.yaml"),
+    }
+    for target in own:
+        stem = Path(target).stem
+        yield Case(f"render-own-{stem}", render, (), own, target, quick)
+    yield _config("render-config", render, "", resolve, "examples/targets.yaml", options=quick, weight=0.5)
+
+
+def _labs() -> Iterator[Case]:
+    from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
+
+    resolvers = {"focus": resolve_focus, "distortion": resolve_distortion, "turntable": resolve_turntable}
+    for stem, resolve in resolvers.items():
+        yield _of_one(f"lab-{stem}", lab, stem, f"lab/{stem}.yaml")
+        yield _config(f"lab-{stem}-config", lab, stem, resolve, f"lab/{stem}.yaml", weight=0.5)
+    own = {
+        "test.yaml": _with(
+            _text("lab/distortion.yaml"),
+            ("camera: gf7", "camera: ./gf7.yaml"),
+            ("turntable: turntable", "turntable: ./table.yaml"),
+        ),
+        "table.yaml": _text("lab/turntable.yaml"),
+        "gf7.yaml": _text("cameras/gf7.yaml"),
+    }
+    for target in ("table.yaml", "gf7.yaml"):
+        yield Case(f"lab-distortion-own-{Path(target).stem}", lab, ("distortion",), own, target)
+
+
+def _orbits() -> Iterator[Case]:
+    from scenes.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+
+    for stem in ("angle", "angle_gf7", "angle_off_axis"):
+        yield _of_one(f"orbit-{stem}", orbit, "angle", f"orbit/{stem}.yaml")
+    for stem in ("calibrate", "calibrate_images", "calibrate_monitor", "calibrate_strip"):
+        yield _of_one(f"orbit-{stem}", orbit, "calibrate", f"orbit/{stem}.yaml")
+    yield _of_one("orbit-monitor", orbit, "monitor", "orbit/monitor.yaml", weight=0.5)
+    yield _of_one("orbit-simulate", orbit, "simulate", "orbit/simulate.yaml")
+    configs = {
+        "angle": resolve_angle,
+        "calibrate": resolve_calibration,
+        "monitor": resolve_monitor,
+        "simulate": resolve_simulate,
+    }
+    for stem, resolve in configs.items():
+        yield _config(f"orbit-{stem}-config", orbit, stem, resolve, f"orbit/{stem}.yaml", weight=0.5)
+    payload = _with(_text("payloads/th1.yaml"), ("detector: th1_line", "detector: ./line.yaml"))
+    own = {"th1.yaml": payload, "line.yaml": _text("detectors/th1_line.yaml")}
+    for command in ("angle", "simulate"):
+        test = {"test.yaml": _with(_text(f"orbit/{command}.yaml"), ("camera: th1", "camera: ./th1.yaml"))}
+        for target in own if command == "simulate" else ("th1.yaml",):
+            yield Case(f"orbit-{command}-own-{Path(target).stem}", orbit, (command,), {**test, **own}, target)
+
+
+def _studies() -> Iterator[Case]:
+    from twin.study.setup import resolve_study
+
+    workers = ("--workers", "1")
+    for stem in ("smoke", "alignment", "aperture", "interval", "prism_heat"):
+        yield _of_one(f"study-{stem}", study, "", f"examples/study_{stem}.yaml", options=workers, weight=0.7)
+    smoke = "examples/study_smoke.yaml"
+    yield _config("study-config", study, "", resolve_study, smoke, options=workers, weight=0.5)
+    yield _of_one("study-gradient", study, "", smoke, options=("--gradient",), weight=0.7)
+    text = _with(
+        _text(smoke),
+        ("file: perturb}", "file: ./base.yaml}"),
+        ("uniform: [-10 arcsec, 10 arcsec]", "table: {file: values.csv, column: turn}"),
+        ("normal: {mean: 0 um, sigma: 2 um}", "table: {file: values.csv, column: despace}"),
+        ("  warmth:", "  # warmth:"),
+        ("kind: latin_hypercube, runs: 100, seed: 1", "kind: grid"),
+    )
+    table = io.StringIO()
+    table.write("turn,despace\n")
+    for k in range(12):
+        table.write(f"{k - 5} arcsec,{0.5 * k} um\n")
+    own = {"study.yaml": text, "base.yaml": _text("examples/perturb.yaml"), "values.csv": table.getvalue()}
+    for target in own:
+        yield Case(f"study-own-{Path(target).stem}", study, (), own, target, workers, 0.7)
+
+
+def _rest() -> Iterator[Case]:
+    file = "examples/design_gf7_short.yaml"
+    yield _of_one("design", design, "", file)
+    own = {
+        "design.yaml": _with(_text(file), ("camera: gf7\n", "camera: ./gf7.yaml\n")),
+        "gf7.yaml": _text("cameras/gf7.yaml"),
+    }
+    yield Case("design-own-camera", design, (), own, "gf7.yaml")
+    yield _of_one("principle", bench, "principle", "lab/principle_experiment.yaml")
+    yield _of_one("budget", bench, "budget", "budgets/monitor_pair.yaml")
+
+
+__all__ = ["Case", "Reached", "cases", "cut"]

@@ -1,0 +1,216 @@
+"""Spoils YAML files at random: bytes, tokens, the tree, and whatever looks like a path.
+
+changed = mutate(text, random.Random(7))
+changed.content     # bytes of the spoilt file
+changed.how         # what was done
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from scenes.errors import InputError
+from tests.robustness.mutate_tree import TREES, YAMLS, paths
+from tests.robustness.nasty import NUMBERS, TEXTS, UNITS
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A spoilt file.
+
+    Attributes:
+        content: its bytes.
+        how: which mutators made it.
+    """
+
+    content: bytes
+    how: str
+
+
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w.])")
+_UNIT = re.compile(r"(?<=\d) [A-Za-z%]+(?:/[A-Za-z]+(?:\^\d)?)?")
+_WORD = re.compile(r"[A-Za-z_]\w+")
+
+
+def mutate(text: str, chance: random.Random) -> Mutant:
+    """A file spoilt in one way, or in two or three at once."""
+    kind = chance.choices(("byte", "token", "tree", "path", "yaml"), (18, 26, 36, 10, 10))[0]
+    if kind == "byte":
+        content, how = text.encode(), []
+        for _ in range(chance.choice((1, 1, 1, 2, 3))):
+            mutator = chance.choice(BYTES)
+            content = mutator(content, chance)
+            how.append(mutator.__name__)
+        return Mutant(content, "byte: " + ", ".join(how))
+    table = {"token": TOKENS, "tree": TREES, "path": (paths,), "yaml": YAMLS}[kind]
+    how = []
+    for _ in range(chance.choice((1, 1, 1, 2, 3))):
+        mutator = chance.choice(table)
+        try:
+            text = mutator(text, chance)
+        except (InputError, IndexError, ValueError):  # nothing left to change
+            continue
+        how.append(mutator.__name__)
+    return Mutant(text.encode("utf-8", "surrogatepass"), f"{kind}: " + ", ".join(how))
+
+
+# --- bytes
+
+
+def _span(content: bytes, chance: random.Random, longest: int = 60) -> tuple[int, int]:
+    first = chance.randrange(len(content) + 1)
+    return first, min(len(content), first + chance.randint(1, longest))
+
+
+def flip(content: bytes, chance: random.Random) -> bytes:
+    out = bytearray(content)
+    for _ in range(chance.choice((1, 2, 5, 20))):
+        if out:
+            out[chance.randrange(len(out))] ^= 1 << chance.randrange(8)
+    return bytes(out)
+
+
+def insert(content: bytes, chance: random.Random) -> bytes:
+    at, _ = _span(content, chance)
+    sort = chance.randrange(4)
+    if sort == 0:
+        extra = chance.randbytes(chance.randint(1, 40))
+    elif sort == 1:
+        extra = chance.choice(
+            (b"\0", b"\t", b"\r", b"\x85", b"\xff\xfe", b"\xed\xa0\x80", b"\xc0\x80", b"\xf4\x90\x80\x80")
+        )
+    elif sort == 2:
+        extra = bytes(chance.choices(b"{}[],:#&*!|>'\"%@`-?\n \\", k=chance.randint(1, 6)))
+    else:
+        extra = chance.choice(("\ufeff", "\u2028", "\x85", "\u200b", "\u00a0", "\u202e", "😀")).encode()
+    return content[:at] + extra + content[at:]
+
+
+def delete(content: bytes, chance: random.Random) -> bytes:
+    first, last = _span(content, chance)
+    return content[:first] + content[last:]
+
+
+def repeat(content: bytes, chance: random.Random) -> bytes:
+    first, last = _span(content, chance, 200)
+    return content[:last] + content[first:last] * chance.choice((1, 2, 50)) + content[last:]
+
+
+def truncate(content: bytes, chance: random.Random) -> bytes:
+    return content[: chance.randrange(len(content) + 1)]
+
+
+def swap(content: bytes, chance: random.Random) -> bytes:
+    a, b = sorted(_span(content, chance))
+    c, d = sorted(_span(content, chance))
+    if b > c:
+        return content
+    return content[:a] + content[c:d] + content[b:c] + content[a:b] + content[d:]
+
+
+def binary(content: bytes, chance: random.Random) -> bytes:
+    return chance.choice(
+        (chance.randbytes(500), b"\x7fELF\x02\x01\x01" + bytes(200), b"\x89PNG\r\n\x1a\n" + bytes(50), bytes(1000))
+    )
+
+
+def recode(content: bytes, chance: random.Random) -> bytes:
+    text = content.decode("utf-8", "replace")
+    return text.encode(chance.choice(("utf-16", "utf-16-le", "utf-32", "utf-7", "cp037", "utf-8-sig")), "replace")
+
+
+def line_ends(content: bytes, chance: random.Random) -> bytes:
+    return content.replace(
+        b"\n", chance.choice((b"\r\n", b"\r", b"\n\n", b"\n\r", b"\xe2\x80\xa8", b"", b"\n \n", b"\n\t"))
+    )
+
+
+def huge(content: bytes, chance: random.Random) -> bytes:
+    """Around the reader's limit of a megabyte."""
+    sort = chance.randrange(4)
+    room = max(0, chance.choice((200_000, 999_999, 1_000_001)) - len(content))
+    if sort == 0:
+        return content + b"\n#" + b"x" * room
+    if sort == 1:
+        return chance.choice((b"[", b"{", b"{a: ", b"- ", b"? ", b"'", b"\n")) * 50_000
+    if sort == 2:
+        return content + b"\nlong: '" + b"x" * room + b"'\n"
+    return b"x" * min(room, 300_000) + b": 1\n" + content
+
+
+BYTES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
+    *(flip, flip, insert, insert, delete, delete, repeat, truncate, swap, binary, recode, line_ends, huge),
+)
+
+
+# --- tokens
+
+
+def _replaced(text: str, pattern: re.Pattern[str], chance: random.Random, new: Callable[[str], str]) -> str:
+    found = list(pattern.finditer(text))
+    one = found[chance.randrange(len(found))]
+    return text[: one.start()] + new(one[0]) + text[one.end() :]
+
+
+def number(text: str, chance: random.Random) -> str:
+    return _replaced(text, _NUMBER, chance, lambda old: chance.choice(NUMBERS))
+
+
+def scale(text: str, chance: random.Random) -> str:
+    factor = chance.choice((-1.0, 0.0, 1e-300, 1e-12, 1e-6, 1e-3, 0.1, 0.9, 1.1, 3.0, 10.0, 1e3, 1e6, 1e12, 1e300))
+
+    def scaled(old: str) -> str:
+        value = float(old) * factor
+        return str(int(value)) if re.fullmatch(r"[-+]?\d+", old) and abs(value) < 1e15 else repr(value)
+
+    return _replaced(text, _NUMBER, chance, scaled)
+
+
+def unit(text: str, chance: random.Random) -> str:
+    return _replaced(text, _UNIT, chance, lambda old: " " + chance.choice(UNITS))
+
+
+def no_unit(text: str, chance: random.Random) -> str:
+    return _replaced(text, _UNIT, chance, lambda old: "")
+
+
+def word(text: str, chance: random.Random) -> str:
+    return _replaced(
+        text, _WORD, chance, lambda old: chance.choice((*TEXTS, old.upper(), old[::-1], old + "x", old[:-1]))
+    )
+
+
+def words(text: str, chance: random.Random) -> str:
+    """Two words change places."""
+    found = list(_WORD.finditer(text))
+    a, b = sorted(chance.sample(range(len(found)), 2))
+    first, second = found[a], found[b]
+    middle = text[first.end() : second.start()]
+    return text[: first.start()] + second[0] + middle + first[0] + text[second.end() :]
+
+
+def indent(text: str, chance: random.Random) -> str:
+    lines = text.split("\n")
+    k = chance.randrange(len(lines))
+    lines[k] = chance.choice((" ", "   ", "\t", "- ", "? ", "'", "> ", "| ")) + lines[k].lstrip(
+        chance.choice((" ", ""))
+    )
+    return "\n".join(lines)
+
+
+TOKENS: tuple[Callable[[str, random.Random], str], ...] = (
+    number,
+    number,
+    scale,
+    scale,
+    scale,
+    unit,
+    unit,
+    no_unit,
+    word,
+    words,
+    indent,
+)

@@ -1,0 +1,529 @@
+"""`python -m twin.validate`: which checks run, how a verdict comes about, what is written, and what happens when
+something goes wrong. Tiny groups stand for the real ones, but for one run of paper 001's formulas.
+"""
+
+import hashlib
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+import twin.validate as command
+from tests.twin.commands import files, invoke
+from twin.artefact import Data, PngFigure, SvgFigure, Table
+from twin.validation import registry
+from twin.validation.check import (
+    CONFIRMED,
+    CORRECTED,
+    FAILED,
+    NOT_CHECKABLE,
+    REFUTED,
+    VERDICTS,
+    Check,
+    CheckResult,
+    Explanation,
+)
+from twin.validation.group import CheckGroup, Context, matches
+from twin.validation.registry import UnknownCheck, select
+from twin.validation.runner import run_checks
+
+run = partial(invoke, command.app)
+"""The command inside this process."""
+
+ROOT = Path(__file__).resolve().parents[2]
+KEYS = [
+    "id", "paper", "equation", "statement", "printed", "measured", "sigma", "unit", "verdict", "how", "seconds",
+]  # fmt: skip
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def check(identifier: str = "001.table3.a", printed: float | None = 1.0, tolerance: float = 0.1, **more) -> Check:
+    return Check(identifier, "Table 3", f"Statement of {identifier}", "arcsec", printed, tolerance, "a reason", **more)
+
+
+def answers(context: Context):
+    """A group that finds every check to hold, and adds one artefact of each kind."""
+    for k, identifier in enumerate(sorted(context.selected)):
+        context.progress(k / len(context.selected), f"do {identifier}")
+        yield context.check(identifier).judge(1.02, 0.01, "Thought about it.")
+    context.add(SvgFigure("drawing", "A drawing", "Of nothing.", "<svg viewBox='0 0 1 1'><g id='mark'/></svg>"))
+    context.add(PngFigure("picture", "A picture", "Of less.", PNG))
+    context.add(Table("numbers", "Some numbers", "Three.", ("name [arcsec]", "value"), [("a<b", 0.5), ("c", None)]))
+    context.add(Data("data", "Data", "All of it.", {"x": [1, 2]}))
+    if context.folder is not None:
+        (context.folder / "own.txt").write_text("mine")
+
+
+def breaks(context: Context):
+    """A group that answers the first of its checks and then fails."""
+    yield context.check(min(context.selected)).judge(1.0, None, "Easy.")
+    raise ValueError("no light\non the detector")
+
+
+def group(prefix: str, *names: str, run=answers, seconds: float = 2.0) -> CheckGroup:
+    checks = tuple(check(f"{prefix}.{name}" if name else prefix) for name in names)
+    return CheckGroup(prefix, f"Group {prefix}", seconds, checks, run)
+
+
+GOOD = group("001.table3", "a", "b")
+NEAR = group("001.table33", "x")
+LEAF = group("001.table4", "")
+OTHER = group("004.eq3", "f", "p")
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """Function: these groups in place of the real ones."""
+    return lambda *groups: monkeypatch.setattr(registry, "GROUPS", groups)
+
+
+# --- which checks run -------------------------------------------------------------------------------------------------
+
+
+def test_prefixes_end_where_a_part_ends():
+    assert matches("001.table3.a", "001.table3")
+    assert matches("001.table3", "001.table3")
+    assert matches("001.table3.a", "001")
+    assert not matches("001.table33.a", "001.table3")
+    assert not matches("001.table3", "001.table3.a")
+    assert not matches("001.table3.a", "")
+    assert not matches("001.table3.a", "001.")
+
+
+@pytest.mark.parametrize(
+    ("only", "expected"),
+    [
+        (None, {"001.table3.a", "001.table3.b", "001.table33.x", "001.table4", "004.eq3.f", "004.eq3.p"}),
+        ("001.table3", {"001.table3.a", "001.table3.b"}),
+        ("001.table3,001.table4", {"001.table3.a", "001.table3.b", "001.table4"}),
+        ("001.table3.b, 004", {"001.table3.b", "004.eq3.f", "004.eq3.p"}),
+        ("001.table3.b,001.table3", {"001.table3.a", "001.table3.b"}),
+    ],
+)
+def test_selection(only, expected):
+    chosen = select((GOOD, NEAR, LEAF, OTHER), only)
+    assert set().union(*(selection.ids for selection in chosen)) == expected
+    assert all(selection.ids <= set(selection.group.ids) and selection.ids for selection in chosen)
+
+
+@pytest.mark.parametrize(
+    ("only", "words"),
+    [
+        ("001.tabel3", ("no check '001.tabel3'", "did you mean '001.table3'?")),
+        ("001.table3.", ("'001.table3.'", "did you mean '001.table3'?")),
+        ("001.table3,004.eq3.g", ("'004.eq3.g'", "did you mean '004.eq3.")),
+        ("001.table", ("'001.table'", "did you mean '001.table")),
+        ("001.table3,", ("empty id",)),
+        ("", ("empty id",)),
+        ("zzzzzz", ("no check 'zzzzzz'; --list shows all",)),
+    ],
+)
+def test_unknown_ids(only, words, fake, tmp_path):
+    fake(GOOD, NEAR, LEAF, OTHER)
+    with pytest.raises(UnknownCheck):
+        select((GOOD, NEAR, LEAF, OTHER), only)
+    result = run("--only", only, "--out", tmp_path / "run")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: ")
+    for word in words:
+        assert word in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ids_are_unique_and_belong_to_a_paper():
+    with pytest.raises(ValueError, match=r"twice: 001\.table3"):
+        select((GOOD, GOOD), None)
+    for wrong in ("002.x", "001", "001.", "001..x", "001.a b", "001.a-b"):
+        with pytest.raises(ValueError, match="check id"):
+            check(wrong)
+    with pytest.raises(ValueError, match="another paper"):
+        CheckGroup("004.x", "", 1.0, (check("001.x"),), answers)
+    with pytest.raises(ValueError, match="group prefix"):
+        CheckGroup("001/../x", "", 1.0, (check("001.x"),), answers)
+
+
+def test_only_selected_groups_run(backend):
+    told = []
+
+    def listen(context: Context):
+        told.append(context.selected)
+        yield from answers(context)
+
+    groups = (group("001.table3", "a", "b", run=listen), group("001.table4", "", run=breaks))
+    validation = run_checks(select(groups, "001.table3.b"), backend, 1)
+    assert told == [{"001.table3.b"}]
+    assert [result.id for result in validation.results] == ["001.table3.b"]
+
+
+def test_list(fake):
+    fake(GOOD, OTHER)
+    result = run("--list")
+    assert result.exit_code == 0
+    for identifier in (*GOOD.ids, *OTHER.ids):
+        assert f"{identifier}  Table 3: Statement of {identifier}" in result.stdout
+    assert result.stdout.count("about 2 s") == 2
+    some = json.loads(run("--list", "--only", "004", "--json").stdout)["checks"]
+    assert [row["id"] for row in some] == list(OTHER.ids)
+
+
+def test_help_says_what_a_verdict_means():
+    result = run("--help")
+    assert result.exit_code == 0
+    for word in (
+        *VERDICTS,
+        "--only",
+        "--fast",
+        "--list",
+        "--out",
+        "--seed",
+        "--backend",
+        "--force",
+        "--json",
+        "Exit codes",
+    ):
+        assert word in result.stdout
+
+
+# --- verdicts ---------------------------------------------------------------------------------------------------------
+
+FAULT = Explanation(2.0, CORRECTED, "A factor 2 is missing.")
+CAMERA = Explanation(3.0, REFUTED, "The camera is another one.")
+
+
+@pytest.mark.parametrize(
+    ("measured", "sigma", "verdict"),
+    [
+        (1.0999, None, CONFIRMED),
+        (0.9001, None, CONFIRMED),
+        (1.1001, None, REFUTED),
+        (1.12, 0.01, CONFIRMED),
+        (1.14, 0.01, REFUTED),
+        (2.0999, None, CORRECTED),
+        (2.1001, None, REFUTED),
+        (3.05, 0.0, REFUTED),
+    ],
+)
+def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
+    result = check().judge(measured, sigma, "Measured.", explanations=[FAULT, CAMERA])
+    assert result.verdict == verdict
+    assert (result.measured, result.sigma, result.printed) == (measured, sigma, 1.0)
+    assert ("factor 2 is missing" in result.how) == (verdict == CORRECTED)
+    assert ("another one" in result.how) == (measured == 3.05)
+    assert ("cause is not known" in result.how) == (verdict == REFUTED and measured != 3.05)
+    assert "a reason" in result.how.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("comparison", "low", "high"),
+    [("at most", CONFIRMED, REFUTED), ("at least", REFUTED, CONFIRMED), ("equal", REFUTED, REFUTED)],
+)
+def test_claims_of_a_limit(comparison, low, high):
+    claim = check(comparison=comparison)
+    assert claim.judge(0.5, None, "").verdict == low
+    assert claim.judge(1.5, None, "").verdict == high
+    assert claim.judge(1.05, None, "").verdict == claim.judge(0.95, None, "").verdict == CONFIRMED
+
+
+def test_a_number_that_is_not_printed_needs_one_that_is_implied():
+    silent = check(printed=None)
+    with pytest.raises(ValueError, match="expected"):
+        silent.judge(1.0, None, "")
+    result = silent.judge(1.0, None, "", expected=1.05)
+    assert (result.printed, result.verdict) == (None, CONFIRMED)
+    assert silent.judge(1.0, None, "", expected=1.2).verdict == REFUTED
+
+
+def test_what_the_text_does_not_print_is_not_checked():
+    result = check(expected=NOT_CHECKABLE).not_checkable("The table is lost.")
+    assert (result.verdict, result.measured, result.how) == (NOT_CHECKABLE, None, "The table is lost.")
+
+
+@pytest.mark.parametrize("verdict", ["fine", FAILED])
+def test_only_a_verdict_can_be_expected(verdict):
+    with pytest.raises(ValueError, match="no verdict to expect"):
+        check(expected=verdict)
+
+
+def test_another_verdict_than_the_expected_one_fails_the_command(fake, tmp_path):
+    """A finding of earlier work that is no longer found is as much of a surprise as a claim that no longer holds."""
+
+    def run_both(context: Context):
+        yield context.check("001.eq5").judge(1.0, None, "Right as printed.")
+        yield context.check("001.eq7").judge(2.0, None, "Twice.", explanations=[FAULT])
+
+    known = (check("001.eq5", expected=CORRECTED), check("001.eq7", expected=CORRECTED))
+    fake(CheckGroup("001.formulas", "Formulas", 1.0, known, run_both))
+    result = run("--json", "--out", tmp_path / "run")
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)["unexpected"]
+    assert told == [{"id": "001.eq5", "verdict": CONFIRMED, "expected": CORRECTED}]
+    assert "001.eq5 is confirmed, not confirmed with correction as expected: Right as printed." in result.stderr
+    assert "earlier work found" in (tmp_path / "run/validation.html").read_text("utf-8")
+    assert run("--json", "--only", "001.eq7").exit_code == 0
+
+
+def test_a_fast_run_makes_fewer_trials(fake):
+    def trials(context: Context):
+        yield context.check("001.table4").judge(context.count(full=100, fast=7), None, "Counted.")
+
+    (one,) = group("001.table4", "").checks
+    fake(CheckGroup("001.table4", "", 600.0, (one,), trials, fast_seconds=5.0))
+    for options, expected, seconds in (([], 100, 600.0), (["--fast"], 7, 5.0)):
+        found = json.loads(run("--json", *options).stdout)
+        assert (found["checks"][0]["measured"], found["fast"]) == (expected, bool(options))
+        assert json.loads(run("--list", "--json", *options).stdout)["checks"][0]["group_seconds"] == seconds
+
+
+def test_a_weak_check_says_so():
+    assert "weak" in check().judge(1.0, 0.05, "").how
+    assert "weak" not in check().judge(1.0, 0.03, "").how
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"verdict": "fine"},
+        {"measured": math.nan},
+        {"sigma": -1.0},
+        {"measured": None},
+        {"verdict": FAILED},
+        {"seconds": -1.0},
+    ],
+)
+def test_results_that_say_nothing_are_refused(change):
+    good = check().judge(1.0, 0.01, "").to_dict()
+    with pytest.raises(ValueError, match=r"001\.table3\.a"):
+        CheckResult(**{**good, **change})
+
+
+@pytest.mark.parametrize("measured", [math.nan, math.inf])
+def test_no_verdict_on_what_is_no_number(measured):
+    with pytest.raises(ValueError, match="no comparison"):
+        check().judge(measured, None, "")
+
+
+# --- what is written --------------------------------------------------------------------------------------------------
+
+FILES = {
+    "validation.json",
+    "validation.html",
+    "manifest.json",
+    *(f"summary/{name}" for name in ("README.md", "001.table3-drawing.svg", "001.table3-picture.png")),
+    *(f"artefacts/001.table3/{name}" for name in ("drawing.svg", "picture.png", "numbers.csv", "data.json", "own.txt")),
+}
+
+
+def test_the_run_folder_is_complete(fake, tmp_path):
+    fake(GOOD, group("001.table4", "", run=lambda context: [context.check("001.table4").judge(1.0, None, "")]))
+    result = run("--out", tmp_path / "new/run", "--json", "--seed", 7)
+    assert result.exit_code == 0
+    assert files(tmp_path) == {f"new/run/{name}" for name in FILES}
+    assert not (tmp_path / "new/run/artefacts/001.table4").exists()
+    assert result.stderr == ""
+    assert result.stdout.count("\n") == 1
+    printed = json.loads(result.stdout)
+    assert printed == json.loads((tmp_path / "new/run/validation.json").read_text())
+    assert (printed["schema"], printed["version"]) == ("space-camera-twin/validation", 1)
+    assert (printed["seed"], printed["backend"], printed["only"], printed["fast"]) == (7, "llvm", None, False)
+    assert printed["unexpected"] == []
+    assert "drjit" in printed["versions"]
+    assert printed["counts"] == {**dict.fromkeys(VERDICTS, 0), CONFIRMED: 3}
+    named = [a["file"] for a in printed["groups"][0]["artefacts"]] + printed["groups"][0]["files"]
+    assert set(named) == {name for name in FILES if name.startswith("artefacts")}
+    manifest = json.loads((tmp_path / "new/run/manifest.json").read_text())
+    assert set(manifest["sha256"]) == FILES - {"manifest.json"}
+    for name, digest in manifest["sha256"].items():
+        assert hashlib.sha256((tmp_path / "new/run" / name).read_bytes()).hexdigest() == digest
+    drawing = (tmp_path / "new/run/artefacts/001.table3/drawing.svg").read_text()
+    assert 'xmlns="http://www.w3.org/2000/svg"' in drawing
+
+
+def test_results_have_exactly_these_keys(fake):
+    fake(GOOD)
+    for found in json.loads(run("--json").stdout)["checks"]:
+        assert list(found) == KEYS
+        assert (found["paper"], found["verdict"]) == ("001", CONFIRMED)
+        for key in KEYS:
+            expected = (float, type(None)) if key in ("printed", "measured", "sigma", "seconds") else str
+            assert isinstance(found[key], expected)
+
+
+def test_the_report_shows_everything_and_needs_nothing_from_outside(fake, tmp_path):
+    fake(GOOD, OTHER)
+    assert run("--out", tmp_path / "run").exit_code == 0
+    page = (tmp_path / "run/validation.html").read_text("utf-8")
+    for text in (*GOOD.ids, *OTHER.ids, "Statement of 004.eq3.f", "1.020 arcsec", "± 0.010", "Thought about it."):
+        assert text in page
+    for text in (*VERDICTS.values(), "<g id='mark'/>", "data:image/png;base64,iVBORw0KGgo=", "a&lt;b", "own.txt"):
+        assert text.replace("'", "&#39;") in page or text in page
+    places = ("<h2>Paper 001", "001.table3.a<", "<h2>Paper 004", "004.eq3.f<")
+    starts = [page.index(place) for place in places]
+    assert starts == sorted(starts)
+    for reference in ('src="http', 'href="http', "@import", "<script", "<link"):
+        assert reference not in page
+
+
+def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
+    def one(context: Context):
+        yield context.check("001.eq5").judge(2.0, 0.001, "Twice | as much.", explanations=[FAULT])
+        yield context.check("001.eq8").not_checkable("No number is printed.")
+
+    silent = check("001.eq8", printed=None, expected=NOT_CHECKABLE)
+    fake(GOOD, CheckGroup("001.formulas", "", 1.0, (check("001.eq5", expected=CORRECTED), silent), one))
+    assert run("--out", tmp_path / "run").exit_code == 0
+    page = (tmp_path / "run/summary/README.md").read_text("utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    assert [row.split("`")[1] for row in rows] == [*GOOD.ids, "001.eq5", "001.eq8"]
+    assert all(row.replace("\\|", "").count("|") == 6 for row in rows)
+    assert "2.0000 ± 0.0010 arcsec" in rows[2]
+    assert "- `001.eq5` (Table 3), confirmed with correction: A factor 2 is missing. That gives 2." in page
+    assert "- `001.eq8` (Table 3), not checkable: No number is printed." in page
+    for figure in re.findall(r"\]\(([^)]+)\)", page):
+        assert (tmp_path / "run/summary" / figure).is_file()
+
+
+def test_without_out_nothing_is_written(fake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fake(GOOD)
+    result = run()
+    assert result.exit_code == 0
+    assert list(tmp_path.iterdir()) == []
+    for word in (*GOOD.ids, "1.020", CONFIRMED, "2 checks: 2 confirmed"):
+        assert word in result.stdout
+    artefacts = json.loads(run("--json").stdout)["groups"][0]["artefacts"]
+    assert [a["file"] for a in artefacts] == [None] * 4
+
+
+def test_an_existing_folder_is_replaced_only_by_force(fake, tmp_path):
+    fake(GOOD)
+    target = tmp_path / "run"
+    assert run("--out", target).exit_code == 0
+    (target / "note.txt").touch()
+    second = run("--out", target)
+    assert (second.exit_code, second.stdout) == (2, "")
+    assert "--force" in second.stderr
+    assert (target / "note.txt").exists()
+    assert run("--out", target, "--force").exit_code == 0
+    assert files(target) == FILES
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").touch()
+    assert run("--out", tmp_path / "mine", "--force").exit_code == 2
+    assert files(tmp_path / "mine") == {"thesis.txt"}
+
+
+def test_artefacts_that_cannot_be_kept_are_refused():
+    context = Context(None, 1, frozenset(), {})
+    context.add(Data("a", "A", "", 1))
+    with pytest.raises(ValueError, match="two artefacts"):
+        context.add(Data("a", "B", "", 2))
+    with pytest.raises(ValueError, match="name"):
+        Data("../a", "A", "", 1)
+    with pytest.raises(ValueError, match="JSON"):
+        Data("a", "A", "", math.nan)
+    with pytest.raises(ValueError, match="1 cells under 2 heads"):
+        Table("a", "A", "", ("x", "y"), [(1,)])
+    with pytest.raises(ValueError, match="PNG"):
+        PngFigure("a", "A", "", b"GIF89a")
+    with pytest.raises(ValueError, match="<svg>"):
+        SvgFigure("a", "A", "", "<p>")
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+def test_a_failing_group_does_not_stop_the_others(fake, tmp_path):
+    fake(group("001.table3", "a", "b", "c", run=breaks), OTHER)
+    result = run("--out", tmp_path / "run", "--json")
+    assert result.exit_code == 1
+    found = {r["id"]: r for r in json.loads(result.stdout)["checks"]}
+    assert list(found) == ["001.table3.a", "001.table3.b", "001.table3.c", *OTHER.ids]
+    assert [r["verdict"] for r in found.values()] == [CONFIRMED, FAILED, FAILED, CONFIRMED, CONFIRMED]
+    broken = found["001.table3.b"]
+    assert (broken["printed"], broken["measured"], broken["sigma"]) == (1.0, None, None)
+    assert "ValueError: no light on the detector" in broken["how"]
+    assert "test_command.py" in broken["how"]
+    assert "001.table3.b failed: Could not be computed: ValueError" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert "no light on the detector" in (tmp_path / "run/validation.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("results", "why"),
+    [
+        ([], "no result"),
+        ([check("001.eq9").judge(1.0, None, "")], "does not hold"),
+        ([check("001.table3.a").judge(1.0, None, "")] * 2, "twice"),
+    ],
+)
+def test_a_group_that_answers_wrongly_has_failed(results, why, backend):
+    validation = run_checks(select([group("001.table3", "a", "b", run=lambda context: results)], None), backend, 1)
+    assert [(r.id, expected) for r, expected in validation.unexpected][-1] == ("001.table3.b", CONFIRMED)
+    assert why in validation.results[-1].how
+
+
+def test_progress_runs_from_nothing_to_all(backend):
+    seen = []
+    groups = (group("001.table3", "a", "b", seconds=6.0), group("001.table4", "", run=breaks, seconds=4.0))
+    run_checks(select(groups, None), backend, 1, progress=lambda done, text: seen.append((done, text)))
+    times = [done for done, _ in seen]
+    assert times == sorted(times)
+    assert (times[0], times[-1]) == (0.0, 10.0)
+    assert (3.0, "001.table3: do 001.table3.b") in seen
+
+
+@pytest.mark.parametrize("options", [["--seed", "-1"], ["--backend", "nonsense"], ["--onyl", "001"]])
+def test_bad_options(options, fake, tmp_path):
+    fake(GOOD)
+    result = run("--out", tmp_path / "run", *options)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert options[0].strip("-") in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+# Signals that a shell set to "ignore" for a background job stay so in its children; a user's terminal has the default.
+SLOW = """
+import runpy, signal, sys, time
+from twin.validation import registry
+from twin.validation.check import Check
+from twin.validation.group import CheckGroup
+
+def sleep(context):
+    (context.folder / "begun").touch()
+    time.sleep(60)
+    yield
+
+registry.GROUPS = (CheckGroup("001.slow", "", 1.0, (Check("001.slow", "", "", "1", 1.0, 0.1, ""),), sleep),)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_leaves_nothing(number, code, tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLOW, "--out", str(tmp_path / "new/run"), "--json"],
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.glob("new/.run.*.partial/artefacts/001.slow/begun")):
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.send_signal(number)
+        out, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, out) == (code, "")
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []

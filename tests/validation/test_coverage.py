@@ -1,0 +1,48 @@
+"""Every equation, table and figure of the papers has a row, and the summary in docs/ is of these rows."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from twin.validation import registry
+from twin.validation.check import PAPERS
+from twin.validation.group import matches
+
+SUMMARY = Path(__file__).resolve().parents[2] / "docs" / "validation" / "README.md"
+IDS = {
+    "000": "eq1 eq2 eq3 eq4 eq5 eq6 eq7 table1 fig3 fig4 fig5 height",
+    "001": "eq1 eq2 eq3 eq4 eq5 eq6 eq7 eq8 eq9 eq10 eq11 eq12 table1 table2 table3 table4 table5",
+    "003": "equations model table1 table2 table3 table4 table5 table6 table7 fig4 fig5 fig6 "
+    "scheme1 scheme2 scheme3 scheme4 scheme5 scale50000",
+    "004": "eq1 eq2 eq3 eq4 table1 table2 turntable alignment",
+}
+"""What the papers number, and what they claim without a number."""
+CHECKS = {check.id: check for group in registry.GROUPS for check in group.checks}
+
+
+@pytest.mark.parametrize("prefix", [f"{paper}.{name}" for paper, names in IDS.items() for name in names.split()])
+def test_everything_that_is_printed_has_a_row(prefix):
+    assert set(IDS) == set(PAPERS)
+    assert [i for i in CHECKS if matches(i, prefix)]
+
+
+def test_every_statement_is_a_sentence_with_its_source():
+    for check in CHECKS.values():
+        assert len(check.statement) > 15, check.id
+        assert re.search(r"section|eq|Table|Fig|abstract|text", check.equation), check.id
+        assert len(check.because) > 10, check.id
+
+
+def test_no_two_checks_are_the_same():
+    assert len({(check.paper, check.statement) for check in CHECKS.values()}) == len(CHECKS)
+
+
+def test_the_summary_in_the_docs_is_of_these_checks():
+    """Made by a full run; its verdicts are the expected ones."""
+    rows = {}
+    for line in SUMMARY.read_text("utf-8").splitlines():
+        if line.startswith("| `"):
+            cells = line.strip("| ").split(" | ")
+            rows[cells[0].strip("`")] = cells[-1]
+    assert rows == {check.id: check.expected for check in CHECKS.values()}

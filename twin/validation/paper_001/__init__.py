@@ -1,0 +1,1 @@
+"""Checks of paper 001: on-board monitoring by optical autocollimation."""

@@ -1,0 +1,193 @@
+"""Every parameter changed by itself, from a fraction of an arcsecond until the formulas fail or the beam is lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.monitoring import ARCSEC, MonitorGeometry
+from optics.aim import AimError
+from optics.trace import BeamMissedError
+from optics.tree import State
+from twin.motions import ElementaryMotion, line_family
+from twin.validation.paper_001.ranges.bench import FORMS, Bench
+from twin.validation.paper_001.ranges.curves import Curves, sampled
+
+NAMES = ("d_alpha", "d_beta", "d_gamma", "d_f")
+EQUATIONS = {"d_alpha": "(3)", "d_beta": "(2)", "d_gamma": "(5)", "d_f": "(7)"}
+UNITS = {"d_alpha": "arcsec", "d_beta": "arcsec", "d_gamma": "arcsec", "d_f": "um"}
+CLAIMED = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 2.15, "d_f": 40.0}
+"""What section 3.3 and Table 5 claim of an error: arcsec and um."""
+FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
+"""0.1 arcsec for all angles, and Table 5's 0.04 mm."""
+RELATIVE = 0.01
+WINDOW, CUT = "leaves the area CCD", "an aperture cuts the beam"
+EDGE_PX = 11.0
+"""Spots may come this near to the outermost pixel centres: half a pixel nearer the fit's template ends on one side, one
+pixel nearer the centroid refuses them on all."""
+WIDE_PX = 384
+"""Rows and columns of the larger CCD that shows what comes after the window's edge."""
+_START = {"d_alpha": 0.02, "d_beta": 0.02, "d_gamma": 0.02, "d_f": 8.0}
+_FAR = {"d_alpha": 3600.0, "d_beta": 3600.0, "d_gamma": 36000.0, "d_f": 600e3}
+"""Table units: where the curves begin, and where the trace ends at the latest."""
+_WIDE_SHARE = 0.76
+_Raw = dict[str, list[np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Range:
+    """One parameter changed in one direction.
+
+    Attributes:
+        parameter: of NAMES.
+        sign: +1 or -1.
+        images: from rendered spots; traced: from traced spots, on from there. Both over the true change, table units;
+            the names are those of ``criterion`` and WINDOW.
+        raw: of the images, form -> error over the true change as (N, 2), for the figure.
+        raw_traced: the same traced.
+        lost: true change beyond which the beam is lost or not followed, table units.
+        lost_why: which of the two.
+        trace_gap: largest difference of a traced spot shift to the rendered one, px.
+    """
+
+    parameter: str
+    sign: int
+    images: Curves
+    traced: Curves
+    raw: Mapping[str, np.ndarray]
+    raw_traced: Mapping[str, np.ndarray]
+    lost: float
+    lost_why: str
+    trace_gap: float
+
+    def limit(self, name: str) -> tuple[float, str]:
+        """Largest true change within a limit, and whence it is known: "images", "trace" or why there is none."""
+        found = self.images.crossing(name)
+        if found is not None:
+            return found, "images"
+        found = self.traced.crossing(name)
+        return (self.lost, self.lost_why) if found is None else (found, "trace")
+
+    @property
+    def window(self) -> float:
+        """True change at which the first spot comes too near the area CCD's edge, table units."""
+        return self.limit(WINDOW)[0]
+
+
+def criterion(form: str, kind: str) -> str:
+    """Name of a form's error as a share of "1 %", "0.1" or "claimed"."""
+    return f"{form} {kind}"
+
+
+KINDS = ("1 %", "fine", "claimed")
+
+
+def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
+    """The single motion behind a parameter, and its amount (SI) for one table unit of change."""
+    k = NAMES.index(parameter)
+    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    amount = (-f_x * ARCSEC, f * ARCSEC, ARCSEC * f_x / f, 1e-6 / f)[k]
+    return line_family(camera)[k], amount
+
+
+def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: int) -> Range:
+    """Follow one parameter in one direction.
+
+    Args:
+        bench: with the instrument's own area CCDs, for the window's edge.
+        wide: with larger ones, same camera.
+        parameter: of NAMES.
+        sign: of the change.
+        count: number of sizes to begin with.
+    """
+    camera = bench.cameras[0]
+    geometry = bench.geometry(camera)
+    motion, unit = motion_of(camera, parameter, geometry)
+    k = NAMES.index(parameter)
+    half = 0.5 * (min(bench.experiment.path.shape) - 1) - EDGE_PX
+    far = 0.5 * _WIDE_SHARE * WIDE_PX
+
+    def states(size: np.ndarray) -> list[State]:
+        return [motion.state(sign * unit * x) for x in size]
+
+    origin = bench.positions([{}])
+    traced_origin = bench.traced([{}])
+    middle = 0.5 * (np.array(bench.experiment.path.shape) - 1)
+    raw: _Raw = {form: [] for form in FORMS}
+    gap = [0.0]
+    truths: dict[float, float] = {}
+
+    def shares(size: np.ndarray, start: np.ndarray, end: np.ndarray, into: _Raw) -> Mapping[str, np.ndarray]:
+        truth = bench.truth(states(size))[camera][:, k]
+        truths.update(zip(size.tolist(), np.abs(truth).tolist(), strict=True))
+        readings = bench.readings(start, end)[camera]
+        out = {WINDOW: np.max(np.abs(end - start + origin - middle), axis=(1, 2)) / half}
+        for form in FORMS:
+            error = readings[form][:, k] - truth
+            into[form].append(np.stack([np.abs(truth), error], axis=-1))
+            allowed = (RELATIVE * np.abs(truth), FINE[parameter], CLAIMED[parameter])
+            for kind, limit in zip(KINDS, allowed, strict=True):
+                out[criterion(form, kind)] = np.abs(error) / limit
+        return out
+
+    def rendered(size: np.ndarray) -> Mapping[str, np.ndarray]:
+        every = states(size)
+        place = wide.positions(every)
+        moved = bench.traced(every) - traced_origin
+        gap[0] = max(gap[0], float(np.max(np.abs(place - origin - moved))))
+        return shares(size, origin, place, raw)
+
+    begin = _START[parameter]
+    end, why = beam_end(bench, states, begin, _FAR[parameter])
+    # the shift is proportional but for a few parts in a thousand
+    shift = float(np.max(np.abs(bench.traced(states(np.array([begin]))) - traced_origin)))
+    largest = min(begin * far / shift, 0.9 * end)
+    images = sampled(rendered, np.geomspace(begin, largest, count).tolist())
+    raw_traced: _Raw = {form: [] for form in FORMS}
+    traced = sampled(
+        lambda size: shares(size, traced_origin, bench.traced(states(size)), raw_traced),
+        np.geomspace(largest, end, 12).tolist(),
+    )
+
+    def over_truth(curves: Curves) -> Curves:
+        return Curves(np.array([truths[x] for x in curves.size.tolist()]), curves.value)
+
+    return Range(
+        parameter, sign, over_truth(images), over_truth(traced), _joined(raw), _joined(raw_traced),
+        truths[float(traced.size[-1])], why, gap[0],
+    )  # fmt: skip
+
+
+def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """Form -> (N, 2), ascending in the change."""
+    out = {}
+    for form, pieces in parts.items():
+        every = np.concatenate(pieces)
+        out[form] = every[np.argsort(every[:, 0])]
+    return out
+
+
+def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: float, far: float) -> tuple[float, str]:
+    """The largest size, from ``start`` up to ``far``, whose beams pass whole, to 1 %, and why no larger one does."""
+
+    def fault(size: float) -> str:
+        try:
+            some = states(np.array([size]))
+            bench.traced(some)
+        except BeamMissedError:
+            return CUT
+        except (AimError, np.linalg.LinAlgError):
+            return "no ray is found"
+        return ""
+
+    good, bad, why = start, far, fault(far)
+    if not why:
+        return far, "not followed farther"
+    while bad / good > 1.01:
+        middle = math.sqrt(good * bad)
+        found = fault(middle)
+        good, bad, why = (good, middle, found) if found else (middle, bad, why)
+    return good, why

@@ -1,0 +1,1 @@
+"""Checks of paper 003: calibration of a three-line camera in orbit."""
