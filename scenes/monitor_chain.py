@@ -315,6 +315,6 @@ def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _facet_axes(normal: np.ndarray) -> np.ndarray:
-    """Frame of a facet: z along its normal, x across the line (as the camera's X)."""
+    """Frame of a facet: z along its normal, x along the line (against the camera's Y)."""
     x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
     return _columns(x_axis, normal)

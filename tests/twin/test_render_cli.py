@@ -103,9 +103,13 @@ def repeated(first, stored):
 
 @pytest.fixture
 def ready(repeated, monkeypatch):
-    """The computation is replaced by one that is done already, for tests of what comes before and after it."""
+    """The computation is replaced by one that is done already, and what is drawn of it by empty files, for tests of
+    what comes before and after it.
+    """
     _, _, _, kept = repeated
     monkeypatch.setattr(command, "render_job", lambda *arguments, **options: kept[0])
+    for writer in ("write_report", "write_scene", "write_summary"):
+        monkeypatch.setattr(f"twin.output.{writer}", lambda *drawn: drawn[-1].touch())
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------

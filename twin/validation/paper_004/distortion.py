@@ -15,7 +15,7 @@ from twin.laboratory.distortion import DistortionRun, measure, rms
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context
-from twin.validation.paper_004 import orientation
+from twin.validation.paper_004 import orientation, sensitivity
 from twin.validation.paper_004.figure import points_svg, reduction_svg
 from twin.validation.paper_004.orientation import SpotTest, judge_equations
 
@@ -31,6 +31,7 @@ _DIGIT = "a unit of the last printed digit"
 
 CHECKS = (
     *orientation.CHECKS,
+    *sensitivity.CHECKS,
     Check("004.table2.reduction", "Table 2, section 3.3", "By Table 2, compensated angles lower the RMS of the "
           "distortion by 35 %: RMS over the points", "%", 100.0 * printed_004.REDUCTION, 1.0, _DIGIT,
           expected=CORRECTED),
@@ -64,8 +65,11 @@ def run(context: Context) -> Iterator[CheckResult]:
         return
     runs = measured_tests(context)
     yield from judge_equations(context, runs)
+    for result in sensitivity.judge_sensitivity(context, runs):
+        if result.id in context.selected:
+            yield result
     if "004.turntable.compensated" in context.selected:
-        yield orientation.judge_angles(context.check("004.turntable.compensated"), runs)
+        yield sensitivity.judge_angles(context.check("004.turntable.compensated"), runs)
     for identifier, judge in _JUDGES.items():
         if identifier in context.selected:
             yield judge(context.check(identifier), runs)

@@ -54,7 +54,8 @@ CHECKS = (
     Check("004.table1.average", "Table 1", "The values are averages", "1", None, 0.0, "nothing is compared",
           expected=NOT_CHECKABLE),
     Check("004.alignment.coupling", "section 1.2", "All six parameters of the assembly are coupled when it is "
-          "adjusted: number of those that an adjustment changes together with another one", "1", 6.0, 0.0, "a count"),
+          "adjusted: number of those that an adjustment changes together with another one", "1", 6.0, 0.0,
+          "they are counted"),
     Check("004.alignment.defocus", "section 2.1", "MTF through focus gives the defocus of every CCD in every field and "
           "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached"),
     Check("004.alignment.plane", "section 2.2", "A turn about X' and Y' and a shift along Z' make up for the defocus: "
@@ -70,7 +71,7 @@ CHECKS = (
     Check("004.alignment.level", "section 2.3", "One round of shims leaves the line level to 1 arcmin: largest true "
           "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most"),
     Check("004.alignment.rounds", "section 2.3", "One round of shims is enough: rounds until both bounds are kept, "
-          "most of any alignment", "1", 1.0, 0.0, "a count", "at most"),
+          "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most"),
 )  # fmt: skip
 
 
@@ -214,8 +215,8 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
         lost = ", ".join(f"{name} {v:.3f}" for name, v in rest.items())
         how = (
             f"{len(edges)} rendered slanted edges along the track, at {len(alignment.bench.setup.test.fields)} fields "
-            f"after {_alignments(len(alignments)).lower()}; traced truth there {true[band]:.4f}. A perfect camera with these "
-            f"pixels has {perfect:.3f}; what the scene file assumes beyond the paper takes the rest ({lost})."
+            f"after {_alignments(len(alignments)).lower()}; traced truth there {true[band]:.4f}. A perfect camera with "
+            f"these pixels has {perfect:.3f}; what the scene file assumes beyond the paper takes the rest ({lost})."
         )
         yield context.check(f"004.table1.{band}").judge(value, sigma, how)
     each = np.array(ratios)

@@ -22,7 +22,7 @@ from analysis.orientation.distortion_model import (
     principal_point,
 )
 from twin.laboratory.distortion import DistortionRun, rms
-from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM, FIT_RMS_ARCSEC, TEST_POINTS
+from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM
 from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.group import Context
 
@@ -34,8 +34,6 @@ camera's radial distortion makes a p of 54 mm, which no noise hides.
 """
 PIXEL_MM = 0.007
 """Pitch of the panchromatic line of gf7."""
-FEW = 5
-"""Every fifth point, for the effect of their number."""
 
 _F = "it moves the edge of the field by 1 µm, half of the accuracy that the paper claims"
 _P = "such a p moves the edge of the field by 2.3 µm, the accuracy that the paper claims"
@@ -65,20 +63,6 @@ CHECKS = (
           "at most", CORRECTED),
     Check("004.eq4.uneven", "eq. (4)", "(4) with the traced f over points that are not even about the middle: p "
           "against the traced camera's there", "mm", None, 5.5, _P),
-    Check("004.sensitivity.angle", "section 3.1", "Angles are the main source of error: their share in the mean square "
-          "error of D, angles compensated", "%", None, 0.0, "the main source has more than half", "at least"),
-    Check("004.sensitivity.field", "section 3.1", "The error of the distortion grows with the field: whole field over "
-          "its inner half, angles as read", "1", None, 0.0, "growth is a ratio above one", "at least"),
-    Check("004.sensitivity.distance", "section 3.1", "The error of the principal distance grows as the field shrinks: "
-          "inner half over the whole field, angles as read", "1", None, 0.0, "growth is a ratio above one", "at least"),
-    Check("004.sensitivity.points", "section 3.1", "More points make f and D more precise: error of f with every fifth "
-          "point over that with all", "1", None, 0.0, "a gain is a ratio above one", "at least"),
-    Check("004.turntable.compensated", "section 3.3", "In the small region of the test the compensated dividing error "
-          "is better than 0.2 arcsec: largest RMS error of the angles of any test about its mean", "arcsec",
-          FIT_RMS_ARCSEC, 0.0, "the bound itself", "at most"),
-    Check("004.sensitivity.requirement", "section 3.3", "A dividing error known to 0.2 arcsec RMS satisfies the "
-          "distortion test: error of D with angles that err so much from point to point", "µm",
-          DISTORTION_ACCURACY_UM, 0.05, "half of the last printed digit", "at most", CORRECTED),
 )  # fmt: skip
 
 
@@ -197,9 +181,9 @@ def _fitted(where: Array, turn: Array) -> tuple[float, Array]:
 
 
 def judge_equations(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
-    """The rows of (1) to (4) and of what section 3.1 says of their errors."""
+    """The rows of (1) to (4)."""
     tests = [SpotTest(run) for run in runs]
-    for equation in (_eq1, _eq2, _eq3, _eq4, _sensitivity):
+    for equation in (_eq1, _eq2, _eq3, _eq4):
         for result in equation(context, tests):
             if result.id in context.selected:
                 yield result
@@ -215,7 +199,7 @@ def _eq1(context: Context, tests: Sequence[SpotTest]) -> Iterator[CheckResult]:
     zeros = np.array([t.zero for t in tests]) / ARCSEC
     need = DISTORTION_ACCURACY_UM / (UM * left) * rms(zeros)
     how = (
-        f"{_rendered(tests)}. The zero of W is wrong by {rms(zeros):.2f}″ RMS, as an operator leaves it. (3) instead "
+        f"{rendered(tests)}. The zero of W is wrong by {rms(zeros):.2f}″ RMS, as an operator leaves it. (3) instead "
         f"of (2) leaves {UM * rms(np.array(alone)):.1f} µm. To keep {DISTORTION_ACCURACY_UM:g} µm by (1) and (2) the "
         f"zero has to be right to {need:.2f}″; the paper does not say how it is set."
     )
@@ -270,7 +254,7 @@ def _distance(check: Check, tests: Sequence[SpotTest], found: Array) -> CheckRes
     true = np.array([t.camera.f for t in tests])
     scatter = float(np.std(found - true, ddof=1))
     how = (
-        f"{_rendered(tests)}. Truth: the camera without distortion that is nearest to the traced chief rays. One test "
+        f"{rendered(tests)}. Truth: the camera without distortion that is nearest to the traced chief rays. One test "
         f"scatters by {MM * scatter:.3f} mm; the zero of W hardly matters to f, for the points are even about it."
     )
     # truth differs by a micrometre between tests
@@ -284,7 +268,7 @@ def _chi(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
     score = np.array([(fit.value(name) - t.camera.f) / fit.sigma(name) for fit, t in zip(fits, tests, strict=True)])
     sigma = MM * float(np.median([fit.sigma(name) for fit in fits]))
     how = (
-        f"{_rendered(tests)}, fitted with a constant: {np.sum(np.abs(score) < 2.0)} within two sigma of the traced "
+        f"{rendered(tests)}, fitted with a constant: {np.sum(np.abs(score) < 2.0)} within two sigma of the traced "
         f"camera; sigma of f {sigma:.3f} mm."
     )
     return check.judge(rms(score), 1.0 / np.sqrt(2 * len(tests)), how, 1.0)
@@ -297,7 +281,7 @@ def _zero(check: Check, tests: Sequence[SpotTest], found: Array, predicted: Arra
     zero = rms(np.array([t.zero for t in tests]))
     true = MM * float(np.mean([t.camera.p for t in tests]))
     how = (
-        f"{_rendered(tests)}. The traced camera has p = {true:.2f} mm. The zero of W is wrong by "
+        f"{rendered(tests)}. The traced camera has p = {true:.2f} mm. The zero of W is wrong by "
         f"{zero / ARCSEC:.2f}″ RMS; 1″ makes {MM * rms(predicted) / (zero / ARCSEC):.0f} mm of p. What the zero "
         f" does not explain: {MM * rms(error - predicted):.2f} mm RMS."
     )
@@ -313,7 +297,7 @@ def _uneven(check: Check, tests: Sequence[SpotTest], found: Array) -> CheckResul
     error = found - true
     scatter = float(np.std(error, ddof=1))
     how = (
-        f"{_rendered(tests)}, of them the {len(tests[0].true_turn[UNEVEN])} points from {low:.2f}° to {high:+.2f}°, W "
+        f"{rendered(tests)}, of them the {len(tests[0].true_turn[UNEVEN])} points from {low:.2f}° to {high:+.2f}°, W "
         "from the zero that a constant finds. There p takes up part of the radial distortion of gf7, so that it is no "
         f"longer small: the equation with all its sums is seen at work. One test scatters by {MM * scatter:.1f} mm."
     )
@@ -330,7 +314,7 @@ def _point(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
     edge = float(np.tan(tests[0].true_turn[-1]) ** 2)
     with_constant, with_f = np.median([[abs(fit.correlation[2, k]) for k in (0, 1)] for fit in fits], axis=0)
     how = (
-        f"{_rendered(tests)}, p by least squares with a constant: RMS error {MM * pitch * error:.2f} mm, stated sigma "
+        f"{rendered(tests)}, p by least squares with a constant: RMS error {MM * pitch * error:.2f} mm, stated sigma "
         f"{MM * pitch * stated:.2f} mm. Correlation of p with the constant {with_constant:.2f}, with f {with_f:.3f} "
         "(medians of their sizes; of equal independent errors it would be 0.75 and 0)."
     )
@@ -354,82 +338,7 @@ def principal_points(tests: Sequence[SpotTest]) -> tuple[Array, Array]:
     return np.array(by_eq2, np.float64), np.array(free)
 
 
-def _sensitivity(context: Context, tests: Sequence[SpotTest]) -> Iterator[CheckResult]:
-    if not context.wants("004.sensitivity"):
-        return
-    count = len(tests)
-    half = np.flatnonzero(np.abs(tests[0].run.bench.turn) <= 0.5 * tests[0].run.bench.turn[-1])
-    whole = slice(None)
-    raw = [np.asarray(t.run.raw.fit.angle) for t in tests]
-    all_raw, inner = (np.array([t.errors(w, k) for t, w in zip(tests, raw, strict=True)]) for k in (whole, half))
-    own = np.array([t.errors(t.turn, whole)[1] for t in tests])
-    spots = np.array([t.errors(t.true_turn, whole)[1] for t in tests])
-    share = 100.0 * (1.0 - rms(spots) ** 2 / rms(own) ** 2)
-    how = (
-        f"{_rendered(tests)}. With compensated angles D errs by {UM * rms(own):.2f} µm RMS, with the true angles and "
-        f"the same images by {UM * rms(spots):.2f} µm; with angles as read by {UM * rms(all_raw[:, 1]):.2f} µm."
-    )
-    yield context.check("004.sensitivity.angle").judge(share, None, how, 50.0)
-    for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
-        top, bottom = rms(over[:, column]), rms(under[:, column])
-        unit, scale = ("µm", UM) if column else ("mm", MM)
-        how = f"{count} tests of {TEST_POINTS} points; {len(half)} of them lie in the inner half: {scale * top:.3g} "
-        how += f"against {scale * bottom:.3g} {unit} RMS."
-        yield context.check(f"004.sensitivity.{name}").judge(top / bottom, _ratio(over, under, column), how, 1.0)
-    few = np.array([[t.errors(t.turn, slice(k, None, FEW))[0] for k in range(FEW)] for t in tests])
-    every = np.array([t.errors(t.turn, whole)[0] for t in tests])
-    gain = rms(few) / rms(every)
-    how = (
-        f"{count} tests, angles compensated: RMS error of f {MM * rms(every):.3f} mm with {TEST_POINTS} points, "
-        f"{MM * rms(few):.3f} mm with {TEST_POINTS // FEW}. Independent errors would gain {FEW**0.5:.2f}; what the "
-        " compensation leaves is common to neighbouring points and gains nothing."
-    )
-    yield context.check("004.sensitivity.points").judge(gain, None, how, 1.0)
-    yield _requirement(context, tests)
-
-
-def _ratio(over: Array, under: Array, column: int) -> float:
-    """Standard deviation of a ratio of RMS over tests, by leaving one out at a time."""
-    n = len(over)
-    keep = ~np.eye(n, dtype=bool)
-    values = np.array([rms(over[k, column]) / rms(under[k, column]) for k in keep])
-    return float(np.sqrt((n - 1) * np.var(values)))
-
-
-def judge_angles(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
-    """What is left of the dividing error in the angles of the tests."""
-    tests = [SpotTest(run) for run in runs]
-    own, raw = (
-        np.array([np.std(angle(t) - t.true_turn) for t in tests]) / ARCSEC
-        for angle in (lambda t: t.turn, lambda t: t.run.raw.fit.angle)
-    )
-    how = (
-        f"{len(tests)} tests, angles of {TEST_POINTS} points against the true ones: median {np.median(own):.3f}″; "
-        f"angles as read {np.median(raw):.3f}″, largest {np.max(raw):.3f}″. What all points share is the zero, see "
-        "004.eq1.constant."
-    )
-    return check.judge(float(np.max(own)), None, how)
-
-
-def _requirement(context: Context, tests: Sequence[SpotTest]) -> CheckResult:
-    rng = np.random.default_rng(np.random.SeedSequence(context.seed, spawn_key=(1,)))
-    wrong = FIT_RMS_ARCSEC * ARCSEC
-    error = [t.errors(t.true_turn + rng.normal(0.0, wrong, len(t.turn)), slice(None))[1] for t in tests]
-    f, points = float(np.mean([t.camera.f for t in tests])), len(tests[0].turn)
-    expected = f * wrong * np.sqrt(1.0 - 3.0 / points)
-    how = (
-        f"The rendered spots of {len(tests)} tests with their true angles and errors of {FIT_RMS_ARCSEC:g}″ drawn from "
-        "point to point; constant, f and p fitted. Errors with long waves would leave less."
-    )
-    text = (
-        f"{FIT_RMS_ARCSEC:g}″ times f is more than twice the accuracy that is claimed, which needs "
-        f"{FIT_RMS_ARCSEC * DISTORTION_ACCURACY_UM / (UM * expected):.2f}″; the fits reach less (004.turntable.fit)."
-    )
-    reason = Explanation(UM * expected, CORRECTED, text)
-    sigma = UM * expected / np.sqrt(2.0 * points * len(tests))
-    return context.check("004.sensitivity.requirement").judge(UM * rms(np.array(error)), sigma, how, None, [reason])
-
-
-def _rendered(tests: Sequence[SpotTest]) -> str:
+def rendered(tests: Sequence[SpotTest]) -> str:
+    """How many tests and spots."""
     places, sets = tests[0].run.record.reading.shape
     return f"{len(tests)} tests of {places} points and {sets} sets, {len(tests) * places * sets} spots rendered"
