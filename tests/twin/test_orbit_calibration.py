@@ -420,7 +420,7 @@ BAD = {
     "datum": ("control: 1 m", "control: 1 m\n  datum: [0 m, 0 m, 100 km]", "errors.datum", ["outside the limits"]),
     "no launch": ("interior: 100 um}", "interior: 0 um}", "launch.interior", ["greater than zero"]),
     "repeats": ("seed: 1", "seed: 1\nrepeat: 3", "repeat", ["repeats"]),
-    "effects": ("corrected: true", "corrected: 1", "effects.corrected", ["valid boolean", "found 1"]),
+    "effects": ("corrected: true", "corrected: 1", "effects.corrected", ["neither true nor false", "found 1"]),
     "never passed": ("latitude: 44 deg, longitude: 87.5", "latitude: 89 deg, longitude: 87.5", "fields", ["never"]),
 }
 

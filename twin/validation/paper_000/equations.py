@@ -151,9 +151,8 @@ def _through_station(context: Context, planes: Planes) -> CheckResult:
     value, sigma = mean_of(np.array(square))
     how = (
         f"{planes.said}. Planes by (5) with the right sign and (1); mean of the RMS over points and lines. The "
-        "measured "
-        f"station itself lies in the planes to {max(station):.0e} m; the true ground points lie beside them by what "
-        "station and slopes are wrong."
+        f"measured station itself lies in the planes to {max(station):.0e} m; the true ground points lie beside them "
+        "by what station and slopes are wrong."
     )
     return context.check("000.eq1").judge(value, sigma, how, 0.0)
 
@@ -258,10 +257,9 @@ def _vertical(context: Context, planes: Planes) -> CheckResult:
             slopes.append(fit_plane(turned.station, turned.strips["nadir"], "corrected").coefficients[0])
     value, sigma = mean_of(np.array(slopes) * np.tan(tilt))
     how = (
-        f"{planes.said}; (5) with the right sign in a frame whose z axis lies {tilt / ARCSEC:.2f}″ from the "
-        "nadir line's "
-        "plane. In Earth-fixed axes the slopes are true (000.eq5.sign); in the orbital frame the plane of a camera "
-        "that looks straight down is vertical. Total least squares does not depend on the frame."
+        f"{planes.said}; (5) with the right sign in a frame whose z axis lies {tilt / ARCSEC:.2f}″ from the nadir "
+        "line's plane. In Earth-fixed axes the slopes are true (000.eq5.sign); in the orbital frame the plane of a "
+        "camera that looks straight down is vertical. Total least squares does not depend on the frame."
     )
     reason = Explanation(
         reach * np.tan(tilt) ** 2 / (reach * np.tan(tilt) ** 2 + noise),

@@ -137,9 +137,8 @@ def _judged(
     lat, lon = ELSEWHERE
     how = (
         f"{len(found)} measurements of a descending pass over 40° N 116° E, Earth-fixed axes, planes fitted anew for "
-        f"every metre. Change for 10 m: {', '.join(f'{axis} {v:+.3f}″' for axis, v in mean.items())}. The paper "
-        "does not "
-        f"print the place: of {len(places)} from 25° to 50° N and 80° to 130° E the sentence holds at {held}; at "
+        f"every metre. Change for 10 m: {', '.join(f'{axis} {v:+.3f}″' for axis, v in mean.items())}. The paper does "
+        f"not print the place: of {len(places)} from 25° to 50° N and 80° to 130° E the sentence holds at {held}; at "
         f"{lat:g}° N {lon:g}° E the number is {sentence.measure(other.rises, other.growth):.3g}."
     )
     value = float(values[0]) if sentence.kind == "grows" else float(np.mean(values))
@@ -204,9 +203,8 @@ def _single(context: Context, passes: Passes) -> CheckResult:
     value = float(np.max(np.abs(each)) / abs(whole))
     how = (
         f"One of {len(each)} forward points is moved by 10 m in y, every one in turn: at most "
-        f"{np.max(np.abs(each)) / ARCSEC:.3f}″, all together {whole / ARCSEC:.2f}″. With n points the share is "
-        "about 1/n, "
-        "and the paper does not print n."
+        f"{np.max(np.abs(each)) / ARCSEC:.3f}″, all together {whole / ARCSEC:.2f}″. With n points the share is about "
+        "1/n, and the paper does not print n."
     )
     return context.check("000.fig4.single").judge(value, None, how, 0.0)
 
@@ -260,10 +258,8 @@ def _show(context: Context, shown: Answers, places: Mapping[tuple[float, float],
         SvgFigure(
             "places",
             "Where the paper's pass can have been",
-            f"How many of the {len(SENTENCES)} sentences on Figs. 3 to 5 hold on a descending pass, by its "
-            "place; the two "
-            "on growing slopes hold nowhere. "
-            "Circles: 40° N 116° E, where the checks are made, and 45° N 120° E.",
+            f"How many of the {len(SENTENCES)} sentences on Figs. 3 to 5 hold on a descending pass, by its place; the "
+            "two on growing slopes hold nowhere. Circles: 40° N 116° E, where the checks are made, and 45° N 120° E.",
             places_svg(held, len(SENTENCES), {"test": (40.0, 116.0), "elsewhere": ELSEWHERE}),
         )
     )

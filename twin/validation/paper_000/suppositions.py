@@ -97,9 +97,8 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
         ),
         "000.light.beta": (
             "all", 1, sum(predicted["beta"]),
-            "Aberration and refraction add up in β and cancel in α. The paper says nothing of either; left in, "
-            "they are "
-            "as large as the differences of its Table 1.",
+            "Aberration and refraction add up in β and cancel in α. The paper says nothing of either; left in, they "
+            "are as large as the differences of its Table 1.",
         ),
     }  # fmt: skip
     for identifier, (what, which, value, text) in cases.items():
@@ -142,9 +141,8 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
     if "000.traced" in context.selected:
         how = (
             f"{many}, whose focal plane has turned and moved and whose base has warmed: the trace changes the angle by "
-            f"{trace / ARCSEC:.3f}″ and the planes by {trace / ARCSEC + value:.3f}″ ± {sigma:.3f}″. Points are "
-            "moved to "
-            "a common projection centre by what the laboratory knows."
+            f"{trace / ARCSEC:.3f}″ and the planes by {trace / ARCSEC + value:.3f}″ ± {sigma:.3f}″. Points are moved "
+            "to a common projection centre by what the laboratory knows."
         )
         yield context.check("000.traced").judge(value, sigma, how, 0.0)
     if "000.centres" in context.selected:

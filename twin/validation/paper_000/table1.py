@@ -37,12 +37,12 @@ CHECKS = (
           "to compare",
           expected=NOT_CHECKABLE),
     Check("000.table1.alpha", "Table 1", "Resection and planes of the same points and station differ by 0.44 "
-          "arcsec in α:"
-          " standard deviation of their difference", "arcsec", ALPHA, 0.03, "a twentieth of either printed difference",
+          "arcsec in α: standard deviation of their "
+          "difference", "arcsec", ALPHA, 0.03, "a twentieth of either printed difference",
           expected=REFUTED),
     Check("000.table1.beta", "Table 1", "Resection and planes of the same points and station differ by 1.53 "
-          "arcsec in β:"
-          " standard deviation of their difference", "arcsec", BETA, 0.03, "a twentieth of either printed difference",
+          "arcsec in β: standard deviation of their "
+          "difference", "arcsec", BETA, 0.03, "a twentieth of either printed difference",
           expected=REFUTED),
     Check("000.table1.alpha_own", "Table 1", "0.44 arcsec in α are within reach when each method has points of its own "
           "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", ALPHA, 0.1, _LIMIT,
@@ -56,8 +56,7 @@ CHECKS = (
     Check("000.accuracy", "abstract, section 2.2", "The result is good to the order of 1 arcsec: larger RMS error of α "
           "and β, light corrected", "arcsec", 1.0, 0.1, "a tenth of the order that is printed", "at most"),
     Check("000.accuracy.light", "abstract, section 2.2", "The result is good to the order of 1 arcsec: larger "
-          "RMS error "
-          "of α and β, light left as it is", "arcsec", 1.0, 0.5, "the order of 1 arcsec", "at most"),
+          "RMS error of α and β, light left as it is", "arcsec", 1.0, 0.5, "the order of 1 arcsec", "at most"),
 )  # fmt: skip
 
 
@@ -141,9 +140,8 @@ def run(context: Context) -> Iterator[CheckResult]:
         SvgFigure(
             "table1",
             "Table 1: resection minus planes",
-            f"Points of {POINT_SIGMA:.1f} m for points of their own, of 1.5 m for the same points. Table 1 does "
-            "not say "
-            "which angle is subtracted; the sign here is that of Figs. 3 to 5.",
+            f"Points of {POINT_SIGMA:.1f} m for points of their own, of 1.5 m for the same points. Table 1 does not "
+            "say which angle is subtracted; the sign here is that of Figs. 3 to 5.",
             differences_svg(same.values, own.values, (ALPHA, BETA)),
         )
     )
@@ -182,10 +180,9 @@ def _own(context: Context, data: Data, own: Differences) -> Iterator[CheckResult
         bias, spread = float(np.mean(own.values[:, k])), float(own.spread[k])
         noise = spread * np.sqrt(1.0 / count + SIGMAS**2 / (2.0 * (count - 1)))
         how = (
-            f"{count} pairs of measurements, points of {POINT_SIGMA:.1f} m (2 m of triangulation, a third of a "
-            "5 m pixel "
-            f"of matching), one orbit for both. Resection minus planes is {bias:+.2f}″ ± {spread:.2f}″, the bias from "
-            "aberration and refraction, which only the resection takes out. How many points the paper has, and "
+            f"{count} pairs of measurements, points of {POINT_SIGMA:.1f} m (2 m of triangulation, a third of a 5 m "
+            f"pixel of matching), one orbit for both. Resection minus planes is {bias:+.2f}″ ± {spread:.2f}″, the bias "
+            "from aberration and refraction, which only the resection takes out. How many points the paper has, and "
             "whether the two methods share them, is not printed."
         )
         yield context.check(identifier).judge(abs(bias) + SIGMAS * spread, noise, how)
@@ -212,9 +209,8 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
     reason = Explanation(
         _distance(np.array([ALPHA, BETA]) - bias, 2.0 * simple),
         REFUTED,
-        "Planes are wrong by σ/√n over their range, and an error of the common nadir plane moves α and β "
-        "oppositely, so "
-        "that differences of one sign are unlikely: either signs are not printed, or there is a further cause.",
+        "Planes are wrong by σ/√n over their range, and an error of the common nadir plane moves α and β oppositely, "
+        "so that differences of one sign are unlikely: either signs are not printed, or there is a further cause.",
     )
     return context.check("000.table1.pair").judge(together, None, how, LIMIT, [reason])
 

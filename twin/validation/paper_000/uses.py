@@ -25,14 +25,11 @@ CHECKS = (
           "the bound itself",
           "at least"),
     Check("000.height.size", "section 0", "Height of 1 arcsec of α over slant range times 1 arcsec over the "
-          "sine of the "
-          "rays' angle on the ground", "1", None, 0.01, "first order in the curvature of ground and orbit"),
+          "sine of the rays' angle on the ground", "1", None, 0.01, "first order in the curvature of ground and orbit"),
     Check("000.outlook.high_resolution", "section 3", "Off-axis angle of the high-resolution line by planes: "
-          "angle along "
-          "the track minus the true one", "arcsec", None, 0.05, _TENTH),
+          "angle along the track minus the true one", "arcsec", None, 0.05, _TENTH),
     Check("000.outlook.multispectral", "section 3", "Off-axis angle of the multispectral line by planes: angle "
-          "along the "
-          "track minus the true one", "arcsec", None, 0.05, _TENTH),
+          "along the track minus the true one", "arcsec", None, 0.05, _TENTH),
     Check("000.outlook.unsigned", "section 3, eq. (6)", "(6) gives the off-axis angle of the multispectral line: its "
           "value minus the angle between the looks", "arcsec", None, 1.0, "half of the noise of one measurement",
           expected=CORRECTED),
@@ -81,9 +78,8 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
         slant = radius * np.sin(zenith - alpha) / np.sin(alpha)
         ratio = float(heights["alpha"] or 0.0) / float(height_error(ARCSEC, slant, zenith))
         how = (
-            f"Triangle of station, point and centre of a spherical Earth: slant range {slant / 1e3:.1f} km, "
-            "angle of the "
-            f"rays {np.degrees(zenith):.2f}°. By the intersection: {heights['alpha']:.3f} m."
+            f"Triangle of station, point and centre of a spherical Earth: slant range {slant / 1e3:.1f} km, angle of "
+            f"the rays {np.degrees(zenith):.2f}°. By the intersection: {heights['alpha']:.3f} m."
         )
         yield context.check("000.height.size").judge(ratio, None, how, 1.0)
 
@@ -110,9 +106,8 @@ def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
         look = flight.look["multispectral"]
         off = (np.array(found) - look) / ARCSEC
         how = (
-            f"{many}; the looks of the lines' centres are {look / ARCSEC:.1f}″ apart, one measurement of the "
-            "planes' angle "
-            f"scatters by {np.std(off, ddof=1):.1f}″, fourteen times that of α."
+            f"{many}; the looks of the lines' centres are {look / ARCSEC:.1f}″ apart, one measurement of the planes' "
+            f"angle scatters by {np.std(off, ddof=1):.1f}″, fourteen times that of α."
         )
         reason = Explanation(
             (flight.dihedral["multispectral"] - look) / ARCSEC,

@@ -283,7 +283,7 @@ def _zero(check: Check, tests: Sequence[SpotTest], found: Array, predicted: Arra
     how = (
         f"{rendered(tests)}. The traced camera has p = {true:.2f} mm. The zero of W is wrong by "
         f"{zero / ARCSEC:.2f}″ RMS; 1″ makes {MM * rms(predicted) / (zero / ARCSEC):.0f} mm of p. What the zero "
-        f" does not explain: {MM * rms(error - predicted):.2f} mm RMS."
+        f"does not explain: {MM * rms(error - predicted):.2f} mm RMS."
     )
     reason = Explanation(
         MM * rms(predicted), CORRECTED, "(1) has no constant term, so that p takes up the error of the zero of W."

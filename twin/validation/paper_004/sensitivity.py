@@ -67,7 +67,7 @@ def judge_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterat
     how = (
         f"{count} tests, angles compensated: RMS error of f {MM * rms(every):.3f} mm with {TEST_POINTS} points, "
         f"{MM * rms(few):.3f} mm with {TEST_POINTS // FEW}. Independent errors would gain {FEW**0.5:.2f}; what the "
-        " compensation leaves is common to neighbouring points and gains nothing."
+        "compensation leaves is common to neighbouring points and gains nothing."
     )
     yield context.check("004.sensitivity.points").judge(gain, None, how, 1.0)
     yield _requirement(context, tests)

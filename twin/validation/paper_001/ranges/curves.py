@@ -53,6 +53,30 @@ class Curves:
         return Curves(every[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
 
 
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """How far something holds: followed in images as far as they go, traced on from there, until the beam is lost.
+
+    Attributes:
+        images, traced: curves over the size; both have the same names.
+        lost: size beyond which the beam is lost or not followed.
+        lost_why: which of the two.
+    """
+
+    images: Curves
+    traced: Curves
+    lost: float
+    lost_why: str
+
+    def limit(self, name: str) -> tuple[float, str]:
+        """Largest size within a limit, and whence it is known: "images", "trace" or why there is none."""
+        for curves, whence in ((self.images, "images"), (self.traced, "trace")):
+            found = curves.crossing(name)
+            if found is not None:
+                return found, whence
+        return self.lost, self.lost_why
+
+
 def sampled(sample: Sample, sizes: Sequence[float], names: Sequence[str] | None = None) -> Curves:
     """Curves at given sizes, with points added where they pass the limit.
 

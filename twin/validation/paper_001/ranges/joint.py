@@ -12,7 +12,7 @@ from optics.tree import Motion, State
 from scenes.channel import BASE
 from twin.experiment import MonitorExperiment
 from twin.validation.paper_001.ranges.bench import FORMS, Bench
-from twin.validation.paper_001.ranges.curves import Curves, sampled
+from twin.validation.paper_001.ranges.curves import Domain, sampled
 from twin.validation.paper_001.ranges.singles import CLAIMED, FINE, NAMES, beam_end, motion_of
 
 BOX = np.array([4.0, 4.0, 24.0, 950.0])
@@ -33,26 +33,12 @@ def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]
 
 
 @dataclass(frozen=True, eq=False)
-class Corners:
+class Corners(Domain):
     """The worst of the 16 corners over the share of the box.
 
-    Attributes:
-        images, traced: form and parameter -> worst error of all corners and cameras as a share of what is claimed.
-        lost: share beyond which a beam is cut, and why.
+    The names of the curves are form and parameter; the values the worst error of all corners and cameras as a share of
+    what is claimed.
     """
-
-    images: Curves
-    traced: Curves
-    lost: float
-    lost_why: str
-
-    def limit(self, name: str) -> tuple[float, str]:
-        """Largest share of the box, and whence it is known."""
-        found = self.images.crossing(name)
-        if found is not None:
-            return found, "images"
-        found = self.traced.crossing(name)
-        return (self.lost, self.lost_why) if found is None else (found, "trace")
 
     def text(self, name: str) -> str:
         """The limit in words."""

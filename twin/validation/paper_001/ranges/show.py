@@ -231,8 +231,7 @@ def defocus_shown(
             "False readings by defocus between before and after",
             "Corrected factors, reading minus truth. Pupil: by how much the reading per µm changes for each mm by "
             "which the sub-aperture is off the pupil's middle; theory 1/f_x² and 1/f². Last column: change of the "
-            "reading of "
-            f"single changes ({SMALL['d_alpha']:g}″, {SMALL['d_beta']:g}″, {SMALL['d_gamma']:g}″, "
+            f"reading of single changes ({SMALL['d_alpha']:g}″, {SMALL['d_beta']:g}″, {SMALL['d_gamma']:g}″, "
             f"{1e-3 * SMALL['d_f']:g} mm) in a camera that is out of focus by ±2λN² before and after.",
             ("reading", "per µm of piston", "at 40 µm", "0.1″ or 0.04 mm at", "claimed error at",
              "per µm and mm along X", "per µm and mm along Y", "theory, size", "gain, defocused"),

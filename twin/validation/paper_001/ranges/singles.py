@@ -14,7 +14,7 @@ from optics.trace import BeamMissedError
 from optics.tree import State
 from twin.motions import ElementaryMotion, line_family
 from twin.validation.paper_001.ranges.bench import FORMS, Bench
-from twin.validation.paper_001.ranges.curves import Curves, sampled
+from twin.validation.paper_001.ranges.curves import Curves, Domain, sampled
 
 NAMES = ("d_alpha", "d_beta", "d_gamma", "d_f")
 EQUATIONS = {"d_alpha": "(3)", "d_beta": "(2)", "d_gamma": "(5)", "d_f": "(7)"}
@@ -38,38 +38,24 @@ _Raw = dict[str, list[np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
-class Range:
-    """One parameter changed in one direction.
+class Range(Domain):
+    """One parameter changed in one direction; sizes are true changes in table units.
+
+    The names of the curves are those of ``criterion`` and WINDOW.
 
     Attributes:
         parameter: of NAMES.
         sign: +1 or -1.
-        images: from rendered spots; traced: from traced spots, on from there. Both over the true change, table units;
-            the names are those of ``criterion`` and WINDOW.
         raw: of the images, form -> error over the true change as (N, 2), for the figure.
         raw_traced: the same traced.
-        lost: true change beyond which the beam is lost or not followed, table units.
-        lost_why: which of the two.
         trace_gap: largest difference of a traced spot shift to the rendered one, px.
     """
 
     parameter: str
     sign: int
-    images: Curves
-    traced: Curves
     raw: Mapping[str, np.ndarray]
     raw_traced: Mapping[str, np.ndarray]
-    lost: float
-    lost_why: str
     trace_gap: float
-
-    def limit(self, name: str) -> tuple[float, str]:
-        """Largest true change within a limit, and whence it is known: "images", "trace" or why there is none."""
-        found = self.images.crossing(name)
-        if found is not None:
-            return found, "images"
-        found = self.traced.crossing(name)
-        return (self.lost, self.lost_why) if found is None else (found, "trace")
 
     @property
     def window(self) -> float:
@@ -155,10 +141,10 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
     def over_truth(curves: Curves) -> Curves:
         return Curves(np.array([truths[x] for x in curves.size.tolist()]), curves.value)
 
+    lost = truths[float(traced.size[-1])]
     return Range(
-        parameter, sign, over_truth(images), over_truth(traced), _joined(raw), _joined(raw_traced),
-        truths[float(traced.size[-1])], why, gap[0],
-    )  # fmt: skip
+        over_truth(images), over_truth(traced), lost, why, parameter, sign, _joined(raw), _joined(raw_traced), gap[0]
+    )
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
