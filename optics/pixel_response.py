@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.special import j1
 
+from optics.threads import cores
+
 FIT_ERROR = 1e-6
 """Largest error of the matched transfer function; kernels grow until they reach it."""
 
 MAX_REACH = 6
+
+_FEW = 8
+"""Images that are not worth threads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +72,18 @@ class PixelResponse:
         """Filter images (B, R, C); returns (B, R - 2 reach, C - 2 reach)."""
         r = self.reach
         out = np.empty((len(images), images.shape[1] - 2 * r, images.shape[2] - 2 * r))
-        for source, target in zip(images, out, strict=True):
-            target[...] = cv2.filter2D(source, cv2.CV_64F, self.kernel)[r:-r, r:-r]
+
+        def work(part: slice) -> None:
+            for source, target in zip(images[part], out[part], strict=True):
+                target[...] = cv2.filter2D(source, cv2.CV_64F, self.kernel)[r:-r, r:-r]
+
+        share = -(-len(images) // cores())
+        parts = [slice(start, start + share) for start in range(0, len(images), share)]
+        if len(images) < _FEW:
+            work(slice(None))
+        else:
+            with ThreadPoolExecutor(len(parts)) as pool:
+                list(pool.map(work, parts))
         return out
 
 

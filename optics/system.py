@@ -18,7 +18,7 @@ from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
 from optics.figure import GridFigure, ZernikeFigure
-from optics.tree import COMPLEX_STEP, FIGURE, Motion, PlacedBodies, State
+from optics.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _media_numbers(
             index = np.full(len(states), medium.index)
             gradient = np.zeros((len(states), 3))
         else:
-            motions = [state.get(medium.solid, Motion()) for state in states]
+            motions = [state.get(medium.solid, AT_REST) for state in states]
             index = assembly.media[medium.solid] + np.array([m.index for m in motions])
             glass = placed.index[medium.solid]
             own = np.array([m.index_gradient for m in motions])
@@ -334,10 +334,9 @@ def _figure_numbers(
         raise ValueError(f"element {element.name!r} needs an aperture to carry a figure: it sets the disk")
     kind = np.float64 if step is None else np.complex128
     table = np.empty((len(states), zernike.triangle_size(order)), kind)
-    nothing = Motion()
     for s, state in enumerate(states):
         terms: dict[int, Any] = dict(base)
-        for j, amplitude in state.get(element.body, nothing).figure.items():
+        for j, amplitude in state.get(element.body, AT_REST).figure.items():
             terms[j] = terms.get(j, 0.0) + amplitude
         if step is not None and step[s][:2] == (element.body, FIGURE):
             terms[step[s][2]] = terms.get(step[s][2], 0.0) + 1j * COMPLEX_STEP

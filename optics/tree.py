@@ -77,6 +77,9 @@ class Motion:
         object.__setattr__(self, "figure", FrozenMap(self.figure))
 
 
+AT_REST = Motion()
+"""Of a body that a state does not name."""
+
 State = Mapping[str, Motion]
 """A perturbed state: body path -> motion; bodies not named stand at their nominal pose."""
 

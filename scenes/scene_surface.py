@@ -16,7 +16,7 @@ from optics.finish import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON
 from optics.pose import Pose
 from optics.solid import Coating, Face, Solid, solid_mesh
 from optics.surface import Surface, plane
-from optics.tree import Motion, PlacedBodies, State
+from optics.tree import AT_REST, PlacedBodies, State
 from scenes.baffle import Plate
 from scenes.scene_mesh import polygon_mesh, sheet_mesh
 
@@ -173,9 +173,7 @@ def solid_surfaces(
     mesh = solid_mesh(solid, placed)
     own = placed.pose(solid.path)
     index = (
-        assembly.media[solid.path] + getattr(state.get(solid.path, Motion()), "index", 0.0)
-        if solid.transparent
-        else 1.0
+        assembly.media[solid.path] + getattr(state.get(solid.path, AT_REST), "index", 0.0) if solid.transparent else 1.0
     )
     nominal = assembly.place()
     out = []

@@ -21,7 +21,7 @@ import numpy as np
 from optics.aim import RayFan, aim
 from optics.pull_back import pull_back
 from optics.system import SystemBatch, assemble
-from optics.tree import COMPLEX_STEP, FIGURE, ORIGIN, Motion, PlacedBodies, State
+from optics.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State
 from scenes.instrument_model import Instrument
 from twin.monitor import AIM_TOLERANCE, MonitorPath
 from twin.monitor_derivative import hit_slopes
@@ -168,7 +168,7 @@ def _union(states: Sequence[State], about: State) -> State:
         for body, motion in state.items():
             if motion.figure:
                 figures.setdefault(body, {}).update(motion.figure)
-    return {**about, **{body: replace(about.get(body, Motion()), figure=terms) for body, terms in figures.items()}}
+    return {**about, **{body: replace(about.get(body, AT_REST), figure=terms) for body, terms in figures.items()}}
 
 
 def _aimed(path: MonitorPath, about: State) -> tuple[np.ndarray, np.ndarray]:
