@@ -43,12 +43,17 @@ def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: in
     """Measure `count` spots a few at a time and join the results; SpotError then names the bad spots of all pieces."""
     reasons: dict[int, str] = {}
 
-    def piece(start: int) -> SpotPositions | None:
+    def piece(start: int, size: int = _PIECE) -> SpotPositions | None:
+        end = min(start + size, count)
         try:
-            return measure(slice(start, min(start + _PIECE, count)))
+            return measure(slice(start, end))
         except SpotError as error:
             reasons.update({start + n: reason for n, reason in error.reasons.items()})
-            return None
+        if size > 1:
+            # spots that are bad for another reason are not named yet
+            for n in range(start, end):
+                piece(n, 1)
+        return None
 
     starts = range(0, count, _PIECE)
     if threads == 1:
