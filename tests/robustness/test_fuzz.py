@@ -23,7 +23,7 @@ from tests.robustness.fuzz import REACHED, Mutant, mutant, numbers, run_many, ru
 from tests.robustness.mutate import mutate
 
 ROOT = Path(__file__).parents[2]
-QUICK = 260
+QUICK = 130
 MANY = 5000
 SAMPLE = 20
 

@@ -274,6 +274,7 @@ def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
         run_course(prepared, resolved, course_states(prepared, resolved.job))
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_nothing(tmp_path) -> None:
     """Ctrl-C while the times are under way."""
     steps = ", ".join(f"{k} s" for k in range(300))

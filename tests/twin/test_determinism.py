@@ -16,9 +16,9 @@ PAGES = ("report.html",)
 """They name the manifest's times; of the manifest itself all but times and checksums is compared."""
 RUNS = {
     "render": ("twin.render", "scenes/examples/perturb.yaml", "--frames", "2"),
-    "angle": ("twin.orbit", "angle", "scenes/orbit/angle.yaml"),
 }
 SLOW_RUNS = {
+    "angle": ("twin.orbit", "angle", "scenes/orbit/angle.yaml"),
     "course": ("twin.render", "scenes/examples/orbit.yaml", "--frames", "1"),
     "targets": ("twin.render", "scenes/examples/targets.yaml", "--frames", "2"),
     "turntable": ("twin.lab", "turntable", "scenes/lab/turntable.yaml"),
@@ -74,6 +74,7 @@ def test_threads_change_no_byte_of_long_runs(name, tmp_path) -> None:
     same(SLOW_RUNS[name], tmp_path)
 
 
+@pytest.mark.slow
 def test_another_seed_changes_the_images(tmp_path) -> None:
     """The comparison above can fail."""
     for seed in ("1", "2"):

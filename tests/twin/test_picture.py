@@ -239,6 +239,7 @@ def test_without_pictures_the_rest_is_kept(ready, tmp_path, monkeypatch):
     assert not kept & NAMES
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_a_picture_is_made_leaves_nothing(ready, tmp_path, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt

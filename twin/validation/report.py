@@ -55,10 +55,15 @@ def render_report(validation: Validation) -> str:
         sigmas=f"{SIGMAS:g}",
         command=command(validation),
         backend=validation.backend,
-        seconds=f"{validation.seconds:.1f}",
+        duration=duration_text(validation.seconds),
         seed=validation.seed,
         versions=versions(),
     )
+
+
+def duration_text(seconds: float) -> str:
+    """A time as one says it."""
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
 
 
 def command(validation: Validation) -> str:

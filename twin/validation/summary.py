@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from twin.artefact import PngFigure, SvgFigure
 from twin.validation.check import CONFIRMED, PAPERS, VERDICTS, CheckResult
-from twin.validation.report import command, measured_text, printed_text, sigma_text
+from twin.validation.report import command, duration_text, measured_text, printed_text, sigma_text
 from twin.validation.runner import Validation
 
 SUMMARY = "summary"
@@ -35,7 +35,7 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
 def _head(validation: Validation) -> Iterator[str]:
     yield "# What the simulation says of the papers"
     yield ""
-    took = f"{validation.seconds / 60:.0f} min" if validation.seconds > 90 else f"{validation.seconds:.0f} s"
+    took = duration_text(validation.seconds)
     yield f"Made by `{command(validation)}` in {took}; its validation.html has every row in full."
     yield ""
     yield "| verdict | checks | meaning |"
