@@ -1,6 +1,7 @@
 """What goes out and comes back is the same: YAML, quantities, configurations, pixels on the ground."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,6 +54,7 @@ RESOLVERS = {
 }
 
 
+@pytest.mark.slow
 def test_configurations_of_spoilt_files_that_are_good(tmp_path) -> None:
     """The config.yaml of whatever can be read is read back to the same text, wherever it lies."""
     table, good = cases(), 0

@@ -117,6 +117,7 @@ def test_all_causes_together_give_table_5(budget):
     assert 2.0 < single["d_gamma_rad"][0] / corrected["d_gamma_rad"][0] < 2.1
 
 
+@pytest.mark.slow
 def test_half_the_glass_path_halves_the_error(budget):
     before, after, ratio = budget.halved_glass()
     assert after < 0.6 * before

@@ -111,6 +111,7 @@ def test_level_is_read_and_set_with_the_theodolites_sigma(alignments) -> None:
         assert low < np.sum(np.square(values)) < high
 
 
+@pytest.mark.slow
 def test_the_seed_decides(alignments, coarse) -> None:
     """The coarse shims' run repeats the first seed as far as the first shims."""
     first, second = (to_dict(alignments[seed]) for seed in SEEDS)

@@ -97,6 +97,7 @@ def test_report_is_self_contained_and_names_its_files(done) -> None:
     assert not re.search(r"@import|url\(\s*['\"]?http|<script[^>]+src|<link[^>]+href", text)
 
 
+@pytest.mark.slow
 def test_config_repeats_the_run(done, tmp_path: Path) -> None:
     """From its own folder, where the camera's file is not beside it."""
     folder, _ = done

@@ -432,6 +432,7 @@ def test_bad_input(case: str, tmp_path: Path) -> None:
     refused(run, "calibrate", path, key, words)
 
 
+@pytest.mark.slow
 def test_warnings(tmp_path: Path) -> None:
     """A datum 500 m to the east is said, and so are effects that are left in."""
     path = write(tmp_path, "control: 1 m", "control: 1 m\n  datum: [500 m, 0 m, 0 m]")

@@ -228,6 +228,7 @@ def test_the_command_writes_them(ready, tmp_path):
         assert read.std() > 5.0
 
 
+@pytest.mark.slow
 def test_without_pictures_the_rest_is_kept(ready, tmp_path, monkeypatch):
     monkeypatch.setitem(picture_light.VARIANTS, "llvm", "llvm_ad_teal")
     arguments = [str(EXAMPLE), "--out", str(tmp_path / "run"), "--frames", "1", "--picture", "--quiet"]

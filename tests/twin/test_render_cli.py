@@ -428,7 +428,9 @@ def test_a_missing_library_is_explained(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     process = start(EXAMPLE, "--out", tmp_path / "new/run", "--quiet")
     try:

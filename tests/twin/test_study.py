@@ -210,6 +210,7 @@ def test_what_only_the_pilot_finds(tmp_path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there(tmp_path) -> None:
     path = write_study(tmp_path / "in")
     with socket.socket() as free:

@@ -46,6 +46,7 @@ def test_grid_of_two_numbers(tmp_path) -> None:
     assert "Enough runs?" not in words
 
 
+@pytest.mark.slow
 def test_latin_hypercube_of_four(tmp_path) -> None:
     study = study_of(
         "{a: {key: [job, a], normal: {mean: 0 um, sigma: 2 um}}, b: {key: [job, b], uniform: [-9 arcsec, 9 arcsec]}, "
@@ -69,6 +70,7 @@ def test_latin_hypercube_of_four(tmp_path) -> None:
     assert found["y_sigma"]["sobol"]["factors"]["d"]["total"]["value"] == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_monte_carlo_is_the_same_each_time(tmp_path) -> None:
     study = study_of(
         "{a: {key: [job, a], normal: {mean: 0 um, sigma: 1 um}}, "

@@ -507,7 +507,9 @@ runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)
 """
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", SLOW, "--out", str(tmp_path / "new/run"), "--json"],

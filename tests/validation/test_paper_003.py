@@ -51,6 +51,7 @@ def test_lost_tables_need_no_work(monkeypatch):
     assert all(len(r.how) > 60 and r.measured is None for r in results)
 
 
+@pytest.mark.slow
 def test_exact_checks_and_the_open_combination():
     """Marks to 0.01 px; the coefficients to what steps of 15 um leave; x of three lines against pitch."""
     ids = ["003.model", "003.equations", "003.equations.exact", "003.model.rank"]
@@ -65,6 +66,7 @@ def test_exact_checks_and_the_open_combination():
     assert again.measured == results["003.model"].measured
 
 
+@pytest.mark.slow
 def test_a_few_campaigns(monkeypatch):
     """Verdicts that three campaigns are enough for, and what the report shows of them."""
     monkeypatch.setattr(fields, "FAST", 3)
