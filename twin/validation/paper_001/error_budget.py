@@ -163,4 +163,4 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     context.add(SvgFigure("table3-figure", "Table 3, printed and simulated", caption, budget_svg(shown)))
 
 
-GROUP = CheckGroup("001.budget", "Error budget (section 3.2)", 240.0, CHECKS, run, fast_seconds=25.0)
+GROUP = CheckGroup("001.budget", "Error budget (section 3.2)", 150.0, CHECKS, run, fast_seconds=25.0)

@@ -266,4 +266,4 @@ def _angle(context: Context, images: JointMotions) -> CheckResult:
     return context.check("001.fig4.angle").judge(slope, sigma, how, None, [reason])
 
 
-GROUP = CheckGroup("001.joint", "Joint form (8)–(11), Table 1 and Fig. 4", 20.0, CHECKS, run, fast_seconds=6.0)
+GROUP = CheckGroup("001.joint", "Joint form (8)–(11), Table 1 and Fig. 4", 3.0, CHECKS, run, fast_seconds=1.0)

@@ -315,4 +315,4 @@ def _table(context: Context, found: tuple[FromImages, ...]) -> None:
     )
 
 
-GROUP = CheckGroup("003.model", "Rigorous model, error equations, stepwise solution", 110.0, CHECKS, run, 40.0)
+GROUP = CheckGroup("003.model", "Rigorous model, error equations, stepwise solution", 60.0, CHECKS, run, 28.0)

@@ -244,5 +244,5 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
 
 
 GROUP = CheckGroup(
-    "004.distortion", "Interior orientation and distortion: rendered tests (sections 3.1, 3.3)", 70.0, CHECKS, run, 15.0
+    "004.distortion", "Interior orientation and distortion: rendered tests (sections 3.1, 3.3)", 85.0, CHECKS, run, 15.0
 )

@@ -333,4 +333,4 @@ def _list(values: Array, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
-GROUP = CheckGroup("004.focus", "Focal-plane alignment (section 2)", 300.0, CHECKS, run, 28.0)
+GROUP = CheckGroup("004.focus", "Focal-plane alignment (section 2)", 380.0, CHECKS, run, 33.0)

@@ -256,4 +256,4 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-GROUP = CheckGroup("004.turntable_fits", "Dividing error of the turntable (sections 3.2, 3.3)", 60.0, CHECKS, run, 12.0)
+GROUP = CheckGroup("004.turntable_fits", "Dividing error of the turntable (sections 3.2, 3.3)", 80.0, CHECKS, run, 15.0)

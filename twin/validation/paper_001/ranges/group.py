@@ -329,5 +329,5 @@ def _plain(unit: str) -> str:
 
 
 GROUP = CheckGroup(
-    "001.ranges", "Ranges of the formulas: size, combination, defocus, pupil, field, return", 120.0, CHECKS, run, 30.0
+    "001.ranges", "Ranges of the formulas: size, combination, defocus, pupil, field, return", 75.0, CHECKS, run, 25.0
 )
