@@ -50,7 +50,7 @@ def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
     from optiland.physical_apertures import RadialAperture, RectangularAperture
 
     optic = Optic()
-    optic.add_surface(index=0, z=-np.inf)
+    optic.surfaces.add(index=0, z=-np.inf)
     for i, (name, surface) in enumerate(model.surfaces.items(), start=1):
         edge = model.apertures[name]
         clear = None
@@ -59,7 +59,7 @@ def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
         shape: dict[str, Any] = {"surface_type": "standard"}
         if surface.even:
             shape = {"surface_type": "even_asphere", "coefficients": [0.0, *surface.even]}
-        optic.add_surface(
+        optic.surfaces.add(
             index=i,
             z=float(model.vertex(name)[2]),
             radius=1.0 / surface.curvature,
@@ -69,8 +69,8 @@ def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
             aperture=clear,
             **shape,
         )
-    optic.add_surface(index=len(model.surfaces) + 1, z=model.spec.image.z)
-    optic.add_wavelength(0.65, is_primary=True)
+    optic.surfaces.add(index=len(model.surfaces) + 1, z=model.spec.image.z)
+    optic.wavelengths.add(0.65, is_primary=True)
     return optic
 
 

@@ -120,9 +120,12 @@ def test_runs_that_kill_their_worker_are_named(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("twin.study.engine.evaluate", deadly)
     store = ChunkStore(tmp_path, plan)
     store.open()
+    before = dict(os.environ)
     with local_workers(1) as workers, pytest.raises(IncompleteError, match=r"runs 75-99 .*workers died"):
         Engine(plan, store, chunk_blocks=2).run(workers)
     assert store.missing == [3]
+    # what workers are told by the environment is not left to this process
+    assert dict(os.environ) == before
 
 
 def test_five_kills(undisturbed, tmp_path) -> None:

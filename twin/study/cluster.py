@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -119,6 +119,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     _silence()
     try:
         with (
+            _kept_environment(ONE_THREAD),
             dask.config.set(settings),
             LocalCluster(
                 n_workers=count,
@@ -138,6 +139,20 @@ def local_workers(count: int) -> Iterator[Workers]:
             yield Workers(client, True)
     finally:
         shutil.rmtree(place, ignore_errors=True)
+
+
+@contextmanager
+def _kept_environment(names: Iterable[str]) -> Iterator[None]:
+    """Restore these variables of this process at the end: Dask's nannies set here what their workers are to inherit."""
+    before = {name: os.environ.get(name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
