@@ -225,7 +225,6 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
         (
             e.interaction,
             e.surface.is_plane,
-            0 if e.surface.is_plane else len(e.surface.even),  # a plane may have terms that are zero
             isinstance(e.surface.figure, GridFigure),
             _aperture_kind(e),
         )
@@ -235,7 +234,9 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
         raise ValueError(
             f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}"
         )
-    interaction, is_plane, even, grid, aperture = kinds.pop()
+    interaction, is_plane, grid, aperture = kinds.pop()
+    # a plane may have terms that are zero, and the terms that a surface lacks are
+    even = 0 if is_plane else max(len(e.surface.even) for e in elements)
     order = -1
     for e in elements:
         if isinstance(e.surface.figure, ZernikeFigure):
@@ -292,7 +293,8 @@ def _numbers(
     if not structure.plane:
         out["c"] = surface.curvature / scale
         out["k"] = np.full(count, surface.conic)
-        for n, term in enumerate(surface.even):
+        for n in range(structure.even):
+            term = surface.even[n] if n < len(surface.even) else 0.0
             out[f"A{n}"] = term / scale ** (2 * n + 3)
     if structure.figure_order >= 0:
         out.update(_figure_numbers(element, structure.figure_order, states, step))

@@ -19,6 +19,7 @@ from optics.pose import Pose
 from optics.rotation import about_axis
 from optics.solid import Solid
 from optics.surface import plane
+from optics.system import assemble
 from optics.tree import Body, PlacedBodies, RigidTree
 from scenes.baffle import Plate
 from scenes.camera_assembly import camera_bodies, camera_elements, camera_sequences, focal_plane_body
@@ -93,7 +94,7 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
         backend: where to trace while the geometry is worked out.
 
     Raises:
-        InputError: prisms or central prism cannot stand as the file says.
+        InputError: prisms or central prism cannot stand as the file says, or the cameras are too different.
     """
     check_prisms(spec)
     derived: dict[str, CameraModel] = {}
@@ -138,6 +139,7 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
     cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
+    _check_alike(spec, assembly)
     assembly = square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
@@ -154,6 +156,17 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     check_solids(instrument.assembly, solids)
     check_clearance(instrument)
     return instrument
+
+
+def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
+    """Refuse cameras that cannot be traced together: one batch holds them all."""
+    try:
+        for way in ("image_to_stop", "image_to_object"):
+            assemble(assembly, [f"{name}/{way}" for name in spec.cameras], [{}])
+    except ValueError as error:
+        text = f"these cameras are too different to stand in one instrument ({error})"
+        alike = "cameras with as many mirrors, planes and apertures of the same kinds in the same places"
+        raise spec.error(text, ("cameras",), allowed=alike) from error
 
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
