@@ -16,9 +16,6 @@ FIT_ERROR = 1e-6
 
 MAX_REACH = 6
 
-_FEW = 8
-"""Images that are not worth threads."""
-
 
 @dataclass(frozen=True, eq=False)
 class PixelResponse:
@@ -73,17 +70,11 @@ class PixelResponse:
         r = self.reach
         out = np.empty((len(images), images.shape[1] - 2 * r, images.shape[2] - 2 * r))
 
-        def work(part: slice) -> None:
-            for source, target in zip(images[part], out[part], strict=True):
-                target[...] = cv2.filter2D(source, cv2.CV_64F, self.kernel)[r:-r, r:-r]
+        def work(number: int) -> None:
+            out[number] = cv2.filter2D(images[number], cv2.CV_64F, self.kernel)[r:-r, r:-r]
 
-        share = -(-len(images) // cores())
-        parts = [slice(start, start + share) for start in range(0, len(images), share)]
-        if len(images) < _FEW:
-            work(slice(None))
-        else:
-            with ThreadPoolExecutor(len(parts)) as pool:
-                list(pool.map(work, parts))
+        with ThreadPoolExecutor(cores()) as pool:
+            list(pool.map(work, range(len(images))))
         return out
 
 

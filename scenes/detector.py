@@ -1,10 +1,11 @@
 """An area detector by the numbers of its EMVA 1288 data sheet, as a file in scenes/detectors gives it."""
 
+from collections.abc import Mapping
 from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from scenes.errors import Problem
+from scenes.errors import KeyPath, Problem, names_text
 from scenes.spec import Name, Number, Spec, Text, Whole
 
 
@@ -44,3 +45,10 @@ class DetectorSpec(Spec):
             found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {most}"
             raise Problem("no grey values are left above the offset", found, allowed, within=("offset_dn",))
         return self
+
+
+def require_detector(setup: Spec, key: KeyPath, name: str, detectors: Mapping[str, DetectorSpec]) -> None:
+    """InputError at ``key`` unless a setup's data sheets hold that name: a config.yaml may have been changed."""
+    if name not in detectors:
+        allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
+        raise setup.error("no such detector in this file", key, found=name, allowed=allowed)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
-from scenes.detector import DetectorSpec
+from scenes.detector import DetectorSpec, require_detector
 from scenes.distortion_test import DistortionTestSpec
 from scenes.dividing_error import TurntableTestSpec
 from scenes.errors import names_text, nearest
@@ -110,12 +110,9 @@ def _require_plane(test: Spec, camera: CameraSpec) -> None:
 
 
 def _require_detectors(setup: Spec, camera: CameraSpec, detectors: Mapping[str, DetectorSpec]) -> None:
-    """Of a config.yaml, which may have been changed by hand."""
+    """InputError unless the data sheets of all bands are there."""
     for name, band in camera.bands.items():
-        if band.detector not in detectors:
-            key = ("camera", "bands", name, "detector")
-            allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
-            raise setup.error("no such detector in this file", key, found=band.detector, allowed=allowed)
+        require_detector(setup, ("camera", "bands", name, "detector"), band.detector, detectors)
 
 
 def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> None:

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
-from scenes.detector import DetectorSpec
+from scenes.detector import DetectorSpec, require_detector
 from scenes.errors import KeyPath, names_text, nearest
 from scenes.experiment import ExperimentSetup, read_setup
 from scenes.instrument import InstrumentSpec
@@ -345,14 +345,12 @@ def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCamera
 def _require_detectors(
     setup: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec, detectors: Mapping[str, DetectorSpec]
 ) -> None:
-    """InputError unless all data sheets are there; a config.yaml may have been changed by hand."""
+    """InputError unless the data sheets of all these lines are there."""
     for name in lines:
         image = camera.image_of(name)
-        if image is not None and image.detector not in detectors:
+        if image is not None:
             own = ("lines", name, "image") if camera.lines[name].image is not None else ("image",)
-            allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
-            key = ("camera", *own, "detector")
-            raise setup.error("no such detector in this file", key, found=image.detector, allowed=allowed)
+            require_detector(setup, ("camera", *own, "detector"), image.detector, detectors)
 
 
 def _require_ends(test: Spec, section: str, ends: tuple[float, float], pixels: int, line: str) -> None:

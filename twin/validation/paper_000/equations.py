@@ -20,7 +20,8 @@ from twin.orbit.angle.procedure import values_of
 from twin.validation.check import CORRECTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_000.least_squares import derivatives, least_slopes, numerical_derivatives
-from twin.validation.paper_000.passes import TEST, Passes, mean_of, planes_of, repeated, setup_of, worst
+from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of, worst
+from twin.validation.scatter import mean_of
 
 Array = NDArray[np.float64]
 TWIST = np.radians(10.0 / 60.0)

@@ -20,6 +20,7 @@ from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_000.figures_figure import places_svg, sensitivity_svg
 from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of
 from twin.validation.paper_000.sentences import ALIKE, AXES, SENTENCES, Rises, Sentence
+from twin.validation.scatter import mean_of
 
 Array = NDArray[np.float64]
 REACH = 10.0
@@ -141,8 +142,7 @@ def _judged(
         f"not print the place: of {len(places)} from 25° to 50° N and 80° to 130° E the sentence holds at {held}; at "
         f"{lat:g}° N {lon:g}° E the number is {sentence.measure(other.rises, other.growth):.3g}."
     )
-    value = float(values[0]) if sentence.kind == "grows" else float(np.mean(values))
-    sigma = None if sentence.kind == "grows" else float(np.std(values, ddof=1) / np.sqrt(len(values)))
+    value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
     return context.check(f"000.{sentence.name}").judge(
         value, sigma, how, sentence.implied, list(_reasons(sentence, passes, other))
     )

@@ -20,6 +20,7 @@ from twin.orbit.angle.camera import AngleCamera, angle_camera
 from twin.orbit.angle.flight import AnglePass, Measurement, fly
 from twin.orbit.angle.procedure import resected
 from twin.orbit.light_effects import NO_EFFECTS
+from twin.validation.scatter import mean_of
 
 TEST = "angle"
 OFF_AXIS = "angle_off_axis"
@@ -79,11 +80,6 @@ class Passes:
             turns = (found - self.normal(line)) @ self.ahead(line) / ARCSEC
             out[line] = mean_of(turns)
         return out
-
-
-def mean_of(values: np.ndarray) -> tuple[float, float]:
-    """Mean of (passes,) and its standard deviation."""
-    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def worst(errors: Mapping[str, tuple[float, float]]) -> tuple[float, float]:

@@ -18,7 +18,8 @@ from twin.orbit.light_effects import SPEED_OF_LIGHT, standard_refractivity
 from twin.orbit.line_camera import dihedral_angle
 from twin.validation.check import CORRECTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context
-from twin.validation.paper_000.passes import TEST, TRACED, Passes, mean_of, repeated, setup_of
+from twin.validation.paper_000.passes import TEST, TRACED, Passes, repeated, setup_of
+from twin.validation.scatter import mean_of
 
 SCALE_HEIGHT = 8435.0
 """Of the standard atmosphere's pressure at 15 °C, R T/(M g), metres."""

@@ -13,7 +13,8 @@ from twin.orbit.angle.flight import AnglePass
 from twin.orbit.angle.procedure import sighted
 from twin.validation.check import CORRECTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context
-from twin.validation.paper_000.passes import OFF_AXIS, TEST, Passes, mean_of, planes_of, repeated, setup_of
+from twin.validation.paper_000.passes import OFF_AXIS, TEST, Passes, planes_of, repeated, setup_of
+from twin.validation.scatter import mean_of
 
 _TENTH = "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"
 

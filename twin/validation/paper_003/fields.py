@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from optics.threads import one_blas_thread
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.ground.random_field import stream
@@ -15,7 +16,7 @@ from twin.validation.paper_003 import flights as flown_fields
 from twin.validation.paper_003 import schemes, stability
 from twin.validation.paper_003.fields_figure import latitude_svg, schemes_svg
 from twin.validation.paper_003.flights import Flights
-from twin.validation.paper_003.setups import ARCSEC, FIELDS, setup_of, without_light
+from twin.validation.paper_003.setups import FIELDS, setup_of, without_light
 
 FULL, FAST = 150, 24
 """Campaigns."""

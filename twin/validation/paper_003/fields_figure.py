@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
 from twin.report.svg import (
     BLUE,
@@ -20,7 +21,6 @@ from twin.report.svg import (
     to_svg,
 )
 from twin.validation.paper_003.flights import Flights
-from twin.validation.paper_003.setups import ARCSEC
 
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, INK)
 _MARKERS = "osD^vPX"

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
 from optics.threads import one_blas_thread
 from scenes.orbit_calibration import CalibrationImagesSpec
@@ -20,7 +21,7 @@ from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_003 import exact, marks, rendered
 from twin.validation.paper_003.model_figure import open_svg
 from twin.validation.paper_003.rendered import FREE_INTERIOR, ROLL_PITCH, YAW, FromImages
-from twin.validation.paper_003.setups import ARCSEC, FIELDS, IMAGES, setup_of, without_light
+from twin.validation.paper_003.setups import FIELDS, IMAGES, setup_of, without_light
 from twin.validation.paper_003.setups import exact as exact_setup
 
 FIELD = "Beijing"

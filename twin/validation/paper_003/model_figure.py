@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from twin.report.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.paper_003.exact import Rank, Walk
-from twin.validation.paper_003.setups import ARCSEC
 
 _FOCAL = 0.65
 """Metres; angles are drawn as image motion."""

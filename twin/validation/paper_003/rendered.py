@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.stepwise import Stepwise, stepwise
@@ -18,7 +19,6 @@ from twin.orbit.calibration.image_sections import image_totals
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, tested, tested_before
 from twin.orbit.calibration.screening import screened
 from twin.validation.paper_003.exact import TOLERANCE, errors_of
-from twin.validation.paper_003.setups import ARCSEC
 
 Advance = Callable[[float], None]
 

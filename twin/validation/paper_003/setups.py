@@ -19,7 +19,6 @@ from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.line_camera import line_cameras
 from twin.orbit.sensor import Platform, Sensor
 
-ARCSEC = np.pi / 648000.0
 FIELDS, IMAGES, STRIP = "calibrate.yaml", "calibrate_images.yaml", "calibrate_strip.yaml"
 """Files of scenes/orbit: seven fields of drawn points; fields of rendered images; passes with tie points."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)

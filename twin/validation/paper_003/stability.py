@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
 from scenes.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, fly_fields
@@ -13,7 +14,8 @@ from twin.validation.check import CORRECTED, Check, CheckResult, Explanation
 from twin.validation.group import Context
 from twin.validation.paper_003.flights import MEDIAN, Flights, lines_of, median
 from twin.validation.paper_003.quality import quality_of
-from twin.validation.paper_003.setups import ARCSEC, changed
+from twin.validation.paper_003.setups import changed
+from twin.validation.scatter import mean_of
 
 ROOT_TEN = 10**0.5
 SLOW = 1.5 * ARCSEC, 10.0
@@ -223,7 +225,7 @@ def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResu
     amplitude = np.array([row[k].amplitude for row in flights.fits]) / ARCSEC
     true = flights.true_amplitude[:, k] / ARCSEC
     away = amplitude - true
-    sigma = float(np.std(away, ddof=1) / np.sqrt(len(away)))
+    sigma = mean_of(away)[1]
     own = float(np.median([row[k].amplitude_sigma for row in flights.fits])) / ARCSEC
     how = (
         f"{_campaigns(flights)}. Mean of the campaigns' amplitudes, each fitted with a constant; implied: the same fit "

@@ -18,6 +18,7 @@ from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_004 import orientation, sensitivity
 from twin.validation.paper_004.figure import points_svg, reduction_svg
 from twin.validation.paper_004.orientation import SpotTest, judge_equations
+from twin.validation.scatter import mean_of, median_of
 
 Array = NDArray[np.float64]
 TEST = "distortion"
@@ -153,9 +154,7 @@ def _compensation(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         "the table. The RMS of the distortion itself, which Table 2 prints, holds the design's distortion of gf7 and "
         f"changes by {-np.median(over_sets):+.1f} % (median; {-np.max(over_sets):+.0f} to {-np.min(over_sets):+.0f} %)."
     )
-    # of a median of normal values
-    sigma = float(np.sqrt(0.5 * np.pi / len(runs)) * np.std(less, ddof=1))
-    return check.judge(float(np.median(less)), sigma, how)
+    return check.judge(*median_of(less), how)
 
 
 def _points(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
@@ -163,7 +162,7 @@ def _points(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
                ((r.raw, r.compensated) for r in runs)]  # fmt: skip
     share = np.array([100.0 * np.mean(raw != own) for raw, own in columns])
     worse = 100.0 * float(np.mean([own > raw for raw, own in columns]))
-    value = float(np.mean(share))
+    value, sigma = mean_of(share)
     how = (
         f"{len(runs)} rendered tests, RMS of the distortion over the sets rounded to 0.1 µm as printed: from "
         f"{np.min(share):.0f} to {np.max(share):.0f} % of the points change, and {worse:.0f} % get larger. In the "
@@ -173,7 +172,6 @@ def _points(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         "A correction of the readings changes the angle of every point and the f and p that all share, so that nearly "
         "every point changes. The table's two thirds of equal entries do not come from such a correction."
     )
-    sigma = float(np.std(share, ddof=1) / np.sqrt(len(runs)))
     return check.judge(value, sigma, how, None, [Explanation(95.0, REFUTED, text)])
 
 

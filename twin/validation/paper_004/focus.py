@@ -29,6 +29,7 @@ from twin.validation.check import NOT_CHECKABLE, Check, CheckResult
 from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_004.coupling import judge_coupling
 from twin.validation.paper_004.figure import alignment_svg
+from twin.validation.scatter import mean_of
 
 Array = NDArray[np.float64]
 TEST = "focus"
@@ -225,8 +226,8 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
         f"{each.size} rendered slanted edges; by band {by_band}. At half the Nyquist frequency the values would be far "
         "higher, at twice as much there is hardly any contrast left."
     )
-    spread = float(np.std(each.mean(axis=1), ddof=1) / np.sqrt(len(each)))
-    yield context.check("004.table1.frequency").judge(float(np.mean(each)), spread, how, 1.0)
+    value, sigma = mean_of(each.mean(axis=1))
+    yield context.check("004.table1.frequency").judge(value, sigma, how, 1.0)
     context.add(
         Table(
             "table1",

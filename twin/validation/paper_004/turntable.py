@@ -19,12 +19,14 @@ from optics.threads import one_blas_thread
 from scenes.dividing_error import TurntableTestSpec
 from scenes.lab_setup import resolve_turntable
 from twin.artefact import Cell, Table
+from twin.laboratory.distortion import rms
 from twin.laboratory.dividing_error import TurntableModel
 from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC, REPEATS
 from twin.laboratory.turntable import run_turntable
 from twin.laboratory.turntable_figure import FIT_NAMES
 from twin.validation.check import CORRECTED, NOT_CHECKABLE, REFUTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context
+from twin.validation.scatter import median_of
 
 Array = NDArray[np.float64]
 TEST = "turntable"
@@ -136,11 +138,11 @@ def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     """Calibrate a table, fit it in all five ways, and look at the readings in between."""
     done = run_turntable(spec, seed, names=CLOSED_FORMS)
     series, held = done.series, done.held_out
-    found = {name: _rms(done.held_out_residual(name)) for name in done.fits}
+    found = {name: rms(done.held_out_residual(name)) for name in done.fits}
     try:
         # without its cross-validation, which takes ten times as long and chooses nothing here
         network = fit(NETWORK, series.angle, series.mean, series.sigma, seed)
-        found[NETWORK] = _rms(held.mean - network(held.angle))
+        found[NETWORK] = rms(held.mean - network(held.angle))
     except NotConvergedError:
         pass
     return FittedTable(done.choice.chosen, {name: found.get(name, float("inf")) for name in FITS})
@@ -175,11 +177,7 @@ def _repeats(context: Context, series: Sequence[CalibrationSeries]) -> Iterator[
                 f"Median of {len(found)} simulated tables; half of them lie between {low:.4f}″ and {high:.4f}″. "
                 f"{more[identifier]}"
             )
-            # of a median of normal values
-            sigma = float(np.sqrt(0.5 * np.pi / len(found)) * np.std(found, ddof=1))
-            yield context.check(identifier).judge(
-                float(np.median(found)), sigma, how, None, reasons.get(identifier, ())
-            )
+            yield context.check(identifier).judge(*median_of(found), how, None, reasons.get(identifier, ()))
 
 
 def _interpolation(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
@@ -250,10 +248,6 @@ def _table(tables: Sequence[FittedTable]) -> Table:
         ("fit", "mean rank", "best on", "median", "largest"),
         rows,
     )
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 GROUP = CheckGroup("004.turntable_fits", "Dividing error of the turntable (sections 3.2, 3.3)", 80.0, CHECKS, run, 15.0)

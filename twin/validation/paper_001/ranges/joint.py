@@ -42,8 +42,8 @@ class Corners(Domain):
 
     def text(self, name: str) -> str:
         """The limit in words."""
-        share = self.limit(name)[0]
-        return f"{share:.3g}" + (" (beam cut)" if share == self.lost else "")
+        share, whence = self.limit(name)
+        return f"{share:.3g}" + (" (beam cut)" if whence == self.lost_why else "")
 
 
 def key(form: str, parameter: str, fine: bool = False) -> str:
