@@ -6,20 +6,16 @@ body carries it, so that a turn of the solid turns all faces and a turn of one f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 import trimesh
-from scipy.optimize import linprog
-from scipy.spatial import HalfspaceIntersection, QhullError
 
+from optics.polyhedron import EmptyBodyError, OpenBodyError, enclosed
 from optics.pose import Pose
 from optics.tree import PlacedBodies
-
-ON_PLANE = 1e-9
-"""Distance below which a vertex counts as lying on a face, metres."""
 
 
 class Coating(Enum):
@@ -77,7 +73,8 @@ class SolidMesh:
     Attributes:
         mesh: watertight, outward winding.
         face_of: (triangles,) index into ``Solid.faces``.
-        polygons: face by face, its corners in order, (K, 3), counterclockwise from outside.
+        polygons: face by face, its corners in order, (K, 3), counterclockwise from outside; (0, 3) for a ground face
+            that the other faces cut off.
     """
 
     mesh: trimesh.Trimesh
@@ -96,69 +93,22 @@ def solid_mesh(solid: Solid, placed: PlacedBodies, state: int = 0) -> SolidMesh:
     """Mesh of the body that the faces enclose.
 
     Raises:
-        SolidError: the faces leave no room, leave the body open, or a face is cut off by the others.
+        SolidError: the faces leave no room, leave the body open, or cut off one of them that is more than a ground
+            surface.
     """
     own = placed.pose(solid.path, state).inverse()
     planes = [face_plane(face, placed, state) for face in solid.faces]
     normals = np.array([own.rotation @ n for _, n in planes])
     offsets = np.einsum("fi,fi->f", normals, np.array([own.apply(p) for p, _ in planes]))
-    corners = _corners(solid.path, normals, offsets)
-    polygons = tuple(_polygon(solid, k, corners, normals[k], offsets[k]) for k in range(len(solid.faces)))
-    vertices, triangles, face_of = _triangulate(polygons)
-    mesh = trimesh.Trimesh(vertices, triangles, process=False)
-    if not mesh.is_watertight or mesh.volume <= 0.0:
-        raise SolidError(f"{solid.path}: its faces do not enclose a body; the mesh is not watertight")
-    return SolidMesh(mesh, face_of, polygons)
-
-
-def _corners(path: str, normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Corners of the polyhedron normals . x <= offsets, (V, 3)."""
-    # the centre of the largest sphere inside; bounded, so that an open body is found as one of huge size
-    bounds = [(-1e3, 1e3)] * 3 + [(0.0, 1e3)]
-    rows = np.column_stack([normals, np.ones(len(normals))])
-    found = linprog([0.0, 0.0, 0.0, -1.0], rows, offsets, bounds=bounds)
-    if found.status != 0 or found.x[3] < ON_PLANE:
-        raise SolidError(f"{path}: its faces leave no room between them")
-    if found.x[3] > 1e2:
-        raise SolidError(f"{path}: its faces do not enclose a body; it is open on one side")
     try:
-        with np.errstate(divide="ignore", invalid="ignore"):  # corners at infinity are found below
-            corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), found.x[:3]).intersections
-    except QhullError as error:
-        raise SolidError(f"{path}: its faces do not enclose a body; it is open on one side") from error
-    if not np.all(np.isfinite(corners)) or np.abs(corners).max() > 1e2:
-        raise SolidError(f"{path}: its faces do not enclose a body; it is open on one side")
-    return np.asarray(corners)
-
-
-def _polygon(solid: Solid, k: int, corners: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
-    """Corners on one face, counterclockwise from outside, each once."""
-    on = corners[np.abs(corners @ normal - offset) < ON_PLANE]
-    kept: list[np.ndarray] = []
-    for corner in on:
-        if all(np.linalg.norm(corner - other) > 10.0 * ON_PLANE for other in kept):
-            kept.append(corner)
-    if len(kept) < 3:
-        raise SolidError(f"{solid.path}: face {solid.faces[k].name!r} is cut off by the other faces")
-    points = np.array(kept)
-    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    across /= np.linalg.norm(across)
-    arm = points - points.mean(axis=0)
-    return np.asarray(points[np.argsort(np.arctan2(arm @ np.cross(normal, across), arm @ across))])
-
-
-def _triangulate(polygons: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shared vertices, fans of triangles, and which polygon each came from."""
-    vertices: list[np.ndarray] = []
-    triangles, face_of = [], []
-    for k, polygon in enumerate(polygons):
-        index = []
-        for corner in polygon:
-            near = next((i for i, v in enumerate(vertices) if np.linalg.norm(v - corner) < 100.0 * ON_PLANE), None)
-            if near is None:
-                vertices.append(corner)
-            index.append(len(vertices) - 1 if near is None else near)
-        for i in range(1, len(index) - 1):
-            triangles.append((index[0], index[i], index[i + 1]))
-            face_of.append(k)
-    return np.array(vertices), np.array(triangles), np.array(face_of)
+        body = enclosed(normals, offsets)
+    except EmptyBodyError as error:
+        raise SolidError(f"{solid.path}: its faces leave no room between them") from error
+    except OpenBodyError as error:
+        raise SolidError(f"{solid.path}: its faces do not enclose a body; it is open on one side") from error
+    for face, ring in zip(solid.faces, body.rings, strict=True):
+        if not ring and face.coating is not Coating.GROUND:
+            raise SolidError(f"{solid.path}: face {face.name!r} is cut off by the other faces")
+    fans = [(k, (ring[0], *pair)) for k, ring in enumerate(body.rings) for pair in pairwise(ring[1:])]
+    mesh = trimesh.Trimesh(body.vertices, np.array([corners for _, corners in fans]), process=False)
+    return SolidMesh(mesh, np.array([k for k, _ in fans]), tuple(body.vertices[list(ring)] for ring in body.rings))

@@ -114,7 +114,9 @@ class MonitorExperiment:
     @cached_property
     def calibration(self) -> MonitorCalibration:
         """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
-        template = SpotTemplate.stack([self._template(image) for image in self.wide_photons])
+        photons = self.wide_photons
+        with one_blas_thread():  # several threads of a small decomposition wait for each other
+            template = SpotTemplate.stack([self._template(image) for image in photons])
         return MonitorCalibration(self.cameras, template, self.detector.noise_model(self.exposure))
 
     def geometry(self, camera: str) -> MonitorGeometry:

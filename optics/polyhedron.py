@@ -1,0 +1,191 @@
+"""The convex body that half-spaces enclose: corners and outlines of its faces, exact whatever the planes.
+
+Planes that almost meet in one point or almost coincide leave edges of nanometres, and no tolerance tells there which
+corners are one. So bodies are cut out of a large box with integers, plane by plane: every corner is the exact meeting
+point of three given planes, every question of sides has the exact answer, and two faces always share their edge. Edges
+too short for floating-point meshes are then taken out one by one, as long as the surface stays closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import ldexp
+
+import numpy as np
+
+REACH = 100.0
+"""A body that reaches farther from the origin counts as open, metres."""
+
+MERGED = 1e-7
+"""Edges shorter than this are taken out, and a body thinner than this is none, metres: a metre in single precision, in
+which paths are traced, has steps of 6e-8 m."""
+
+_BITS = 60
+"""Planes are rounded to 2**-60, 1e-18 of a unit normal or a metre: far below the rounding of doubles."""
+
+_Plane = tuple[int, int, int, int]
+"""Normal and offset, n . x <= d."""
+
+_Corner = tuple[int, int, int, int]
+"""Homogeneous x, y, z, w with w > 0."""
+
+_Rings = dict[int, list[int]]
+"""Face -> its corners, counterclockwise from outside."""
+
+
+class OpenBodyError(ValueError):
+    """The half-spaces do not bound a body."""
+
+
+class EmptyBodyError(ValueError):
+    """No body, or one thinner than MERGED, lies in all half-spaces."""
+
+
+@dataclass(frozen=True, eq=False)
+class Polyhedron:
+    """A convex body.
+
+    Attributes:
+        vertices: its corners, (V, 3), metres.
+        rings: for each half-space the corners of its face, counterclockwise from outside; empty when the half-space
+            leaves no face, or none wider than ``MERGED``. Every edge is in two of them, once each way.
+    """
+
+    vertices: np.ndarray
+    rings: tuple[tuple[int, ...], ...]
+
+
+def enclosed(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
+    """The body of all x with normals . x <= offsets.
+
+    Args:
+        normals: outward unit vectors, (F, 3).
+        offsets: along them from the origin, (F,), metres.
+
+    Raises:
+        OpenBodyError, EmptyBodyError: there is no such body.
+    """
+    count = len(offsets)
+    planes = [_integers((*n, d)) for n, d in zip(normals.tolist(), offsets.tolist(), strict=True)]
+    corners, rings = _box(planes, count)
+    for k in range(count):
+        _cut(corners, rings, planes, k)
+    if any(k >= count for k in rings):
+        raise OpenBodyError("open on one side")
+    used = sorted({v for ring in rings.values() for v in ring})
+    number = {v: i for i, v in enumerate(used)}
+    vertices = np.array([[c / corners[v][3] for c in corners[v][:3]] for v in used])  # correctly rounded
+    depth = offsets - np.min(vertices @ normals.T, axis=0)
+    if np.min(depth[list(rings)]) < MERGED:
+        raise EmptyBodyError("no room")
+    outlines = {k: [number[v] for v in ring] for k, ring in rings.items()}
+    _merge(vertices, outlines)
+    used = sorted({v for ring in outlines.values() for v in ring})
+    number = {v: i for i, v in enumerate(used)}
+    return Polyhedron(vertices[used], tuple(tuple(number[v] for v in outlines.get(k, ())) for k in range(count)))
+
+
+def _integers(plane: Iterable[float]) -> _Plane:
+    a, b, c, d = (round(ldexp(value, _BITS)) for value in plane)
+    return a, b, c, d
+
+
+def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
+    """Corners and faces of the box to cut from; its planes are added to ``planes``, beginning with number ``first``."""
+    reach = int(REACH)
+    corners = [(x, y, z, 1) for x in (-reach, reach) for y in (-reach, reach) for z in (-reach, reach)]
+    outlines = {(-1, 0, 0): (0, 1, 3, 2), (1, 0, 0): (4, 6, 7, 5), (0, -1, 0): (0, 4, 5, 1)}
+    outlines |= {(0, 1, 0): (2, 3, 7, 6), (0, 0, -1): (0, 2, 6, 4), (0, 0, 1): (1, 5, 7, 3)}
+    rings = {}
+    for k, (normal, ring) in enumerate(outlines.items()):
+        planes.append(_integers((*normal, REACH)))
+        rings[first + k] = list(ring)
+    return corners, rings
+
+
+def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int) -> None:
+    """Cut off what lies beyond plane number ``k``; a plane that cuts nothing off leaves no face."""
+    a, b, c, d = planes[k]
+    side = {}
+    for v in {v for ring in rings.values() for v in ring}:
+        x, y, z, w = corners[v]
+        height = a * x + b * y + c * z - d * w
+        side[v] = (height > 0) - (height < 0)
+    if min(side.values()) >= 0:
+        raise EmptyBodyError("no room")
+    if max(side.values()) <= 0:
+        return
+    face_at = {(u, v): face for face, ring in rings.items() for u, v in _edges(ring)}
+    new: dict[tuple[int, int], int] = {}
+    after: dict[int, int] = {}  # along the cut
+    for face, ring in list(rings.items()):
+        if all(side[v] >= 0 for v in ring):
+            del rings[face]
+            continue
+        kept = []
+        for u, v in _edges(ring):
+            if side[u] <= 0:
+                kept.append(u)
+            if side[u] * side[v] < 0:
+                edge = (min(u, v), max(u, v))
+                if edge not in new:
+                    new[edge] = len(corners)
+                    corners.append(_meeting(planes[face], planes[face_at[v, u]], planes[k]))
+                    side[new[edge]] = 0
+                kept.append(new[edge])
+        rings[face] = kept
+        after.update({v: u for u, v in _edges(kept) if side[u] == side[v] == 0})
+    start = next(iter(after))
+    cap = [start]
+    while after[cap[-1]] != start:
+        cap.append(after[cap[-1]])
+    rings[k] = cap
+
+
+def _edges(ring: Sequence[int]) -> Iterable[tuple[int, int]]:
+    """Consecutive corners of a ring, closed."""
+    return zip(ring, (*ring[1:], ring[0]), strict=True)
+
+
+def _meeting(p: _Plane, q: _Plane, r: _Plane) -> _Corner:
+    """Where three planes meet in one point, by Cramer's rule."""
+    qr = (q[1] * r[2] - q[2] * r[1], q[2] * r[0] - q[0] * r[2], q[0] * r[1] - q[1] * r[0])
+    rp = (r[1] * p[2] - r[2] * p[1], r[2] * p[0] - r[0] * p[2], r[0] * p[1] - r[1] * p[0])
+    pq = (p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0])
+    w = p[0] * qr[0] + p[1] * qr[1] + p[2] * qr[2]
+    x, y, z = (p[3] * s + q[3] * t + r[3] * u for s, t, u in zip(qr, rp, pq, strict=True))
+    return (x, y, z, w) if w > 0 else (-x, -y, -z, -w)
+
+
+def _merge(vertices: np.ndarray, rings: _Rings) -> None:
+    """Take out edges shorter than ``MERGED``, the shortest first: one end takes the other's place.
+
+    A corner stays where it is or goes, so that all that are left are corners of the exact body. An edge whose end
+    cannot go without tearing the surface stays.
+    """
+    while True:
+        edges = {(u, v) for ring in rings.values() for u, v in _edges(ring) if u < v}
+        lengths = {(u, v): float(np.linalg.norm(vertices[u] - vertices[v])) for u, v in edges}
+        for u, v in sorted((e for e in edges if lengths[e] < MERGED), key=lambda e: (lengths[e], e)):
+            changed = _without(rings, u, v)
+            if changed is not None:
+                rings.clear()
+                rings.update(changed)
+                break
+        else:
+            return
+
+
+def _without(rings: _Rings, u: int, v: int) -> _Rings | None:
+    """The faces with corner v drawn into its neighbour u; None when the surface would not be a closed one any more."""
+    out = {}
+    for face, ring in rings.items():
+        drawn = [u if w == v else w for w in ring]
+        drawn = [w for w, after in _edges(drawn) if w != after]
+        if len(drawn) > 2:
+            out[face] = drawn
+    edges = [edge for ring in out.values() for edge in _edges(ring)]
+    once = set(edges)
+    closed = len(out) > 3 and len(once) == len(edges) and all((b, a) in once for a, b in once)
+    return out if closed and all(len(set(ring)) == len(ring) for ring in out.values()) else None
