@@ -8,8 +8,10 @@ too short for floating-point meshes are then taken out one by one, as long as th
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from math import ldexp
 
 import numpy as np
@@ -178,14 +180,19 @@ def _merge(vertices: np.ndarray, rings: _Rings) -> None:
 
 
 def _without(rings: _Rings, u: int, v: int) -> _Rings | None:
-    """The faces with corner v drawn into its neighbour u; None when the surface would not be a closed one any more."""
+    """The faces with corner v drawn into its neighbour u; None when they would not be those of a body any more."""
     out = {}
     for face, ring in rings.items():
         drawn = [u if w == v else w for w in ring]
         drawn = [w for w, after in _edges(drawn) if w != after]
         if len(drawn) > 2:
             out[face] = drawn
-    edges = [edge for ring in out.values() for edge in _edges(ring)]
-    once = set(edges)
-    closed = len(out) > 3 and len(once) == len(edges) and all((b, a) in once for a, b in once)
-    return out if closed and all(len(set(ring)) == len(ring) for ring in out.values()) else None
+    if len(out) < 4 or any(len(set(ring)) < len(ring) for ring in out.values()):
+        return None
+    edges = {edge: face for face, ring in out.items() for edge in _edges(ring)}
+    closed = len(edges) == sum(map(len, out.values())) and all((b, a) in edges for a, b in edges)
+    common = Counter(
+        frozenset(pair) for f, g in combinations(out.values(), 2) for pair in combinations(set(f) & set(g), 2)
+    )
+    # two corners that two faces share are an edge, and no other two faces share them
+    return out if closed and all(tuple(pair) in edges and count == 1 for pair, count in common.items()) else None

@@ -17,8 +17,7 @@ from scipy.spatial import ConvexHull
 
 from optics.assembly import Assembly
 from optics.element import Element
-from optics.pose import Pose
-from optics.solid import Solid, SolidError, solid_mesh
+from optics.solid import Face, Solid, SolidError, face_plane, solid_mesh
 from optics.tree import PlacedBodies
 from scenes.channel import BASE, CENTRAL_PRISM
 from scenes.errors import InputError, Issue, KeyPath
@@ -30,6 +29,9 @@ if TYPE_CHECKING:
 
 LEAST_GAP = 20e-6
 """Bodies nearer than this count as touching, metres: what the path tracer needs between two of them."""
+
+PARALLEL = 1e-9
+"""Sine of the angle between planes below which they have no common edge."""
 
 _CELLS = 12  # across a mirror: the hull lies within a few tenths of a millimetre of the surface
 
@@ -151,26 +153,44 @@ def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
     placed = assembly.place()
     for solid in solids:
         try:
-            mesh = solid_mesh(solid, placed)
+            solid_mesh(solid, placed)
         except SolidError as error:
             raise MisplacedError(str(error), key_of(solid.path)) from error
-        own = placed.pose(solid.path)
-        for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
+        for face in solid.faces:
             for element in assembly.elements.values():
                 if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
-                    _check_inside(element, placed.pose(element.body), own.apply(polygon), solid.path)
+                    _check_inside(element, face, solid, placed)
 
 
-def _check_inside(element: Element, frame: Pose, polygon: np.ndarray, path: str) -> None:
-    """Check that an element's clear aperture lies inside the polygon (K, 3), world, of its face."""
+def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodies) -> None:
+    """Check that an element's clear aperture lies on its face: behind the planes of all others, whatever the length of
+    the edges that they have in common.
+    """
     assert element.aperture is not None
-    corners = frame.inverse().apply(polygon)[:, :2]
     rim = element.aperture.outline()
-    edge = np.roll(corners, -1, axis=0) - corners
-    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
-    room = float(np.min((rim[:, None] - corners) * inward @ np.ones(2)))
-    if room < 0.0:
-        key = ("monitor", "return_face", "aperture") if path == CENTRAL_PRISM else key_of(path)
+    points = placed.pose(element.body).apply(np.column_stack([rim, np.zeros(len(rim))]))
+    _, own = face_plane(face, placed)
+    over, across = 0.0, ""
+    for other in solid.faces:
+        point, normal = face_plane(other, placed)
+        slope = float(np.linalg.norm(normal - (normal @ own) * own))
+        if other is face or slope < PARALLEL:
+            continue
+        beyond = float(np.max((points - point) @ normal)) / slope
+        if beyond > over:
+            over, across = beyond, other.name
+    if over > 0.0:
         raise MisplacedError(
-            f"{path}: the clear aperture of {element.name} reaches {-1e3 * room:.3g} mm over the edge of its face", key
+            f"{solid.path}: the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face, "
+            f"beyond {across}",
+            _key_of_edge(solid.path, across),
         )
+
+
+def _key_of_edge(path: str, across: str) -> KeyPath:
+    """What to change when a clear aperture reaches over a face's edge to the face named ``across``."""
+    if path != CENTRAL_PRISM:
+        return key_of(path)
+    if across == "bottom":
+        return ("central_prism", "height")
+    return ("monitor", "return_face", "aperture")

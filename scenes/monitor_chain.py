@@ -9,7 +9,7 @@ and over to the central prism's side; the rhomboid displaces it by a given amoun
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -37,6 +37,9 @@ from scenes.prism_model import null_point, prism_0, prism_180, roof_offset
 
 if TYPE_CHECKING:
     from scenes.instrument import InstrumentSpec, MonitorSpec
+
+
+_OUTLINE = 2000  # points of a clear aperture's edge: a few millimetres apart at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,14 +301,20 @@ def _missed(
 ) -> MisplacedError:
     """Which element of a channel's way out rays (1, N, 3) from the pinhole and from the CCD miss first."""
     names = assembly.sequences[f"{channel.key}/outgoing"]
-    for element, alive in alive_along(backend, assembly, names, position, direction):
-        if not alive.all():
-            what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
-            if element.interaction is Interaction.TOTAL:
-                what += ", or is not totally reflected there"
-            else:
-                what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
-            return MisplacedError(what, key_of(element.body))
+    for count, (element, alive) in enumerate(alive_along(backend, assembly, names, position, direction), 1):
+        if alive.all():
+            continue
+        what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
+        bare = assembly.with_element(replace(element, aperture=None))
+        traced = trace(backend, assemble(bare, [names[:count]]), make_rays(backend, position, direction))
+        if element.aperture is not None and traced.numpy()[3].all():
+            gap = element.aperture.outline(_OUTLINE)[:, None] - traced.place()[0][~alive]
+            off = float(np.max(np.min(np.linalg.norm(gap, axis=-1), axis=0)))
+            what += f": it passes {1e3 * off:.3g} mm beside the clear aperture"
+        elif element.interaction is Interaction.TOTAL:
+            what += ", or is not totally reflected there"
+        what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
+        return MisplacedError(what, key_of(element.body))
     return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
 
 

@@ -178,6 +178,8 @@ def solid_surfaces(
     nominal = assembly.place()
     out = []
     for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
+        if not len(polygon):
+            continue
         on_it = _elements_on(face, solid, assembly, nominal)
         apertures = tuple(dict.fromkeys(aperture for _, aperture in on_it if aperture is not None))
         if len(apertures) > 2:

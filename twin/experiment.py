@@ -22,7 +22,7 @@ from scenes.job import JobSpec, noll
 from scenes.resolved import ResolvedJob
 from scenes.thermal_model import TemperatureError, ThermalModel
 from twin.detector import EmvaDetector, FixedPattern
-from twin.monitor import MonitorPath
+from twin.monitor import MonitorPath, SpotFocus
 from twin.monitor_derivative import spot_jacobian
 from twin.motions import line_family
 from twin.truth import Truth, trace_truth, truth_jacobian
@@ -81,6 +81,17 @@ class MonitorExperiment:
         """Expected photons per pixel and frame of the unperturbed instrument, (C, rows, columns)."""
         m = TEMPLATE_MARGIN
         return self.wide_photons[:, m:-m, m:-m]
+
+    @cached_property
+    def nominal_focus(self) -> SpotFocus:
+        """Sharpness of the unperturbed instrument's spots.
+
+        Raises:
+            BeamMissedError, AimError: they do not come to their CCDs.
+        """
+        focus = self.path.focus
+        self.nominal_truth  # noqa: B018 - the line's light, too, has to arrive
+        return focus
 
     @cached_property
     def nominal_truth(self) -> Truth:

@@ -99,6 +99,19 @@ class CcdRays:
     valid: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class SpotFocus:
+    """Sharpness of the unperturbed instrument's spots, channel by channel.
+
+    Attributes:
+        error: rms wavefront error of the returned beam about its best plane tilt, waves, (C,).
+        defocus: how far the focal plane would have to move along its Z for the sharpest spots, metres, (C,).
+    """
+
+    error: np.ndarray
+    defocus: np.ndarray
+
+
 class MonitorPath:
     """Traces and images the monitor channels of one instrument.
 
@@ -291,15 +304,16 @@ class MonitorPath:
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
         """Raise BeamMissedError when the middle of a spot (rays (S, N, 3) at the CCD) is outside its CCD."""
-        place = np.einsum("n,snk->sk", self.nodes.share, position[..., 1::-1]) / self.pitch + 0.5 * (
-            np.array(self.shape) - 1
-        )
-        outside = np.any((place < 0.0) | (place > np.array(self.shape) - 1), axis=-1)
-        if np.any(outside):
-            row, column = place[np.argmax(outside)]
+        half = 0.5 * (np.array(self.shape) - 1)
+        place = np.einsum("n,snk->sk", self.nodes.share, position[..., 1::-1]) / self.pitch
+        beyond = np.linalg.norm(np.maximum(np.abs(place) - half, 0.0), axis=-1)
+        if np.any(beyond > 0.0):
+            worst = int(np.argmax(beyond))
+            row, column = place[worst] + half
             raise BeamMissedError(
                 f"the spot {channel.key} falls on row {row:.0f}, column {column:.0f}, outside its area CCD of "
-                f"{self.shape[0]} x {self.shape[1]} pixels"
+                f"{self.shape[0]} x {self.shape[1]} pixels: {beyond[worst]:.3g} px or "
+                f"{1e3 * self.pitch * beyond[worst]:.3g} mm beyond its edge"
             )
 
     @cached_property
@@ -307,6 +321,29 @@ class MonitorPath:
         """What pixel and pinhole do to the image."""
         pinhole = self.instrument.spec.monitor.reticle.pinhole
         return PixelResponse.fit(self.pitch, pinhole, cutoff=2.0 * self.numerical_aperture / self.wavelength)
+
+    @cached_property
+    def focus(self) -> SpotFocus:
+        """How sharp the unperturbed instrument's spots are.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        rays, weight = self.coarse.rays([{}]), self.coarse.nodes.weight
+        paths = eikonal(rays.position, rays.direction, rays.path, np.zeros(3))
+        error, defocus = np.empty(len(paths)), np.empty(len(paths))
+        for i, (direction, path) in enumerate(zip(rays.direction, paths, strict=True)):
+            root = np.sqrt(weight * rays.valid[i])
+            # light to a point (x, y, z) of the CCD's frame has there an eikonal of -(u x + v y + w z) and a constant
+            basis = np.column_stack([np.ones_like(path), direction - direction[0]]) * root[:, None]
+            scale = np.linalg.norm(basis, axis=0)
+            flat, point = (
+                np.linalg.lstsq(basis[:, :n] / scale[:n], path * root, rcond=None)[0] / scale[:n] for n in (3, 4)
+            )
+            error[i] = np.linalg.norm(path * root - basis[:, :3] @ flat) / np.linalg.norm(root)
+            # the CCD's z is the plane's -Z; the pinhole moves with the CCD, its image the other way
+            defocus[i] = 0.5 * point[3]
+        return SpotFocus(error / self.wavelength, defocus)
 
     def expected_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True

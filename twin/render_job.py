@@ -21,6 +21,7 @@ from twin.course import course_states, run_course, too_large
 from twin.crosstalk import crosstalk
 from twin.experiment import MonitorExperiment
 from twin.image_quality import image_quality
+from twin.monitor import SpotFocus
 from twin.path_tracing.stray import NominalPathLost
 from twin.results import RenderRun, StrayPair
 from twin.stray_light import stray_light
@@ -51,6 +52,9 @@ TARGETS = "render the targets"
 
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
+
+SHARP = 1.0 / 14.0
+"""Wavefront error below which a nominal spot is as good as perfect, waves rms (Marechal: Strehl ratio 0.8)."""
 
 Progress = Callable[[str], None]
 Advance = Callable[[str, int, int], None]
@@ -90,8 +94,12 @@ def render_job(
     states = [experiment.state(resolved.job)] if course is None else course_states(experiment, resolved.job)
     shown = 0 if course is None else course.shown
     state = states[shown]
+    progress(STAGES[2])
     try:
-        progress(STAGES[2])
+        focus = experiment.nominal_focus
+    except (AimError, BeamMissedError) as error:
+        raise _no_spots(resolved, str(error)) from error
+    try:
         truth = trace_truth(experiment.instrument, backend, [state])
         progress(STAGES[3])
         calibration = experiment.calibration
@@ -138,6 +146,7 @@ def render_job(
         recovery=recovery,
         crosstalk=tables,
         warnings=(
+            *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
@@ -214,6 +223,33 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
         found=f"motions of {moved}",
         allowed="motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller",
     )
+
+
+def _no_spots(resolved: ResolvedJob, reason: str) -> InputError:
+    return resolved.instrument.error(
+        f"the monitor does not work even as designed, without any perturbation: {reason}",
+        ("monitor",),
+        allowed="prism widths, angle_errors, pupil_offset, return_face.aperture and a camera with which the beams pass "
+        "the prisms twice, and an area_ccd (rows, columns, pitch) that the spots fall on",
+    )
+
+
+def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:
+    """One warning for each camera whose spots are not sharp as designed; it is a camera, but hardly the one meant."""
+    out = []
+    for name in experiment.instrument.cameras:
+        own = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
+        worst = max(own, key=lambda i: focus.error[i])
+        if focus.error[worst] > SHARP:
+            model = experiment.instrument.cameras[name]
+            # image.z counts along the parent axis, +-Z of the focal plane
+            shift = model.focal_plane.rotation[2, 2] * focus.defocus[worst]
+            out.append(
+                f"{name}: the spots of camera {model.spec.name} are out of focus as designed, "
+                f"{focus.error[worst]:.2g} waves rms; they would be sharpest with image.z {1e3 * shift:+.3g} mm from "
+                "where it is"
+            )
+    return tuple(out)
 
 
 def _warnings(

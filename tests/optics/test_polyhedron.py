@@ -1,0 +1,191 @@
+"""Bodies from half-spaces: closed and of the right volume, however nearly planes meet in a point or coincide."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+
+from optics.polyhedron import MERGED, REACH, EmptyBodyError, OpenBodyError, Polyhedron, enclosed
+from optics.rotation import rotation_matrix
+
+ROUNDING = 1e-15
+"""Of heights over a plane: corners of bodies of a metre, in doubles."""
+
+CUBE = (np.concatenate([np.eye(3), -np.eye(3)]), np.full(6, 0.5))
+
+
+def unit(vectors) -> np.ndarray:
+    vectors = np.asarray(vectors, float)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def mesh_of(body: Polyhedron) -> trimesh.Trimesh:
+    fans = [(ring[0], ring[i], ring[i + 1]) for ring in body.rings for i in range(1, len(ring) - 1)]
+    return trimesh.Trimesh(body.vertices, fans, process=False)
+
+
+def checked(normals: np.ndarray, offsets: np.ndarray) -> tuple[Polyhedron, float]:
+    """The body after a check of all that holds for every body, and its volume."""
+    body = enclosed(normals, offsets)
+    mesh = mesh_of(body)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.euler_number == 2
+    heights = body.vertices @ normals.T - offsets
+    assert heights.max() < 3.0 * ROUNDING  # every corner that is left is one of the exact body
+    for k, ring in enumerate(body.rings):
+        assert len(set(ring)) == len(ring) != 1
+        # where an edge went, one end has moved by its length; hardly ever several in a row
+        assert np.all(heights[list(ring), k] > -3.0 * MERGED)
+    return body, float(mesh.volume)
+
+
+def volume_by_triples(normals: np.ndarray, offsets: np.ndarray) -> float:
+    """Hull of all points where three planes meet in front of no other one.
+
+    Planes within a few 1e-12 of each other do not meet in a definite point; leaving those out changes the volume as
+    little.
+    """
+    corners = []
+    for three in combinations(range(len(offsets)), 3):
+        matrix = normals[list(three)]
+        if abs(np.linalg.det(matrix)) > 1e-12:
+            corner = np.linalg.solve(matrix, offsets[list(three)])
+            if np.all(normals @ corner - offsets < 1e-9):
+                corners.append(corner)
+    return float(ConvexHull(np.array(corners), qhull_options="QJ").volume)
+
+
+def random_planes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A cube cut by random planes, some of them almost or exactly through one point, some in pairs that nearly or
+    exactly coincide, from 1e-17 up to a millimetre.
+    """
+    normals, offsets = [*CUBE[0]], [*CUBE[1]]
+    small = lambda: 10.0 ** rng.uniform(-17.0, -3.0) * (rng.random() < 0.8)  # noqa: E731
+    meeting = rng.uniform(-0.2, 0.2, 3)
+    for _ in range(rng.integers(1, 7)):
+        normal = unit(rng.normal(size=3))
+        offset = rng.uniform(0.05, 0.6)
+        if rng.random() < 0.5:
+            normal = normal if normal @ meeting > 0.0 else -normal
+            offset = normal @ meeting + small()
+        normals.append(normal)
+        offsets.append(offset)
+        for _ in range(rng.integers(0, 3)):
+            normals.append(unit(normal + small() * rng.normal(size=3)))
+            offsets.append(offset + small() * rng.normal())
+    return np.array(normals), np.array(offsets)
+
+
+def random_bodies(count: int, seed: int) -> int:
+    """Check that many random bodies; how many of them were bodies."""
+    rng, bodies = np.random.default_rng(seed), 0
+    for _ in range(count):
+        normals, offsets = random_planes(rng)
+        try:
+            body, volume = checked(normals, offsets)
+        except EmptyBodyError:
+            with pytest.raises(EmptyBodyError):
+                enclosed(normals[::-1], offsets[::-1])
+            continue
+        bodies += 1
+        # edges of that length were taken out, on a body of that much surface
+        slack = MERGED * mesh_of(body).area
+        assert volume == pytest.approx(volume_by_triples(normals, offsets), abs=slack)
+        order = rng.permutation(len(offsets))
+        assert checked(normals[order], offsets[order])[1] == pytest.approx(volume, abs=slack)
+        turn = rotation_matrix(rng.normal(size=3))
+        assert checked(normals @ turn.T, offsets)[1] == pytest.approx(volume, abs=slack)
+    return bodies
+
+
+def test_random_bodies() -> None:
+    assert random_bodies(60, 1) > 40
+
+
+@pytest.mark.slow
+def test_thousands_of_random_bodies() -> None:
+    assert random_bodies(1000, 2) > 700
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-17, 1e-15, 1e-12, 3e-10, 1e-9, 7e-9, 2e-8, 1.1e-7, 4e-6, 1e-3])
+def test_planes_that_nearly_meet_in_a_point(size) -> None:
+    """A pyramid whose four sides miss their common apex by that much: V = (2a)^2 h / 3 and at most that much of skin."""
+    rng = np.random.default_rng(7)
+    half, height = 0.12, 0.06
+    sides = unit([(height, 0, half), (-height, 0, half), (0, height, half), (0, -height, half)])
+    for _ in range(20):
+        normals = np.concatenate([unit(sides + size * rng.normal(size=(4, 3))), [[0, 0, -1.0]]])
+        offsets = np.array([*size * rng.uniform(-1.0, 1.0, 4), height])
+        body, volume = checked(normals, offsets)
+        area = (2 * half) ** 2 + 4 * half * np.hypot(half, height)
+        assert volume == pytest.approx((2 * half) ** 2 * height / 3.0, abs=(3.0 * size + MERGED) * area)
+        assert all(body.rings)
+        if size < 0.1 * MERGED:
+            assert len(body.vertices) == 5  # one apex
+
+
+@pytest.mark.parametrize("width", [1e-12, 0.5e-7, 2e-7, 1e-5, 0.3])
+def test_a_chamfer_that_shrinks_to_nothing(width) -> None:
+    """V = 1 - t^2 / 2 for edges cut by t; narrower than what counts, the face is none and the cube is whole."""
+    normals = np.concatenate([CUBE[0], unit([[1, 1, 0]])])
+    body, volume = checked(normals, np.append(CUBE[1], (1.0 - width) / np.sqrt(2.0)))
+    assert volume == pytest.approx(1.0 - 0.5 * width**2, abs=2.0 * MERGED if width < MERGED else 1e-14)
+    assert len(body.rings[6]) == (0 if width * np.sqrt(2.0) < MERGED else 4)
+    assert len(body.vertices) == (8 if width * np.sqrt(2.0) < MERGED else 10)
+
+
+def test_planes_that_cut_nothing_leave_no_face() -> None:
+    """One that is given twice, one that only touches a corner, one beyond."""
+    normals = np.concatenate([CUBE[0], [[1.0, 0, 0]], unit([[1, 1, 1]]), unit([[1, 1, 1]])])
+    body, volume = checked(normals, np.array([*CUBE[1], 0.5, 1.5 / np.sqrt(3.0) + 1e-15, 3.0]))
+    assert [len(ring) for ring in body.rings] == [4] * 6 + [0] * 3
+    assert volume == pytest.approx(1.0, abs=1e-15)
+
+
+def test_corners_are_exact() -> None:
+    """Not the rounding of a solver: 1/3 is the double nearest to it."""
+    normals = np.array([[1.0, 0, 0], [-3, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    body = enclosed(normals, np.array([1.0, 1.0, 1, 0, 1, 0]))
+    assert body.vertices[:, 0].min() == -1.0 / 3.0
+
+
+@pytest.mark.parametrize(
+    ("normals", "offsets", "error"),
+    [
+        (CUBE[0][:5], CUBE[1][:5], OpenBodyError),
+        (CUBE[0], np.full(6, 2.0 * REACH), OpenBodyError),
+        (unit([[-1, 0, 0], [1e-3, 1, 0], [1e-3, -1, 0], [0, 0, 1], [0, 0, -1]]), np.full(5, 0.5), OpenBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5]), EmptyBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 0.9 * MERGED]), EmptyBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.6]), EmptyBodyError),
+    ],
+    ids=["five", "too large", "a wedge far too long", "flat", "thin", "inside out"],
+)
+def test_what_is_no_body(normals, offsets, error) -> None:
+    with pytest.raises(error):
+        enclosed(normals, offsets)
+
+
+def test_thin_but_enough() -> None:
+    assert checked(CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 2.0 * MERGED]))[1] == pytest.approx(2.0 * MERGED)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-8, 3e-8])
+def test_a_needle_on_a_ridge(size) -> None:
+    """A ridge cut down to three long thin faces, whose short end cannot be drawn together: it would leave two faces
+    back to back.
+    """
+    u, v, w, x = np.array([[0, -size, -size], [0, size, -size], [1, 0, 0], [0.5, 0, -0.25 * size]])
+    ridge = unit([[0, -1, 1], [0, 1, 1]])
+    planes = [(n, 0.0) for n in ridge] + [(np.array(n, float), d) for n, d in (((-1, 0, 0), 0), ((0, 0, -1), 0.5))]
+    planes.append((np.array([1.0, 0, 0]), 1.0))
+    for a, b, c in ((u, w, x), (v, x, w), (u, x, v)):
+        normal = unit(np.cross(b - a, c - a))
+        normal = normal if normal[2] > 0.0 else -normal
+        planes.append((normal, float(normal @ a)))
+    normals, offsets = (np.array(p) for p in zip(*planes, strict=True))
+    _, volume = checked(normals, offsets)
+    assert volume == pytest.approx(0.25, abs=10.0 * MERGED)
