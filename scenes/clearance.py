@@ -180,11 +180,8 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
         if beyond > over:
             over, across = beyond, other.name
     if over > 0.0:
-        raise MisplacedError(
-            f"{solid.path}: the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face, "
-            f"beyond {across}",
-            _key_of_edge(solid.path, across),
-        )
+        what = f"the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face"
+        raise MisplacedError(f"{solid.path}: {what}, beyond {across}", _key_of_edge(solid.path, across))
 
 
 def _key_of_edge(path: str, across: str) -> KeyPath:

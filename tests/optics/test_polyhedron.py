@@ -112,7 +112,7 @@ def test_thousands_of_random_bodies() -> None:
 
 @pytest.mark.parametrize("size", [0.0, 1e-17, 1e-15, 1e-12, 3e-10, 1e-9, 7e-9, 2e-8, 1.1e-7, 4e-6, 1e-3])
 def test_planes_that_nearly_meet_in_a_point(size) -> None:
-    """A pyramid whose four sides miss their common apex by that much: V = (2a)^2 h / 3 and at most that much of skin."""
+    """A pyramid whose four sides miss their apex by that much: V = (2a)^2 h / 3 and at most that much of skin."""
     rng = np.random.default_rng(7)
     half, height = 0.12, 0.06
     sides = unit([(height, 0, half), (-height, 0, half), (0, height, half), (0, -height, half)])

@@ -185,7 +185,7 @@ REFUSED = [
         14,
         ["monitor.return_face.aperture: base/central_prism", "return_face reaches", "over the edge of its face"],
     ),
-    ([("height: 60 mm", "height: 1 mm")], 6, ["central_prism.height: base/central_prism", "return_face", "beyond bottom"]),
+    ([("height: 60 mm", "height: 1 mm")], 6, ["central_prism.height: base/central_prism", "over the edge", "bottom"]),
     ([("field: 1.22 deg", "field: 40 deg")], 9, ["monitor.field", "forward/left"]),
     (
         [("wavelength: 650 nm", "wavelength: 250 nm"), (ONLY_180, ONLY_180.replace("fused silica", "N-BK7"))],

@@ -1,0 +1,274 @@
+"""Small edits of a prescription, a look, a position or a prism make another instrument of the same kind: it runs.
+
+An edit of one part in a hundred is what a designer does all day. The facets of the central prism and the places of the
+prisms follow from the traced beams, so that spots stay on the middle of their CCDs; what an edit does is to blur them.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from optics.solid import solid_mesh
+from scenes.errors import InputError
+from scenes.load import CAMERAS, INSTRUMENTS, LIBRARY
+from scenes.resolved import resolve
+from scenes.yaml_file import dump_yaml, parse_yaml
+from twin.experiment import MonitorExperiment
+from twin.render_job import STAGES, render_job
+
+Key = tuple[str | int, ...]
+
+LIMIT = 0.01
+"""Largest edit, relative; of a zero, relative to the values beside it."""
+
+OF_CAMERA = re.compile(r"(mirrors|image|field|entrance_pupil|field_bias|focal_length)\b")
+OF_INSTRUMENT = re.compile(
+    r"cameras/\w+/(look|position|pupil_offset)\b|central_prism/|monitor/(field|prism_|return_face|area_ccd/offset)"
+)
+QUANTITY = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?)( .*)?")
+
+QUICK, MANY, TO_THE_FRAMES = 12, 500, 10
+"""Edits by default and of the slow test; every so many of these go on to the calibration and the first images."""
+
+
+class Stop(BaseException):
+    """Far enough."""
+
+
+def test_library_names_are_those_edited() -> None:
+    for name in ("gf7_pair", "monitor_pair"):
+        keys = [f"{file}:{'/'.join(map(str, key))}" for file, key in editable(*trees(name))]
+        for known in (
+            *("camera:mirrors/M1/radius", "camera:mirrors/M2/z", "camera:mirrors/M3/aspheric/A6", "camera:image/z"),
+            *("instrument:cameras/forward/look", "instrument:cameras/backward/position/0"),
+            *("instrument:central_prism/spread/1", "instrument:monitor/prism_180/tilt/0", "instrument:monitor/field"),
+        ):
+            assert known in keys
+        assert len(keys) > 45
+
+
+def trees(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Camera and instrument of the library as plain data; the camera's name is ./camera.yaml."""
+    instrument = parse_yaml((LIBRARY / INSTRUMENTS / f"{name}.yaml").read_text("utf-8")).data
+    (stem,) = {site["camera"] for site in instrument["cameras"].values()}
+    for site in instrument["cameras"].values():
+        site["camera"] = "./camera.yaml"
+    return parse_yaml((LIBRARY / CAMERAS / f"{stem}.yaml").read_text("utf-8")).data, instrument
+
+
+def _numbers(data: Any, key: Key = ()) -> Iterator[Key]:
+    for name, value in data.items() if isinstance(data, dict) else enumerate(data):
+        if isinstance(value, dict | list):
+            yield from _numbers(value, (*key, name))
+        elif isinstance(value, int | float) or QUANTITY.fullmatch(value):
+            yield (*key, name)
+
+
+def editable(camera: dict[str, Any], instrument: dict[str, Any]) -> list[tuple[str, Key]]:
+    """The numbers of both files that are edited, as file and key."""
+    wanted = (("camera", camera, OF_CAMERA), ("instrument", instrument, OF_INSTRUMENT))
+    return [(file, key) for file, tree, kind in wanted for key in _numbers(tree) if kind.match("/".join(map(str, key)))]
+
+
+def _holder(data: Any, key: Key) -> Any:
+    for part in key[:-1]:
+        data = data[part]
+    return data
+
+
+def scaled(data: Any, key: Key, change: float) -> None:
+    """Change a number, with its unit if it has one, by a part of itself, or of the largest beside it if it is 0 (then of
+    1 where nothing is beside it).
+    """
+    holder = _holder(data, key)
+
+    def read(value: Any) -> tuple[float, str | None]:
+        if not isinstance(value, str):
+            return float(value), None
+        match = QUANTITY.fullmatch(value)
+        assert match is not None
+        return float(match[1]), match[2] or ""
+
+    value, unit = read(holder[key[-1]])
+    beside = [abs(read(other)[0]) for other in holder] if isinstance(holder, list) else [1.0]
+    new = value + change * (value or max(beside))
+    holder[key[-1]] = new if unit is None else f"{new!r}{unit}"
+
+
+def random_edit(number: int) -> tuple[str, dict[str, Any], dict[str, Any], str]:
+    """The edit of that number, the same every time: instrument, both trees, and what was changed.
+
+    One key, a few, or all of them; by anything up to the limit, or by orders of magnitude less.
+    """
+    chance = random.Random(f"edit {number}")
+    name = ("gf7_pair", "monitor_pair")[number % 2]
+    camera, instrument = trees(name)
+    keys = editable(camera, instrument)
+    size = chance.choice((LIMIT, LIMIT * 10.0 ** chance.uniform(-3.0, 0.0)))
+    changes = []
+    for file, key in chance.sample(keys, chance.choice((1, 1, 1, 2, 3, 5, len(keys)))):
+        changes.append((file, key, size * chance.uniform(-1.0, 1.0)))
+        scaled(camera if file == "camera" else instrument, key, changes[-1][2])
+    text = ", ".join(f"{file} {'.'.join(map(str, key))} {change:+.3g}" for file, key, change in changes)
+    return name, camera, instrument, text
+
+
+def job_of(folder: Path, camera: dict[str, Any], instrument: dict[str, Any]) -> Path:
+    """Write the files of a job."""
+    (folder / "camera.yaml").write_text(dump_yaml(camera), "utf-8")
+    (folder / "instrument.yaml").write_text(dump_yaml(instrument), "utf-8")
+    job = folder / "job.yaml"
+    job.write_text("instrument: ./instrument.yaml\n", "utf-8")
+    return job
+
+
+def run_until(job: Path, backend, last: str) -> None:
+    """The render command's own way up to a stage: files read, instrument built, nominal spots traced."""
+
+    def progress(stage: str) -> None:
+        if stage == last:
+            raise Stop
+
+    with pytest.raises(Stop):
+        render_job(resolve(job), backend, progress=progress)
+
+
+def outcome(number: int, folder: Path, backend) -> tuple[str, str]:
+    """Whether an edit "runs", or the problem that it is refused for, and all that there is to say. Other exceptions
+    get through.
+    """
+    name, camera, instrument, how = random_edit(number)
+    job = job_of(folder, camera, instrument)
+    try:
+        run_until(job, backend, STAGES[5] if number % TO_THE_FRAMES == 0 else STAGES[3])
+    except InputError as error:
+        kind = error.issues[0].problem if well_told(error) else "badly told"
+        return kind, f"edit {number} of {name} ({how}): {error}"
+    return "runs", ""
+
+
+def well_told(error: InputError) -> bool:
+    """Whether it says where, what and what to do."""
+    said = all(i.file and i.line and i.key and (i.allowed or "depends on" in i.problem) for i in error.issues)
+    return said and "watertight" not in str(error)
+
+
+@pytest.mark.parametrize("number", range(QUICK))
+def test_random_edits_run(number, tmp_path, backend) -> None:
+    assert outcome(number, tmp_path, backend) == ("runs", "")
+
+
+@pytest.mark.slow
+def test_hundreds_of_random_edits_run(tmp_path, backend, capsys) -> None:
+    """None of the 500 makes a job that cannot be rendered. Some five minutes on one core."""
+    began = time.monotonic()
+    outcomes = [outcome(number, tmp_path, backend) for number in range(MANY)]
+    counts = Counter(kind for kind, _ in outcomes)
+    with capsys.disabled():
+        print(f"\n{MANY} edits in {time.monotonic() - began:.0f} s: {dict(counts)}")  # noqa: T201 - the test's result
+    assert counts == {"runs": MANY}, "\n".join(text for _, text in outcomes if text)
+
+
+NAMED = [
+    ("camera", "mirrors.M2.radius", 0.9e-4),
+    ("camera", "mirrors.M1.radius", 1e-4),
+    ("camera", "mirrors.M2.z", "-2.01600047747168 m"),
+    ("camera", "image.z", "-2.11473383495353 m"),
+    ("instrument", "cameras.forward.look", "27 deg"),
+]
+
+
+@pytest.mark.parametrize(("file", "key", "change"), NAMED, ids=[key for _, key, _ in NAMED])
+def test_named_edits(file, key, change, tmp_path, backend) -> None:
+    """Spots lie on the middle of their CCDs, and the central prism is a closed body of the volume that its facets give
+    it, also where a wall is no more because the facets beside it go down to the bottom.
+    """
+    camera, instrument = trees("gf7_pair")
+    tree = camera if file == "camera" else instrument
+    keys = tuple(key.split("."))
+    if isinstance(change, str):
+        assert _holder(tree, keys)[keys[-1]] != change
+        _holder(tree, keys)[keys[-1]] = change
+    else:
+        scaled(tree, keys, change)
+    job = job_of(tmp_path, camera, instrument)
+    run_until(job, backend, STAGES[3])
+    experiment = MonitorExperiment(resolve(job), backend)
+    places = experiment.path.scouted([{}]).place
+    assert np.abs(places).max() < 0.1  # pixels; coma of the beam's edge against its middle
+    block = experiment.instrument.solids[-1]
+    mesh = solid_mesh(block, experiment.instrument.assembly.place()).mesh
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(_block_volume(experiment), rel=1e-3)
+
+
+def _block_volume(experiment: MonitorExperiment) -> float:
+    """Of the block under four facets that meet in its apex, by midpoints of columns: height where it is positive."""
+    model = experiment.instrument
+    spec, placed = model.spec.central_prism, model.assembly.place()
+    count = 1000
+    x, y = (2.0 * s * ((np.arange(count) + 0.5) / count * 2.0 - 1.0) for s in spec.spread)
+    top = np.full((count, count), np.inf)
+    for channel in model.channels:
+        pose = placed.pose(channel.face_body)
+        normal, point = pose.rotation[:, 2], pose.translation - np.array(spec.position)
+        top = np.minimum(top, (point @ normal - x[:, None] * normal[0] - y * normal[1]) / normal[2])
+    return float(np.mean(np.maximum(top + spec.height, 0.0)) * 16.0 * spec.spread[0] * spec.spread[1])
+
+
+def test_a_camera_out_of_focus_says_so(tmp_path, backend) -> None:
+    """M1's radius by 0.2 %: the spots are blurred; moved as the warning says the focal plane makes them sharp."""
+    camera, instrument = trees("gf7_pair")
+    scaled(camera, ("mirrors", "M1", "radius"), 2e-3)
+    job = job_of(tmp_path, camera, instrument)
+    run = render_job(resolve(job), backend, frames=2)
+    blurred = [text for text in run.warnings if "out of focus as designed" in text]
+    assert [text.partition(":")[0] for text in blurred] == ["forward", "backward"]
+    shifts = [float(re.search(r"image\.z ([-+][\d.]+) mm", text)[1]) for text in blurred]
+    assert all(-20.0 < shift < -15.0 for shift in shifts)
+    before = float(camera["image"]["z"].removesuffix(" m"))
+    camera["image"]["z"] = f"{before + 1e-3 * float(np.mean(shifts))!r} m"
+    experiment = MonitorExperiment(resolve(job_of(tmp_path, camera, instrument)), backend)
+    assert np.all(experiment.nominal_focus.error < 0.1 * run.experiment.nominal_focus.error)
+
+
+def test_focus_of_the_reference_is_where_its_plane_is(experiment, tmp_path, backend) -> None:
+    """A plane 1 mm beside is 1 mm out of focus: pinhole and CCD go together, the image goes twice as far."""
+    nominal = experiment("gf7_pair").nominal_focus
+    assert np.all(nominal.error < 1e-3)
+    camera, instrument = trees("gf7_pair")
+    before = float(camera["image"]["z"].removesuffix(" m"))
+    camera["image"]["z"] = f"{before - 1e-3!r} m"
+    moved = MonitorExperiment(resolve(job_of(tmp_path, camera, instrument)), backend).nominal_focus
+    # the focal plane's Z is the prescription's -z; the beam goes back through another part of the camera
+    assert moved.defocus - nominal.defocus == pytest.approx(-1e-3, rel=2e-2)
+
+
+def test_a_monitor_that_misses_says_by_how_much(tmp_path, backend, monkeypatch) -> None:
+    """Facets that are not turned to their beams: which spot, how far off in pixels and mm, in which file. The job is not
+    to blame, it perturbs nothing.
+    """
+    import scenes.instrument_model
+
+    monkeypatch.setattr(scenes.instrument_model, "square_facets", lambda assembly, *_: assembly)
+    camera, instrument = trees("gf7_pair")
+    instrument["monitor"]["prism_180"]["angle_errors"] = {"roof_a": ["30 arcsec", "0 arcsec"]}
+    with pytest.raises(InputError) as caught:
+        render_job(resolve(job_of(tmp_path, camera, instrument)), backend)
+    (issue,) = caught.value.issues
+    assert issue.file.endswith("instrument.yaml")
+    assert issue.key == ("monitor",)
+    assert "even as designed" in issue.problem
+    match = re.search(r"the spot (\w+/\w+) falls on row .*: ([\d.]+) px or ([\d.]+) mm beyond its edge", issue.problem)
+    assert match is not None, issue.problem
+    assert float(match[3]) == pytest.approx(0.012 * float(match[2]), rel=1e-2)  # pixels of 12 um, three digits
+    assert "area_ccd" in issue.allowed
