@@ -12,7 +12,12 @@ from skfem import MeshHex1, MeshHex2, MeshTet1
 from optics.aperture import Aperture, Circle
 from optics.surface import Surface
 
-_FLAT = 1e-9  # relative size below which a body counts as flat and two planes as one
+CLOSE = 1e-3
+"""Corners nearer to each other than this part of the spacing are one for a mesh: what so small a facet changes is far
+below what the elements can tell."""
+
+_FLAT = 1e-9  # relative size below which a body counts as flat
+_PLANE = 1e-11  # and that of the steps between two triangles below which they are one face
 _INNER_SQUARE = 0.55  # half-diagonal of the inner block of a disk's mesh, in radii; gives about equal cells
 
 
@@ -167,7 +172,8 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
     depth = np.max(points @ hull.equations[:, :3].T + hull.equations[:, 3], axis=1)
     if np.min(depth) < -_FLAT * size:
         raise ValueError(f"the polyhedron is not convex: vertex {int(np.argmin(depth))} lies inside the others' hull")
-    fans = [_fan(piece, _FLAT * size) for piece in _slabs(points[hull.vertices], spacing)]
+    hull = ConvexHull(_apart(points[hull.vertices], CLOSE * spacing))
+    fans = [_fan(corners, faces) for corners, faces in _slabs(*_faces(hull, _PLANE * size), spacing)]
     first = np.cumsum([0, *(len(n) for n, _ in fans)])
     nodes, number = np.unique(np.concatenate([n for n, _ in fans]), axis=0, return_inverse=True)
     tetrahedra = number.ravel()[np.concatenate([t + k for (_, t), k in zip(fans, first[:-1], strict=True)])]
@@ -196,62 +202,102 @@ def _skin_area(nodes: np.ndarray, tetrahedra: np.ndarray) -> float:
     return float(np.sum(np.linalg.norm(np.cross(b - a, c - a), axis=1)) / 2.0)
 
 
-def _slabs(corners: np.ndarray, spacing: float) -> list[np.ndarray]:
-    """Cut a body across its length into pieces about as long as it is wide; corners of each, shape (V_i, 3).
+_Edges = list[tuple[int, int]]
+"""Of one face, numbers of corners, each with the face on its left when seen from outside."""
+
+
+def _apart(points: np.ndarray, least: float) -> np.ndarray:
+    """Those of some points (P, 3) that are farther than ``least`` from all that were kept before, (K, 3)."""
+    kept: list[np.ndarray] = []
+    for point in points:
+        if all(np.linalg.norm(point - other) > least for other in kept):
+            kept.append(point)
+    return np.array(kept)
+
+
+def _faces(hull: ConvexHull, tolerance: float) -> tuple[np.ndarray, list[_Edges]]:
+    """Corners (V, 3) and faces of a hull; neighbouring triangles in one plane are one face.
+
+    A face is known by its edges and not by what lies in its plane: whatever the tolerance, neighbours fit.
+    """
+    points, triangles = hull.points, hull.simplices.copy()
+    corners = points[triangles]
+    inward = np.einsum("ti,ti->t", np.cross(*np.moveaxis(np.diff(corners, axis=1), 1, 0)), hull.equations[:, :3]) < 0.0
+    triangles[inward] = triangles[inward, ::-1]
+    face = np.arange(len(triangles))
+    for i, neighbours in enumerate(hull.neighbors):
+        for j in neighbours:
+            heights = points[triangles[j]] @ hull.equations[i, :3] + hull.equations[i, 3]
+            if np.max(np.abs(heights)) <= tolerance:
+                face[face == face[j]] = face[i]
+    out = []
+    for number in np.unique(face):
+        edges = {(int(t[k]), int(t[k - 2])) for t in triangles[face == number] for k in range(3)}
+        out.append([(u, v) for u, v in sorted(edges) if (v, u) not in edges])
+    return points, out
+
+
+def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tuple[np.ndarray, list[_Edges]]]:
+    """Cut a body across its length into pieces about as long as it is wide: corners and faces of each.
 
     Cuts stay away from the corners, so that no piece is a splinter. Neighbours have the very same corners in common.
     """
     middle = np.mean(corners, axis=0)
     axes = np.linalg.svd(corners - middle)[2]
-    along = (corners - middle) @ axes[0]
     target = max(spacing, float(np.ptp((corners - middle) @ axes[1])))
-    stops = np.sort(along)
+    nodes, along = list(corners), ((corners - middle) @ axes[0]).tolist()
     cuts: list[float] = []
-    for low, high in pairwise(stops):
+    for low, high in pairwise(sorted(along)):
         count = round((high - low) / target)
         cuts += [low + (high - low) * (k + 0.5) / count for k in range(count)]
-    sections = []
+    pieces = []
     for cut in cuts:
-        below, above = np.flatnonzero(along < cut), np.flatnonzero(along > cut)
-        share = (cut - along[below])[:, None] / (along[above] - along[below][:, None])
-        points = corners[below][:, None] + share[..., None] * (corners[above] - corners[below][:, None])
-        points = points.reshape(-1, 3)
-        flat = (points - middle) @ axes[1:].T
-        sections.append(points[np.sort(ConvexHull(flat).vertices)])
-    edges = [-np.inf, *cuts, np.inf]
-    bounds = [np.empty((0, 3)), *sections, np.empty((0, 3))]
-    return [
-        np.concatenate([corners[(along > edges[i]) & (along < edges[i + 1])], bounds[i], bounds[i + 1]])
-        for i in range(len(cuts) + 1)
-    ]
+        new: dict[tuple[int, int], int] = {}
+        parts: tuple[list[_Edges], list[_Edges]] = ([], [])  # below, above
+        section: _Edges = []
+        for edges in faces:
+            own: tuple[_Edges, _Edges] = ([], [])
+            ends = {}
+            for u, v in edges:
+                side = along[u] > cut
+                if side == (along[v] > cut):
+                    own[side].append((u, v))
+                    continue
+                key = (min(u, v), max(u, v))
+                if key not in new:
+                    a, b = key
+                    share = (cut - along[a]) / (along[b] - along[a])
+                    new[key] = len(nodes)
+                    nodes.append(nodes[a] + share * (nodes[b] - nodes[a]))
+                    along.append(cut)
+                own[side].append((u, new[key]))
+                own[not side].append((new[key], v))
+                ends[side] = new[key]
+            if ends:  # where the face's outline goes up, and where it comes down again
+                own[False].append((ends[False], ends[True]))
+                own[True].append((ends[True], ends[False]))
+                section.append((ends[True], ends[False]))
+            for part, piece in zip(parts, own, strict=True):
+                if piece:
+                    part.append(piece)
+        pieces.append([*parts[0], section])
+        faces = [*parts[1], [(v, u) for u, v in section]]
+    return [(np.array(nodes), piece) for piece in [*pieces, faces]]
 
 
-def _fan(corners: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra from a convex body's middle over the triangles from each plane face's middle to its edges."""
-    nodes = [*corners, np.mean(corners, axis=0)]
-    middle = len(nodes) - 1
-    planes: list[np.ndarray] = []
-    for plane in ConvexHull(corners).equations:  # one per triangle; triangles of one face share their plane
-        if not any(np.max(np.abs(corners @ (plane - p)[:3] + (plane - p)[3])) <= 10.0 * tolerance for p in planes):
-            planes.append(plane)
+def _fan(corners: np.ndarray, faces: list[_Edges]) -> tuple[np.ndarray, np.ndarray]:
+    """Tetrahedra from a convex body's middle over the triangles from each face's middle to its edges."""
+    used = sorted({corner for edges in faces for edge in edges for corner in edge})
+    number = {corner: k for k, corner in enumerate(used)}
+    nodes = [*corners[used], np.mean(corners[used], axis=0)]
     tetrahedra = []
-    for plane in planes:
-        on_face = np.flatnonzero(np.abs(corners @ plane[:3] + plane[3]) <= 10.0 * tolerance)
+    for edges in faces:
         # in an order that does not depend on the piece: the neighbour's face gets the same middle to the last bit
-        on_face = on_face[np.lexsort(corners[on_face].T)]
-        centre = np.mean(corners[on_face], axis=0)
-        first = corners[on_face[0]] - centre
-        first = first - (first @ plane[:3]) * plane[:3]
-        second = np.cross(plane[:3], first)
-        out = corners[on_face] - centre
-        ring = on_face[np.argsort(np.arctan2(out @ second, out @ first))]
-        nodes.append(centre)
-        face = len(nodes) - 1
-        tetrahedra += [(middle, i, j, face) for i, j in zip(ring, np.roll(ring, -1), strict=True)]
+        nodes.append(np.mean(corners[sorted({corner for edge in edges for corner in edge})], axis=0))
+        tetrahedra += [(len(used), number[u], number[v], len(nodes) - 1) for u, v in edges]
     chosen = np.array(tetrahedra)
-    volumes = _volumes(np.array(nodes), chosen)
-    chosen[volumes < 0.0] = chosen[volumes < 0.0][:, [0, 2, 1, 3]]
-    return np.array(nodes), chosen
+    # all are turned alike
+    return np.array(nodes), chosen if np.sum(_volumes(np.array(nodes), chosen)) > 0.0 else chosen[:, [0, 2, 1, 3]]
 
 
 def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

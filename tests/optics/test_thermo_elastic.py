@@ -10,6 +10,7 @@ from optics.elastic_field import rigid_modes
 from optics.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.figure import ZernikeFigure
 from optics.material import material
+from optics.polyhedron import enclosed
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
 from optics.surface import Surface, plane
@@ -122,6 +123,24 @@ class TestMeshes:
         ]
         assert errors[0] < 1e-3
         assert errors[1] < errors[0] / 12.0
+
+    def test_facets_that_miss_their_apex_are_meshed_whatever_the_size_of_the_gap(self) -> None:
+        """A block under four mirror facets, from 1e-13 to 3 mm off a common point: edges of any length at the apex."""
+        rng = np.random.default_rng(0)
+        walls = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -1]])
+        for size in 10.0 ** np.linspace(-13.0, -2.5, 40):
+            facets = np.array([[0.24, 0.2, 0.97], [-0.04, 0.2, 0.97], [0.24, -0.2, 0.97], [-0.04, -0.2, 0.97]])
+            facets += size * rng.normal(size=facets.shape)
+            normals = np.concatenate([facets / np.linalg.norm(facets, axis=1, keepdims=True), walls])
+            offsets = np.array([*size * rng.uniform(-0.1, 0.1, 4), 0.12, 0.12, 0.1, 0.1, 0.06])
+            corners = enclosed(normals, offsets).vertices
+            mesh = polyhedron_mesh(corners, 0.06)
+            p = mesh.p[:, mesh.t]
+            edges = [np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], axis=0), p[:, 3] - p[:, 0]]
+            volume = np.abs(np.einsum("it,it->t", *edges)).sum() / 6.0
+            hull = ConvexHull(corners)
+            # corners within a thousandth of the spacing are one
+            assert volume == pytest.approx(hull.volume, abs=6e-5 * hull.area)
 
     @pytest.mark.parametrize(
         ("arguments", "words"),

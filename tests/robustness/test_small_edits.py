@@ -86,8 +86,8 @@ def _holder(data: Any, key: Key) -> Any:
 
 
 def scaled(data: Any, key: Key, change: float) -> None:
-    """Change a number, with its unit if it has one, by a part of itself, or of the largest beside it if it is 0 (then of
-    1 where nothing is beside it).
+    """Change a number, with its unit if it has one, by a part of itself; a zero by one of the largest beside it
+    or of 1.
     """
     holder = _holder(data, key)
 
@@ -254,8 +254,8 @@ def test_focus_of_the_reference_is_where_its_plane_is(experiment, tmp_path, back
 
 
 def test_a_monitor_that_misses_says_by_how_much(tmp_path, backend, monkeypatch) -> None:
-    """Facets that are not turned to their beams: which spot, how far off in pixels and mm, in which file. The job is not
-    to blame, it perturbs nothing.
+    """Facets that are not turned to their beams: which spot, how far off in pixels and mm, in which file.
+    The job is not to blame, it perturbs nothing.
     """
     import scenes.instrument_model
 
