@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optics.array_math import determinant, inverse, product
 from optics.backend import Backend
 from optics.push_forward import push_forward
 from optics.system import SystemBatch
@@ -78,10 +79,10 @@ def ray_matrix(
 
 def first_order(matrix: RayMatrix) -> FirstOrder:
     """Chief-ray quantities from the ray matrix: neighbouring fields through the same stop point."""
-    follow = -np.linalg.solve(matrix.stop_by_position, matrix.stop_by_angle)
-    scale = matrix.image_by_angle + matrix.image_by_position @ follow
-    turn = matrix.direction_by_angle + matrix.direction_by_position @ follow
-    focal_length = np.sqrt(np.abs(np.linalg.det(scale)))
+    follow = -product(inverse(matrix.stop_by_position), matrix.stop_by_angle)
+    scale = matrix.image_by_angle + product(matrix.image_by_position, follow)
+    turn = matrix.direction_by_angle + product(matrix.direction_by_position, follow)
+    focal_length = np.sqrt(np.abs(determinant(scale)))
     # two chief rays cross where image step - s * direction step vanishes, s measured upstream
     distance = np.sum(scale * turn, axis=(-1, -2)) / np.maximum(np.sum(turn * turn, axis=(-1, -2)), 1e-30)
     return FirstOrder(scale, focal_length, matrix.stop_by_position, distance)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.aim import RayFan, aim, transverse_axes
+from optics.array_math import inner, product
 from optics.backend import Backend
 from optics.system import SystemBatch
 from optics.trace import make_rays, require_some, trace
@@ -86,7 +87,7 @@ def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> 
         position: coordinate of the points along camera Y on the focal plane, (M,), metres.
         camera: columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
     """
-    local = sight @ camera
+    local = product(sight, camera)
     middle = sight.shape[1] // 2
     axis = local[:, middle]
     # tangent-plane coordinates about each state's own line of sight, its X axis kept square to the nominal Y axis
@@ -99,9 +100,9 @@ def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> 
     y = np.sum(local * along, axis=-1) / depth
     # a lens inverts: an image point at +L looks toward -tan W
     weight = position / np.sum(position**2)
-    roll = np.arctan2(x @ weight, -(y @ weight))
+    roll = np.arctan2(inner(x, weight), -inner(y, weight))
     tangent = -(y * np.cos(roll)[:, None] - x * np.sin(roll)[:, None])
-    distance = tangent @ position / np.sum(tangent**2, axis=-1)
+    distance = inner(tangent, position) / np.sum(tangent**2, axis=-1)
     return LineChange(
         d_alpha=np.arctan2(axis[1:, 0], axis[1:, 2]),
         d_beta=np.arctan2(-axis[1:, 1], np.hypot(axis[1:, 0], axis[1:, 2])),

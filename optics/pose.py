@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from optics.array_math import product, turned
+
 
 def triple(vector: Any) -> tuple[float, float, float]:
     """A vector (3,) as plain numbers, for immutable values that are compared."""
@@ -53,12 +55,12 @@ class Pose:
 
     def apply(self, points: Any) -> np.ndarray:
         """Map points (..., 3) from the body's frame to the parent's, metres."""
-        return np.asarray(points) @ self.rotation.T + self.translation
+        return turned(self.rotation, np.asarray(points)) + self.translation
 
     def inverse(self) -> Pose:
         """The transform back from the parent's frame to the body's."""
-        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+        return Pose(self.rotation.T, -turned(self.rotation.T, self.translation))
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: (a @ b).apply(x) == a.apply(b.apply(x))."""
-        return Pose(self.rotation @ other.rotation, self.apply(other.translation))
+        return Pose(product(self.rotation, other.rotation), self.apply(other.translation))

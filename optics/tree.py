@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from optics.array_math import product, turned
 from optics.frozen_map import FrozenMap
 from optics.pose import Pose, triple
 from optics.rotation import rotation_matrix
@@ -170,9 +171,9 @@ class RigidTree:
                 base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3))
                 base_translation = np.zeros((count, 3), dtype)
                 inherited = distances = np.ones(count, dtype)
-            here = base_rotation @ body.pose.rotation
+            here = product(base_rotation, body.pose.rotation)
             inner = inherited if body.scales else np.ones(count, dtype)
-            rotation[:, i] = here @ motion
+            rotation[:, i] = product(here, motion)
             translation[:, i] = (
                 np.einsum("sij,sj->si", base_rotation, distances[:, None] * position)
                 + base_translation
@@ -235,7 +236,8 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
         body = bodies[path]
         turn_1, offset_1 = _affine(before, body)
         turn_2, offset_2 = _affine(motion, body)
-        turn, offset = turn_1 @ turn_2, turn_1 @ ((1.0 + before.stretch) * (1.0 + before.scale) * offset_2) + offset_1
+        growth = (1.0 + before.stretch) * (1.0 + before.scale)
+        turn, offset = product(turn_1, turn_2), turned(turn_1, growth * offset_2) + offset_1
         out[path] = Motion(
             rotate=triple(Rotation.from_matrix(turn).as_rotvec()),
             shift=triple(offset),
@@ -253,4 +255,4 @@ def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
     turn = rotation_matrix(np.array(motion.rotate))
     pivot = np.array(body.pivots[motion.pivot])
     growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
-    return turn, pivot + np.array(motion.shift) - growth * (turn @ pivot)
+    return turn, pivot + np.array(motion.shift) - growth * turned(turn, pivot)

@@ -16,6 +16,7 @@ import numpy as np
 
 from optics.aim import AimError, transverse_axes
 from optics.aperture import Aperture, Circle, Rectangle
+from optics.array_math import determinant, norm, turned
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
@@ -81,7 +82,7 @@ class CameraModel:
         """Direction from the line's centre along its chief ray, upstream, for rotations (..., 3, 3) of the focal plane
         in the world.
         """
-        return np.asarray(focal_plane @ (self.focal_plane.rotation.T @ -self.image_direction))
+        return turned(focal_plane, turned(self.focal_plane.rotation.T, -self.image_direction))
 
     def bare_assembly(self, apertures: bool = True) -> Assembly:
         """The camera alone, in the prescription frame: mirrors and image plane."""
@@ -93,7 +94,7 @@ def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
     radians.
     """
     vector = np.array([np.tan(x), np.tan(spec.field_bias + y), 1.0])
-    return np.asarray(vector / np.linalg.norm(vector))
+    return np.asarray(vector / norm(vector))
 
 
 def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -153,7 +154,7 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
 
     axes = transverse_axes(centre[None], LINE_AXIS[None])
     chief = first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
-    stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(np.linalg.det(chief.entrance_magnification[0]))))
+    stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
     return CameraModel(

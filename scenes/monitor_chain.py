@@ -18,6 +18,7 @@ import numpy as np
 
 from optics.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.aperture import Circle
+from optics.array_math import inner, norm, turned
 from optics.assembly import Assembly
 from optics.backend import Backend
 from optics.element import Element, Interaction
@@ -119,7 +120,7 @@ def leaving_beams(
     beams = []
     for i, centre in enumerate(centres):
         along = leaving[2 * i] + leaving[2 * i + 1]
-        along = in_base.rotation @ (along / np.linalg.norm(along))
+        along = turned(in_base.rotation, along / norm(along))
         beams.append(LeavingBeam(in_base.apply(reference.apply(np.array([*centre, 0.0]))), along))
     return beams
 
@@ -143,10 +144,10 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     # facets lean to where their beams come from, so that each is the lowest of all planes through the apex there
     side = np.sign(up[:2])
     offset = side * spread
-    centre = apex + np.array([*offset, -(offset @ up[:2]) / up[2]])
+    centre = apex + np.array([*offset, -inner(offset, up[:2]) / up[2]])
     across = centre - beam.middle
-    across = across - (across @ up) * up
-    whole = float(np.linalg.norm(across))
+    across = across - inner(across, up) * up
+    whole = float(norm(across))
     toward = across / whole
     transfer = whole - monitor.prism_0.shift
     off = roof_offset(monitor.prism_180.width)
@@ -211,7 +212,7 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
     """A turn about x and y that leaves a point in place."""
     turn = rotation_matrix(np.array([*tilt, 0.0]))
-    return Pose(turn, np.array(about) - turn @ np.array(about))
+    return Pose(turn, np.array(about) - turned(turn, np.array(about)))
 
 
 def check_prisms(spec: InstrumentSpec) -> None:
@@ -273,7 +274,7 @@ def square_facets(
             raise _missed(assembly, channel, backend, position, direction)
         normal = -leaving[0].sum(axis=0)
         block = placed.pose(CENTRAL_PRISM)
-        local = block.rotation.T @ (normal / np.linalg.norm(normal))
+        local = turned(block.rotation.T, normal / norm(normal))
         poses[channel.face_body] = Pose(_facet_axes(local), assembly.tree[channel.face_body].pose.translation)
     bodies = tuple(Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies)
     return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media)

@@ -25,6 +25,7 @@ from math import sqrt
 import numpy as np
 
 from optics.aperture import Ellipse
+from optics.array_math import inner, norm
 from optics.element import Element, Interaction
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
@@ -228,7 +229,7 @@ def _parts(
     for passage in passages:
         frame = frames[passage.face]
         centre = np.zeros(3) if passage.face in shared else frame.inverse().apply(passage.place)
-        cosine = abs(float(frame.rotation[:, 2] @ passage.direction))
+        cosine = abs(float(inner(frame.rotation[:, 2], passage.direction)))
         aperture = Ellipse(0.5 * width / cosine, 0.5 * width, (float(centre[0]), float(centre[1])))
         elements.append(
             Element(
@@ -240,7 +241,7 @@ def _parts(
                 solid=path,
             )
         )
-    inside = sum(float(np.linalg.norm(b.place - a.place)) for a, b in pairwise(passages))
+    inside = sum(float(norm(b.place - a.place)) for a, b in pairwise(passages))
     return PrismParts(tuple(bodies), tuple(elements), Solid(path, material, tuple(faces)), inside, apex)
 
 
@@ -257,12 +258,12 @@ def _centre(passages: list[Passage]) -> tuple[float, float, float]:
 
 def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
     """Columns x, y, z of a face's frame: z along the normal, x where the arriving beam leans."""
-    z = normal / np.linalg.norm(normal)
-    lean = np.zeros(3) if direction is None else direction - (direction @ z) * z
-    if np.linalg.norm(lean) < 1e-6:
+    z = normal / norm(normal)
+    lean = np.zeros(3) if direction is None else direction - inner(direction, z) * z
+    if norm(lean) < 1e-6:
         lean = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
-        lean = lean - (lean @ z) * z
-    x = lean / np.linalg.norm(lean)
+        lean = lean - inner(lean, z) * z
+    x = lean / norm(lean)
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 

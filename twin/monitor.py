@@ -17,6 +17,7 @@ import numpy as np
 from optics import quadrature, zernike
 from optics.aim import RayFan, aim, alive_along, transverse_axes
 from optics.aperture import Circle
+from optics.array_math import inverse, product
 from optics.backend import Backend
 from optics.diffraction import Grid, PupilField, image
 from optics.pixel_response import PixelResponse
@@ -186,17 +187,17 @@ class MonitorPath:
     def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N, T)."""
         x, y = self.nodes.x, self.nodes.y
-        root = np.sqrt(self.nodes.weight)
         basis = zernike.basis(MAP_TERMS, x, y)
-        solve = np.linalg.pinv(basis * root[:, None]) * root
+        # the terms are orthonormal over the disk, and the quadrature is exact for their products
+        solve = (basis * self.nodes.share[:, None]).T
         dx, dy = (zernike.gradient_basis(MAP_TERMS, x, y, axis) for axis in (0, 1))
         return solve, basis, dx, dy
 
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N)."""
         solve, _, dx, dy = self._smooth
-        a, b = u @ solve.T, v @ solve.T
-        return np.asarray((a @ dx.T) * (b @ dy.T) - (a @ dy.T) * (b @ dx.T))
+        a, b = product(u, solve.T), product(v, solve.T)
+        return product(a, dx.T) * product(b, dy.T) - product(a, dy.T) * product(b, dx.T)
 
     def _outgoing(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
         """Rays from each pinhole toward the optics, and the systems up to the return face."""
@@ -219,7 +220,7 @@ class MonitorPath:
         """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
         middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
-        near = middle + np.einsum("bnij,pj->bpi", np.linalg.inv(slope), self._target)
+        near = middle + np.einsum("bnij,pj->bpi", inverse(slope), self._target)
         q, slope = aim(self.backend, outgoing, fan, self._target, near, slope, AIM_TOLERANCE)
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
@@ -238,7 +239,7 @@ class MonitorPath:
         nominal = scout.nominal
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
         q, _ = aim(self.backend, outgoing, fan, scout._target, start, slope, AIM_TOLERANCE)
-        turn = np.moveaxis(q - start, -1, 0) @ scout._smooth[0].T
+        turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
         place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / self.pitch
         return Scouted(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
@@ -256,7 +257,7 @@ class MonitorPath:
         """
         known = self.scouted(states) if scouted is None else scouted
         start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
-        q = start + np.moveaxis(known.turn @ self._smooth[1].T, 0, -1)
+        q = start + np.moveaxis(product(known.turn, self._smooth[1].T), 0, -1)
         launch = known.fan.at(q)
         uploaded = known.back.upload(self.backend)
         face = len(known.outgoing.structure) - 1

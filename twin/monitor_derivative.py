@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from optics.aim import transverse_axes
+from optics.array_math import inverse, turned
 from optics.backend import Backend
 from optics.diffraction import PupilTangent, image_derivative
 from optics.push_forward import RayTangents, push_forward
@@ -40,7 +41,7 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayT
     outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
-    q_step = -np.linalg.solve(np.repeat(slopes, m, axis=0), drift[..., None])[..., 0]
+    q_step = -turned(np.repeat(inverse(slopes), m, axis=0), drift)
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0)))
 
 

@@ -105,7 +105,7 @@ def render_job(
         calibration = experiment.calibration
         progress(STAGES[4])
         nominal = experiment.nominal_photons
-        photons = experiment.path.expected_photons([state]) if course is None else None
+        photons = experiment.path.expected_photons([state], single=False) if course is None else None
     except (AimError, BeamMissedError) as error:
         raise _too_large(resolved, str(error)) from error
     series = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -119,6 +120,35 @@ class RenderRun:
         out["centroid"] = self.resolved.job.analysis.centroid
         out["frames"] = self.frames
         return out
+
+
+STATED = 6
+"""Decimals of a reading's sigma to which files state the reading."""
+STATED_SIGMA = 8
+"""Significant digits of a sigma."""
+
+
+def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
+    """Readings with as many digits as files state: each to a millionth of its sigma, the sigmas to eight digits.
+
+    What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
+
+    Args:
+        readings: nested; the sigma of ``x`` is ``x_sigma`` or ``sigma_x`` beside it. Other numbers stay as they are.
+    """
+    out: dict[str, Any] = {}
+    for key, value in readings.items():
+        sigma = readings.get(f"{key}_sigma", readings.get(f"sigma_{key}"))
+        if isinstance(value, Mapping):
+            out[key] = stated(value)
+        elif isinstance(value, float) and (key.endswith("_sigma") or key.startswith("sigma_")):
+            out[key] = float(f"{value:.{STATED_SIGMA - 1}e}")
+        elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
+            # adding 0.0 turns a negative zero into a plain one
+            out[key] = round(value, STATED - math.floor(math.log10(sigma))) + 0.0
+        else:
+            out[key] = value
+    return out
 
 
 def quality_dict(quality: ImageQuality) -> dict[str, Any]:

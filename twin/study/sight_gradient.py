@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from optics.aim import RayFan, aim, transverse_axes
+from optics.array_math import inverse, turned
 from optics.backend import Backend
 from optics.push_forward import push_forward
 from optics.system import SystemBatch, assemble
@@ -58,10 +59,10 @@ def sight_gradient(
         return assemble(assembly, [f"{name}/{sequence}" for name in names], states, steps, stepped)
 
     drift = push_forward(backend, systems("image_to_stop"), place, heading, moved, 0.0).position[..., :2]
-    turn = -np.linalg.solve(np.repeat(slope, m, axis=0), drift[..., None])[..., 0]
+    turn = -turned(np.repeat(inverse(slope), m, axis=0), drift)
     to_object = systems("image_to_object")
-    turned = np.einsum("bnk,bnkx->bnx", turn, np.repeat(axes, m, axis=0))
-    pushed = push_forward(backend, to_object, place, heading, moved, turned)
+    heading_step = np.einsum("bnk,bnkx->bnx", turn, np.repeat(axes, m, axis=0))
+    pushed = push_forward(backend, to_object, place, heading, moved, heading_step)
     local = pushed.traced.numpy()[1]
     # from the frame of the last element, which moves too, to the world
     assert to_object.tangents is not None
