@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
+from rich.console import Console
 
 from scenes.camera import CameraSpec
 from scenes.camera_design_spec import CameraDesignSpec
@@ -28,6 +29,7 @@ from scenes.orbit_calibration import OrbitCalibrationSpec
 from scenes.orbit_monitor import OrbitMonitorSpec
 from scenes.orbit_simulate import OrbitSimulateSpec
 from scenes.spec import Spec
+from scenes.standard_output import to_stdout
 from scenes.study import StudySpec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from scenes.turntable import PrincipleExperimentSpec
@@ -118,7 +120,8 @@ def main(
     except OSError as error:
         sys.stderr.write(f"{out}: cannot be written: {error.strerror or error}\n")
         raise typer.Exit(2) from None
-    sys.stdout.write("".join(f"{path}\n" for path in paths))
+    with to_stdout(Console(stderr=True), f"the schemas are complete in {out}"):
+        sys.stdout.write("".join(f"{path}\n" for path in paths))
 
 
 if __name__ == "__main__":

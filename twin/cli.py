@@ -1,4 +1,4 @@
-"""What the commands share: exit codes, errors as one sentence, and an orderly end on SIGTERM."""
+"""What the commands share: exit codes, errors as one sentence, and an orderly end on signals."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from rich.table import Table
 
 from optics.backend import NAMES, BackendUnavailable
 from optics.llvm import LibraryMissing
-from scenes.errors import InputError, printable
+from scenes.errors import InputError
+from scenes.standard_output import FAILURE, print_error
 from twin.run_folder import RunFolderError
 
-FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+BAD_INPUT, INTERRUPTED = 2, 128 + signal.SIGINT
 LARGEST_SEED = 2**63 - 1
 BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
 
@@ -84,24 +85,28 @@ def print_place(console: Console, target: Path) -> None:
     console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
-def print_error(errors: Console, text: str) -> None:
-    """One error message, as it is: no markup, no wrapping; control characters as escapes."""
-    text = "\n".join(printable(line) for line in text.split("\n"))
-    errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """Signals that ask the program to end, Ctrl-C aside. SIGHUP does not when ``nohup`` has started it."""
+    asked = (signal.SIGTERM, signal.SIGHUP)
+    return tuple(number for number in asked if signal.getsignal(number) != signal.SIG_IGN)
 
 
 @contextmanager
 def exit_on_terminate() -> Iterator[None]:
-    """Let SIGTERM end the program as an exception, so that a half-written run folder is removed."""
+    """Let SIGTERM and SIGHUP end the program as an exception, so that a half-written run folder is removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    got: list[int] = []
 
     def leave(number: int, frame: object) -> None:
-        raise SystemExit(TERMINATED)
+        if not got:  # a second one must not break off the clearing up
+            got.append(number)
+            raise SystemExit(128 + number)
 
-    before = signal.signal(signal.SIGTERM, leave)
+    before = {number: signal.signal(number, leave) for number in ending_signals()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

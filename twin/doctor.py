@@ -23,6 +23,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from scenes.standard_output import Terminal, print_json, to_stdout
+
 DISTRIBUTION = "space-camera-twin"
 OLDEST_PYTHON = (3, 11)
 PROBE_TIMEOUT_S = 120.0
@@ -202,7 +204,7 @@ def _pins() -> list[Check]:
     return checks
 
 
-def _show(checks: list[Check], good: bool) -> None:
+def _show(checks: list[Check], good: bool, console: Console) -> None:
     styles = {"ok": "green", "note": "yellow", "failed": "bold red"}
     table = Table(title="space camera twin: doctor", title_justify="left")
     table.add_column("check")
@@ -210,7 +212,6 @@ def _show(checks: list[Check], good: bool) -> None:
     table.add_column("detail", overflow="fold")
     for check in checks:
         table.add_row(check.name, Text(check.status, style=styles[check.status]), Text(check.detail))
-    console = Console()
     console.print(table)
     console.print("ready" if good else "not ready: see the lines marked failed")
 
@@ -224,11 +225,11 @@ def main(
     """
     checks = examine(quick)
     good = all(check.status != "failed" for check in checks)
-    if as_json:
-        report = {"ok": good, "checks": [asdict(check) for check in checks]}
-        sys.stdout.write(json.dumps(report, indent=2) + "\n")
-    else:
-        _show(checks, good)
+    with to_stdout(Console(stderr=True)):
+        if as_json:
+            print_json({"ok": good, "checks": [asdict(check) for check in checks]}, indent=2)
+        else:
+            _show(checks, good, Terminal())
     raise typer.Exit(0 if good else 1)
 
 

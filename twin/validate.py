@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich import box
@@ -16,9 +14,9 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from optics.backend import load_backend
+from scenes.standard_output import FAILURE, Terminal, print_json, to_stdout
 from twin.cli import (
     BACKEND_HELP,
-    FAILURE,
     LARGEST_SEED,
     InputErrorText,
     check_backend,
@@ -100,15 +98,17 @@ def main(
         except UnknownCheck as error:
             raise InputErrorText(str(error)) from error
         if list_checks:
-            _print_list(selections, fast, as_json)
+            with to_stdout(errors):
+                _print_list(selections, fast, as_json)
             return
         folder = None if out is None else RunFolder(out, force)
         with exit_on_terminate():
             validation = _run(selections, backend, seed, only, fast, folder, errors)
-    if as_json:
-        _print_json(validation.to_dict())
-    else:
-        _print_result(validation, None if folder is None else folder.target)
+    with to_stdout(errors, "" if folder is None else f"the report is complete in {folder.target}"):
+        if as_json:
+            print_json(validation.to_dict())
+        else:
+            _print_result(validation, None if folder is None else folder.target)
     for result, expected in validation.unexpected:
         text = f"{result.id} is {result.verdict}, not {expected} as expected: {result.how}"
         if result.verdict == FAILED:
@@ -163,11 +163,6 @@ class _TimeLeft(ProgressColumn):
         return Text(f"about {minutes}:{seconds:02d} left", style="cyan", no_wrap=True)
 
 
-def _print_json(data: Any) -> None:
-    json.dump(data, sys.stdout, allow_nan=False)
-    sys.stdout.write("\n")
-
-
 def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> None:
     """Ids, statements and rough times of the selected checks."""
     if as_json:
@@ -188,9 +183,9 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
             for check in selection.group.checks
             if check.id in selection.ids
         ]
-        _print_json({"checks": rows})
+        print_json({"checks": rows})
         return
-    console = Console()
+    console = Terminal()
     for selection in selections:
         group = selection.group
         console.print(
@@ -217,7 +212,7 @@ def _print_result(validation: Validation, target: Path | None) -> None:
         unit = "" if r.unit == "1" else r.unit
         cells = (r.id, printed_text(r), measured_text(r), sigma_text(r), unit)
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
-    console = Console()
+    console = Terminal()
     print_whole(console, table)
     counts = ", ".join(f"{validation.counts[verdict]} {verdict}" for verdict in VERDICTS if validation.counts[verdict])
     number = len(validation.results)

@@ -1,0 +1,162 @@
+"""Results that cannot be written: a full disk is one sentence and exit code 1, a reader that has gone no word."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import pytest
+import typer
+from rich.console import Console
+
+from scenes.standard_output import Terminal, print_json, to_stdout
+from tests.twin.study_bench import ROOT
+from twin.cli import exit_on_terminate
+
+FULL = "/dev/full"
+LIST = ("twin.validate", "--list")
+DOCTOR = ("twin.doctor", "--quick")
+SCHEMA = ("scenes.schema", "--out", "{tmp}")
+RENDER = ("twin.render", "scenes/examples/perturb.yaml", "--frames", "1", "--out", "{tmp}/run")
+LAB = ("twin.lab", "distortion", "scenes/lab/distortion.yaml", "--out", "{tmp}/run")
+COMMANDS = [
+    pytest.param((*LIST, "--json"), id="list-json", marks=pytest.mark.slow),
+    pytest.param(LIST, id="list", marks=pytest.mark.slow),
+    pytest.param(SCHEMA, id="schema"),
+    pytest.param((*DOCTOR, "--json"), id="doctor-json", marks=pytest.mark.slow),
+    pytest.param(DOCTOR, id="doctor", marks=pytest.mark.slow),
+    pytest.param((*RENDER, "--json"), id="render-json", marks=pytest.mark.slow),
+    pytest.param(RENDER, id="render", marks=pytest.mark.slow),
+    pytest.param((*LAB, "--json"), id="lab-json", marks=pytest.mark.slow),
+]
+
+
+@contextmanager
+def closed_pipe():
+    """The end to write to of a pipe that nobody reads."""
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "wb") as file:
+        yield file
+
+
+def run(words, tmp_path, stdout) -> tuple[int, str]:
+    """Exit code and stderr."""
+    words = [word.format(tmp=tmp_path) for word in words]
+    done = subprocess.run(
+        [sys.executable, "-m", *words], cwd=ROOT, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=300
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_a_full_disk(words, tmp_path) -> None:
+    with open(FULL, "w") as full:
+        code, errors = run(words, tmp_path, full)
+    assert code == 1
+    assert errors.startswith("error: cannot write to the standard output: No space left on device")
+    assert len(errors.splitlines()) == 1, errors
+    if "{tmp}/run" in words:
+        assert f"complete in {tmp_path / 'run'}" in errors
+        assert (tmp_path / "run" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_a_reader_that_has_gone(words, tmp_path) -> None:
+    with closed_pipe() as pipe:
+        code, errors = run(words, tmp_path, pipe)
+    assert (code, errors) == (128 + signal.SIGPIPE, "")
+
+
+@pytest.fixture(params=["json", "table", "much"])
+def printed(request):
+    """Something to print."""
+    much = {"x": ["0123456789" * 10] * 10_000}
+    return {
+        "json": lambda: print_json({"x": 1.5}),
+        "table": lambda: Terminal().print("a line"),
+        "much": lambda: print_json(much),
+    }[request.param]
+
+
+def outcome(printed, stdout, monkeypatch) -> tuple[int, str]:
+    """Exit code and message when ``printed`` goes to a file."""
+    said = io.StringIO()
+    with open(os.dup(stdout.fileno()), "w") as file:
+        monkeypatch.setattr(sys, "stdout", file)
+        with pytest.raises(typer.Exit) as left, to_stdout(Console(file=said, width=200), "kept in run"):
+            printed()
+        file.flush()  # what the interpreter does at its end says nothing more
+    return left.value.exit_code, said.getvalue()
+
+
+def test_a_full_disk_in_process(printed, monkeypatch) -> None:
+    with open(FULL, "w") as full:
+        code, text = outcome(printed, full, monkeypatch)
+    assert code == 1
+    assert text == "error: cannot write to the standard output: No space left on device; kept in run\n"
+
+
+def test_a_reader_that_has_gone_in_process(printed, monkeypatch) -> None:
+    with closed_pipe() as pipe:
+        assert outcome(printed, pipe, monkeypatch) == (128 + signal.SIGPIPE, "")
+
+
+def test_what_is_printed_arrives(capfd) -> None:
+    with to_stdout(Console(stderr=True)):
+        print_json({"x": [1.5, None]})
+    out, errors = capfd.readouterr()
+    assert json.loads(out) == {"x": [1.5, None]}
+    assert errors == ""
+
+
+def test_other_errors_are_not_taken_for_the_disk() -> None:
+    with pytest.raises(ValueError, match="JSON"), to_stdout(Console(stderr=True)):
+        print_json({"x": float("nan")})
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_signals_leave_in_order(number, code) -> None:
+    """Also when the signal comes again while the block clears up."""
+    cleared = []
+
+    def work() -> None:
+        with exit_on_terminate():
+            try:
+                signal.raise_signal(number)
+            finally:
+                signal.raise_signal(number)
+                cleared.append(True)
+
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as left:
+        work()
+    assert left.value.code == code
+    assert cleared == [True]
+    assert signal.getsignal(number) == before
+
+
+def test_nohup_is_respected() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with exit_on_terminate():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_signals_are_left_alone_in_other_threads() -> None:
+    done = []
+
+    def work() -> None:
+        with exit_on_terminate():
+            done.append(True)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done == [True]
