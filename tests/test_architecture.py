@@ -30,20 +30,28 @@ def source_files() -> list[Path]:
     return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level names of everything a file imports, at any depth, also by importlib with a literal name."""
+def imported_modules(path: Path) -> set[str]:
+    """Names of everything a file imports, at any depth, also by importlib with a literal name; of what is imported from
+    a module, the module's and the one that it would have as a module of its own.
+    """
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             # A relative import stays in its package.
-            names.add((node.module or "").split(".")[0] if node.level == 0 else path.relative_to(ROOT).parts[0])
+            module = (node.module or "") if node.level == 0 else path.relative_to(ROOT).parts[0]
+            names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("importlib.import_module", "__import__"):
             first = node.args[0] if node.args else None
             if isinstance(first, ast.Constant) and isinstance(first.value, str):
-                names.add(first.value.split(".")[0])
+                names.add(first.value)
     return names
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level names of everything a file imports."""
+    return {name.split(".")[0] for name in imported_modules(path)}
 
 
 def forbidden(path: Path) -> set[str]:

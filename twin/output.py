@@ -12,7 +12,7 @@ from twin.course import CourseRun
 from twin.data_file import netcdf
 from twin.image_file import SPOT_STRETCH, preview_png, tiff
 from twin.report import write_report
-from twin.results import RenderRun, quality_dict
+from twin.results import RenderRun, quality_dict, stated
 from twin.run_folder import MANIFEST, RunFolder
 from twin.scene_file import write_scene
 from twin.summary_figure import write_summary
@@ -36,7 +36,7 @@ def write_run(
     channels = run.experiment.path.channels
     folder.write_text("config.yaml", run.resolved.to_yaml())
     folder.write_json("truth.json", run.truth_dict())
-    folder.write_json("recovered.json", run.recovered_dict())
+    folder.write_json("recovered.json", stated(run.recovered_dict()))
     folder.write_json("crosstalk.json", {name: table.to_dict() for name, table in run.crosstalk.items()})
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):

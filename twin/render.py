@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,14 +18,13 @@ from analysis.recovery import ESTIMATORS
 from optics.backend import load_backend
 from scenes.course import moment
 from scenes.resolved import ResolvedJob, resolve
+from scenes.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.cli import (
     BACKEND_HELP,
-    FAILURE,
     LARGEST_SEED,
     check_backend,
     exit_on_terminate,
     explained,
-    print_error,
     print_place,
     print_whole,
     progress_columns,
@@ -37,8 +34,8 @@ from twin.output import write_run
 from twin.picture import write_pictures
 from twin.picture_light import PictureError
 from twin.render_job import STAGES, render_job
-from twin.results import RenderRun
-from twin.run_folder import RunFolder, next_free
+from twin.results import RenderRun, stated
+from twin.run_folder import RunFolder, chosen
 from twin.target_images import PLACES
 from twin.target_result import EdgeReading, TargetRun
 
@@ -128,16 +125,15 @@ def main(
     with explained(errors):
         check_backend(backend)
         resolved = resolve(job)
-        folder = RunFolder(out if out is not None else next_free(Path("runs"), job.stem), force)
+        folder = RunFolder(chosen(out, job.stem), force)
         run, problem = _run(folder, resolved, backend, frames, seed, picture, silent=as_json or quiet, errors=errors)
-    if as_json:
-        course = {"course": run.course.to_dict()} if run.course is not None else {}
-        mtf = {"mtf": run.targets.to_dict()} if run.targets is not None else {}
-        result = {"truth": run.truth_dict(), "recovered": run.recovered_dict(), **course, **mtf}
-        json.dump(result, sys.stdout, allow_nan=False)
-        sys.stdout.write("\n")
-    elif not quiet:
-        _print_result(run, folder.target)
+    with to_stdout(errors, f"the run is complete in {folder.target}"):
+        if as_json:
+            course = {"course": run.course.to_dict()} if run.course is not None else {}
+            mtf = {"mtf": run.targets.to_dict()} if run.targets is not None else {}
+            print_json({"truth": run.truth_dict(), "recovered": stated(run.recovered_dict()), **course, **mtf})
+        elif not quiet:
+            _print_result(run, folder.target)
     if problem:
         print_error(errors, f"the pictures are not complete: {problem}; all else is in {folder.target}")
         raise typer.Exit(FAILURE)
@@ -193,7 +189,7 @@ def _run(
 def _print_result(run: RenderRun, target: Path) -> None:
     """Result table and where to look next."""
     table = _table(run)
-    console = Console()
+    console = Terminal()
     print_whole(console, table)
     if run.targets is not None:
         lines = _mtf_table(run.targets)

@@ -16,6 +16,7 @@ from twin.study.plan import Plan
 from twin.study.render_base import BLOCK
 from twin.study.setup import resolve_study
 from twin.study.task import Task, evaluate
+from twin.versions import source_digest
 
 RUNS, QUICK_RUNS = 1825, 125
 OVERHEAD_MS = 1.0
@@ -36,7 +37,7 @@ def run_engine(folder: Path, plan: Plan, workers: Workers, chunk_blocks: int = 4
 
 def warm(workers: Workers, plan: Plan, count: int) -> None:
     """Let every worker build the instrument and compile before anything is timed."""
-    task = Task(plan.setup.to_yaml(), "llvm", 0, (tuple(next(plan.runs_of(range(1)))),))
+    task = Task(plan.setup.to_yaml(), source_digest(), "llvm", 0, (tuple(next(plan.runs_of(range(1)))),))
     for future in [
         workers.client.submit(evaluate, task, workers=[address], pure=False)
         for address in workers.client.scheduler_info(n_workers=-1)["workers"]

@@ -263,6 +263,9 @@ def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
 def test_force_replaces_a_run(ready, tmp_path):
     assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet").exit_code == 0
     (tmp_path / "run/note.txt").touch()
+    complains(run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force"), "did not write: note.txt", "--out")
+    assert files(tmp_path / "run") == {*FILES, "note.txt"}
+    (tmp_path / "run/note.txt").unlink()
     assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet", "--force").exit_code == 0
     assert files(tmp_path / "run") == FILES
 
@@ -429,7 +432,8 @@ def test_a_missing_library_is_explained(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+    ("number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGHUP, 129), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
 )
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     process = start(EXAMPLE, "--out", tmp_path / "new/run", "--quiet")

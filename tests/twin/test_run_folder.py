@@ -3,8 +3,12 @@
 import hashlib
 import json
 import os
+import re
 import resource
+import signal
 import stat
+import subprocess
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,8 +16,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from tests.twin.study_bench import ROOT
 from twin import run_folder
-from twin.run_folder import MANIFEST, RunFolder, RunFolderError, is_run_folder, next_free
+from twin.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
+from twin.unfinished import LOCK, OLD, PARTIAL, Unfinished
+from twin.versions import versions
 
 
 def everything(folder: Path) -> set[str]:
@@ -23,8 +30,14 @@ def everything(folder: Path) -> set[str]:
 def a_run(target: Path, text: str = "first", force: bool = False) -> Path:
     with RunFolder(target, force) as folder:
         folder.write_text("a/b.txt", text)
-        folder.write_json(MANIFEST, {"program": "twin.test", "sha256": folder.checksums()})
+        write_manifest(folder)
     return target
+
+
+def write_manifest(folder: RunFolder, **other: object) -> None:
+    times = {"started_unix_s": 1.5e9, "wall_time_s": 1.0}
+    sums = folder.checksums()
+    folder.write_json(MANIFEST, {"program": "twin.test", "versions": versions(), **times, "sha256": sums, **other})
 
 
 def test_files_appear_at_the_end_and_all_at_once(tmp_path):
@@ -145,7 +158,7 @@ def test_an_existing_folder_is_kept(tmp_path):
 
 def test_force_replaces_a_run(tmp_path):
     target = a_run(tmp_path / "run")
-    (target / "old.txt").touch()
+    (target / "empty").mkdir()
     a_run(target, "second", force=True)
     assert everything(tmp_path) == {"run", "run/a", "run/a/b.txt", f"run/{MANIFEST}"}
     assert (target / "a/b.txt").read_text() == "second"
@@ -181,8 +194,65 @@ def test_force_puts_the_old_run_back_when_the_rename_fails(tmp_path, monkeypatch
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.parametrize("put", ["notes.txt", "a/notes.txt", "deep/er/notes.txt", ".hidden"])
+def test_force_keeps_what_the_run_did_not_write(tmp_path, put):
+    target = a_run(tmp_path / "run")
+    (target / put).parent.mkdir(parents=True, exist_ok=True)
+    (target / put).write_text("mine")
+    with pytest.raises(RunFolderError, match=rf"did not write: {re.escape(put)}; .*--out"):
+        RunFolder(target, force=True)
+    assert (target / put).read_text() == "mine"
+    assert (target / "a/b.txt").read_text() == "first"
+
+
+def test_force_names_a_few_of_many_files(tmp_path):
+    target = a_run(tmp_path / "run")
+    for k in range(9):
+        (target / f"note{k}").touch()
+    (target / "link").symlink_to(tmp_path)
+    with pytest.raises(RunFolderError, match=r"did not write: link, note0, note1, note2, note3 and 5 more; "):
+        RunFolder(target, force=True)
+
+
+def test_files_put_there_during_the_run_are_kept(tmp_path):
+    target = a_run(tmp_path / "run")
+    with RunFolder(target, force=True) as folder:
+        folder.write_text("new.txt", "the run's")
+        write_manifest(folder)
+        (target / "new.txt").write_text("mine")
+        (target / "sub").mkdir()
+        (target / "sub" / "late.txt").write_text("mine")
+    assert (target / "new.txt").read_text() == "the run's"
+    assert (target / "new.txt.kept").read_text() == "mine"
+    assert (target / "sub" / "late.txt").read_text() == "mine"
+    assert not (target / "a").exists()
+    assert everything(tmp_path) == {f"run/{name}" for name in everything(target)} | {"run"}
+
+
+LOOKS_LIKE = {
+    "other program": {"program": "other.tool"},
+    "no program": {"program": None},
+    "no versions": {"versions": {}},
+    "checksums of another kind": {"sha256": ["thesis.txt"]},
+    "no checksum": {"sha256": {"thesis.txt": 1}},
+    "a path that leaves": {"sha256": {"../thesis.txt": "0" * 64}},
+    "an absolute path": {"sha256": {"/thesis.txt": "0" * 64}},
+    "a text for a time": {"started_unix_s": "today"},
+}
+
+
+@pytest.mark.parametrize("wrong", LOOKS_LIKE)
+def test_a_manifest_that_is_not_ours(tmp_path, wrong):
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_text("thesis.txt", "all of it")
+        write_manifest(folder, **LOOKS_LIKE[wrong])
+    assert not is_run_folder(tmp_path / "run")
+    with pytest.raises(RunFolderError, match="is not a run folder"):
+        RunFolder(tmp_path / "run", force=True)
+
+
 @pytest.mark.parametrize(
-    "manifest", [None, "", "[]", '{"name": "a web page"}', '{"program": "other.tool", "sha256": {}}', "\xff"]
+    "manifest", [None, "", "[]", '{"name": "a web page"}', '{"program": "twin.render", "sha256": {}}', "\xff"]
 )
 def test_force_replaces_nothing_that_is_not_a_run(tmp_path, manifest):
     """Web applications and browser extensions keep a manifest.json as well."""
@@ -234,8 +304,91 @@ def test_somebody_else_takes_the_name_meanwhile(tmp_path):
     assert everything(tmp_path) == {"run", "run/theirs.txt"}
 
 
-def test_next_free(tmp_path):
-    assert next_free(tmp_path, "job") == tmp_path / "job-001"
+def test_the_next_free_number(tmp_path):
+    assert Numbered(tmp_path, "job").free() == tmp_path / "job-001"
     (tmp_path / "job-001").mkdir()
     (tmp_path / "job-002").symlink_to(tmp_path / "nowhere")
-    assert next_free(tmp_path, "job") == tmp_path / "job-003"
+    assert Numbered(tmp_path, "job").free() == tmp_path / "job-003"
+
+
+def test_runs_that_start_together_get_a_number_each(tmp_path):
+    """All see the same number free when they start; no folder is lost, not even an empty one."""
+    runs = [RunFolder(Numbered(tmp_path / "runs", "job")) for _ in range(3)]
+    assert {run.target.name for run in runs} == {"job-001"}
+    with runs[0] as first, runs[1] as second, runs[2] as third:
+        for k, run in enumerate((first, second, third)):
+            run.write_text("me.txt", str(k))
+        (tmp_path / "runs" / "job-002").mkdir()
+    assert sorted(run.target.name for run in runs) == ["job-001", "job-003", "job-004"]
+    for k, run in enumerate(runs):
+        assert (run.target / "me.txt").read_text() == str(k)
+    assert not list((tmp_path / "runs").glob(".*"))
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from twin.run_folder import RunFolder
+with RunFolder(Path(sys.argv[1]), force=True) as folder:
+    folder.write_text("half.txt", "half")
+    {act}
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def kill_a_run(target: Path, act: str = "") -> None:
+    """Another process that is killed while it makes a run folder."""
+    done = subprocess.run([sys.executable, "-c", KILLED.format(act=act), str(target)], cwd=ROOT, timeout=60)
+    assert done.returncode == -signal.SIGKILL
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
+    kill_a_run(tmp_path / "other")
+    assert {path.suffix for path in tmp_path.iterdir()} == {f".{PARTIAL}", f".{LOCK}"}
+    (tmp_path / ".other.0123abcd.partial").mkdir()  # of a version that had no locks
+    (tmp_path / ".mine.partial").mkdir()
+    (tmp_path / ".mine.01234567.partial").touch()
+    a_run(tmp_path / "run")
+    assert {path.name for path in tmp_path.iterdir()} == {"run", ".mine.partial", ".mine.01234567.partial"}
+
+
+def test_what_a_living_run_has_is_left_alone(tmp_path):
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_text("a.txt", "mine")
+        a_run(tmp_path / "other")
+        # another process sees the lock as well
+        code = "import sys; from pathlib import Path; from twin.run_folder import RunFolder\n"
+        code += "with RunFolder(Path(sys.argv[1])) as f: f.write_text('x', 'y')"
+        subprocess.run([sys.executable, "-c", code, str(tmp_path / "third")], cwd=ROOT, timeout=60, check=True)
+    assert (tmp_path / "run" / "a.txt").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "other", "third"}
+
+
+AWAY = "os.rename(folder.target, folder._unfinished.path('old'))"
+
+
+def test_a_run_that_was_being_replaced_is_put_back(tmp_path):
+    """Killed between the two renames: the old folder stands under its hidden name, none under its own."""
+    target = a_run(tmp_path / "run")
+    kill_a_run(target, AWAY)
+    assert not target.exists()
+    with pytest.raises(RunFolderError, match="exists"):
+        a_run(target, "second")
+    assert (target / "a/b.txt").read_text() == "first"
+    assert {path.name for path in tmp_path.iterdir()} == {"run"}
+
+
+def test_a_run_that_was_replaced_is_removed(tmp_path):
+    """Killed between the second rename and the removal; a file that was put there meanwhile is kept."""
+    target = a_run(tmp_path / "run", "new")
+    left = Unfinished(target)
+    old = a_run(tmp_path / "old", "old")
+    (old / "late.txt").write_text("mine")
+    os.rename(old, left.path(OLD))
+    a_run(tmp_path / "while it lives")
+    assert left.path(OLD).exists()
+    left._lock.close()
+    a_run(tmp_path / "afterwards")
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "while it lives", "afterwards"}
+    assert (target / "a/b.txt").read_text() == "new"
+    assert (target / "late.txt").read_text() == "mine"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,7 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from twin.cli import BACKEND_HELP, FAILURE, explained, print_error, print_place, print_whole
+from scenes.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from twin.cli import BACKEND_HELP, explained, print_place, print_whole
 from twin.study.cluster import ClusterError
 from twin.study.command import Broken, StudyOptions, StudyRun, run_study
 from twin.study.engine import Estimate, IncompleteError
@@ -38,7 +37,12 @@ def main(
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="Use a running Dask cluster: tcp://host:8786. Its workers need the twin installed."),
+        typer.Option(
+            help="Use a running Dask cluster, tls://host:8786 or tcp://host:8786. Its workers need the twin installed. "
+            "Over tcp:// everybody who reaches its ports can run programs there: use it in a network of your own only. "
+            "For tls:// name the certificates to scheduler, workers and this command by DASK_DISTRIBUTED__COMM__TLS "
+            "variables, see docs/studies.md."
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the folder if it exists.")] = False,
@@ -65,7 +69,7 @@ def main(
     With --gradient it runs no design: the folder gets the Jacobian at the base's own values, gradient.json and
     gradient.csv, by automatic differentiation and beside it by differences.
 
-    Exit codes: 0 success, 2 bad input (nothing is lost), 130 or 143 interrupted, 1 anything else.
+    Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else.
     """
     errors = Console(stderr=True)
     options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
@@ -87,11 +91,11 @@ def main(
         except OSError as error:
             print_error(errors, f"{error.strerror or error}{_how_to_go_on(file, place)}")
             raise typer.Exit(FAILURE) from None
-    if as_json:
-        json.dump(run.numbers, sys.stdout, allow_nan=False)
-        sys.stdout.write("\n")
-    elif not quiet:
-        _print_result(run)
+    with to_stdout(errors, f"the study is complete in {run.folder}"):
+        if as_json:
+            print_json(run.numbers)
+        elif not quiet:
+            _print_result(run)
 
 
 def _differentiate(file: Path, options: StudyOptions, errors: Console, as_json: bool, quiet: bool) -> None:
@@ -108,14 +112,14 @@ def _differentiate(file: Path, options: StudyOptions, errors: Console, as_json: 
         except OSError as error:
             print_error(errors, error.strerror or str(error))
             raise typer.Exit(FAILURE) from None
-    if as_json:
-        json.dump(run.numbers, sys.stdout, allow_nan=False)
-        sys.stdout.write("\n")
-    elif not quiet:
-        console = Console()
-        for table in terminal_tables(run.gradient):
-            print_whole(console, table)
-        print_place(console, run.folder)
+    with to_stdout(errors, f"the gradient is complete in {run.folder}"):
+        if as_json:
+            print_json(run.numbers)
+        elif not quiet:
+            console = Terminal()
+            for table in terminal_tables(run.gradient):
+                print_whole(console, table)
+            print_place(console, run.folder)
 
 
 def _how_to_go_on(file: Path, place: list[Path]) -> str:
@@ -201,7 +205,7 @@ def _print_result(run: StudyRun) -> None:
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():
         table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
-    console = Console()
+    console = Terminal()
     print_whole(console, table)
     print_place(console, run.folder)
 

@@ -6,44 +6,55 @@ when the power failed is seen and left out. Whatever is not listed is not there.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
 import os
-from dataclasses import dataclass
+import stat
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Self
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from twin.study.block_result import BlockResult
 from twin.study.plan import Plan
 from twin.study.safe_file import PARTIAL, write_safely
 
 FOLDER, INDEX = "chunks", "index.txt"
+PARTS = ("values", "sigmas", "messages", "seconds", "blocks")
+"""Arrays in the file of a chunk."""
 
 
 class ChunkError(Exception):
     """A chunk file does not hold what was written."""
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(BaseModel):
     """A listed chunk.
 
     Attributes:
-        file: name in the folder.
+        file: name in the folder; it follows from ``first``.
         first: number of its first block.
         blocks: number of blocks.
         runs: number of runs.
         sha256: of the file.
     """
 
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
     file: str
-    first: int
-    blocks: int
-    runs: int
-    sha256: str
+    first: Annotated[int, Field(ge=0)]
+    blocks: Annotated[int, Field(ge=1)]
+    runs: Annotated[int, Field(ge=1)]
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+    @model_validator(mode="after")
+    def _named(self) -> Self:
+        if self.file != _file(self.first):
+            raise ValueError(f"the chunk from block {self.first} on is not in {self.file!r}")
+        return self
 
     @property
     def range(self) -> range:
@@ -57,6 +68,10 @@ class ChunkStore:
     Args:
         folder: of the study.
         plan: of the study.
+
+    Attributes:
+        entries: chunks that are there, by their first blocks.
+        corrupt: what was found damaged when the folder was opened, and what becomes of it, a sentence each.
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
@@ -66,7 +81,7 @@ class ChunkStore:
         self.corrupt: list[str] = []
 
     def open(self) -> None:
-        """Read the index and check every chunk in it; corrupt ones are moved aside, their names kept in ``corrupt``."""
+        """Read the index and check every chunk in it; corrupt ones are moved aside and told in ``corrupt``."""
         self.folder.mkdir(parents=True, exist_ok=True)
         for left in self.folder.glob(f"*{PARTIAL}"):
             left.unlink(missing_ok=True)
@@ -113,9 +128,15 @@ class ChunkStore:
         """
         whole = BlockResult.joined(parts)
         content = _packed(first, len(parts), whole)
-        name = f"{first:05d}.npz"
+        name = _file(first)
         write_safely(self.folder / name, content)
-        entry = Entry(name, first, len(parts), len(whole.messages), hashlib.sha256(content).hexdigest())
+        entry = Entry(
+            file=name,
+            first=first,
+            blocks=len(parts),
+            runs=len(whole.messages),
+            sha256=hashlib.sha256(content).hexdigest(),
+        )
         with (self.folder / INDEX).open("ab") as index:
             index.write(_line(entry))
             index.flush()
@@ -129,19 +150,16 @@ class ChunkStore:
             ChunkError: not what was written.
         """
         try:
-            content = (self.folder / entry.file).read_bytes()
+            content = _content(self.folder / entry.file)
         except OSError as error:
             raise ChunkError(f"{entry.file}: {error.strerror}") from error
         if hashlib.sha256(content).hexdigest() != entry.sha256:
             raise ChunkError(f"{entry.file}: its checksum is wrong")
         runs = [number for block in entry.range for number in self.plan.block(block)]
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            result = BlockResult(
-                file["values"], file["sigmas"], tuple(json.loads(file["messages"].tobytes())), float(file["seconds"])
-            )
-        if len(result.messages) != len(runs):
-            raise ChunkError(f"{entry.file}: {len(result.messages)} runs instead of {len(runs)}")
-        return result
+        try:
+            return _unpacked(content, entry, (len(runs), len(self.plan.setup.study.responses)))
+        except Exception as error:  # whatever a doctored file makes of the libraries
+            raise ChunkError(f"{entry.file}: {error}") from error
 
     def result(self) -> BlockResult:
         """Results of all runs, in order; all blocks must be there.
@@ -154,10 +172,13 @@ class ChunkStore:
     def _listed(self) -> list[Entry]:
         """Entries of the index, the last one for each file; lines that are not whole are left out."""
         entries: dict[int, Entry] = {}
-        for line in self._index_lines():
+        content = self._index()
+        for number, line in enumerate(content.splitlines(keepends=True), 1):
             entry = _entry(line)
-            if entry is not None and entry.first + entry.blocks <= self.plan.blocks:
+            if entry is not None and self._fits(entry):
                 entries[entry.first] = entry
+            elif line.endswith(b"\n"):  # else it was being written when the power failed
+                self.corrupt.append(f"line {number} of {INDEX} is corrupt; what it listed is computed again")
         taken: set[int] = set()
         out = []
         for entry in entries.values():
@@ -166,21 +187,28 @@ class ChunkStore:
                 out.append(entry)
         return out
 
-    def _index_lines(self) -> list[bytes]:
+    def _fits(self, entry: Entry) -> bool:
+        """Whether a chunk is one of this plan's."""
+        if entry.range.stop > self.plan.blocks:
+            return False
+        return entry.runs == sum(len(self.plan.block(block)) for block in entry.range)
+
+    def _index(self) -> bytes:
         try:
-            return (self.folder / INDEX).read_bytes().splitlines()
+            return _content(self.folder / INDEX)
         except FileNotFoundError:
-            return []
+            return b""
 
     def _index_is_damaged(self, listed: list[Entry]) -> bool:
-        content = (self.folder / INDEX).read_bytes() if (self.folder / INDEX).exists() else b""
-        return content != b"".join(_line(entry) for entry in listed)
+        return self._index() != b"".join(_line(entry) for entry in listed)
 
     def _set_aside(self, entry: Entry) -> None:
         place = self.folder / entry.file
-        self.corrupt.append(entry.file)
-        if place.exists():
+        text = "it is computed again"
+        if place.exists() or place.is_symlink():
             place.replace(place.with_name(f"{entry.file}.corrupt"))
+            text = f"it was moved aside as {entry.file}.corrupt and is computed again"
+        self.corrupt.append(f"chunk {entry.file} is corrupt; {text}")
 
     def _rewrite_index(self) -> None:
         write_safely(self.folder / INDEX, b"".join(_line(entry) for entry in self.entries.values()))
@@ -200,14 +228,56 @@ def _packed(first: int, blocks: int, result: BlockResult) -> bytes:
     return out.getvalue()
 
 
+def _unpacked(content: bytes, entry: Entry, shape: tuple[int, int]) -> BlockResult:
+    """The inverse of ``_packed``.
+
+    Raises:
+        ValueError, KeyError, zipfile.BadZipFile, ...: it is not its output for runs and responses of this shape.
+    """
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        packed = {name: file[name] for name in PARTS}
+    for name in ("values", "sigmas"):
+        if packed[name].dtype != np.float64 or packed[name].shape != shape:
+            raise ValueError(f"{name} are {packed[name].dtype} {packed[name].shape} instead of float64 {shape}")
+    if packed["blocks"].tolist() != [entry.first, entry.blocks]:
+        raise ValueError("it is of other blocks")
+    messages = json.loads(packed["messages"].tobytes())
+    if not (isinstance(messages, list) and len(messages) == shape[0] and all(isinstance(m, str) for m in messages)):
+        raise ValueError("it has not one message for each run")
+    seconds = packed["seconds"]
+    if seconds.dtype != np.float64 or seconds.shape != () or not seconds >= 0.0:
+        raise ValueError("it does not say how long it took")
+    return BlockResult(packed["values"], packed["sigmas"], tuple(messages), float(seconds))
+
+
+def _content(place: Path) -> bytes:
+    """A file's content; no link is followed, out of the folder for instance, and nothing waited for.
+
+    Raises:
+        OSError: it is not there, or no file.
+    """
+    with open(os.open(place, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "not a file", str(place))
+        return file.read()
+
+
+def _file(first: int) -> str:
+    """Name of the chunk that begins with this block."""
+    return f"{first:05d}.npz"
+
+
 def _line(entry: Entry) -> bytes:
-    text = json.dumps(vars(entry), sort_keys=True)
+    text = json.dumps(entry.model_dump(), sort_keys=True)
     return f"{hashlib.sha256(text.encode()).hexdigest()[:16]} {text}\n".encode()
 
 
 def _entry(line: bytes) -> Entry | None:
-    check, _, text = line.partition(b" ")
+    """The entry of a line of the index, None when it is not one that this program writes."""
+    check, _, text = line.removesuffix(b"\n").partition(b" ")
     if hashlib.sha256(text).hexdigest()[:16].encode() != check:
         return None
-    data: dict[str, Any] = json.loads(text)
-    return Entry(**data)
+    try:
+        return Entry.model_validate_json(text)
+    except ValidationError:
+        return None

@@ -18,10 +18,11 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster
 from distributed.scheduler import KilledWorker
+from distributed.security import Security
 
 from twin.cli import InputErrorText
 from twin.study.task import ONE_THREAD
-from twin.versions import versions
+from twin.versions import source_digest, versions
 
 REACH_SECONDS = 5.0
 """How long a scheduler may take to answer before the user is told that it does not."""
@@ -99,13 +100,20 @@ def killed(error: BaseException) -> bool:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Workers]:
-    """Worker processes on this machine with one thread each; they, and what they leave on disk, end with the block."""
+    """Worker processes on this machine with one thread each; they, and what they leave on disk, end with the block.
+
+    Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
+    So all speak TLS with a key that is made for the study and kept in memory, and a peer without it is refused.
+    """
     place = Path(tempfile.mkdtemp(prefix="twin-study-"))
     settings = {
         # set before the processes start: NumPy reads them when it is imported
         "distributed.nanny.pre-spawn-environ": {**ONE_THREAD},
         "distributed.scheduler.allowed-failures": RETRIES,
         # what is computed is small and handed over at once; a worker is never to wait for memory
+        # nothing is told by HTTP, neither about the scheduler nor about the workers
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
@@ -126,6 +134,8 @@ def local_workers(count: int) -> Iterator[Workers]:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
+                protocol="tls",
+                security=Security.temporary(),
                 # no dashboard; the port for it cannot be left out, so it is a free one, seen by this machine only
                 dashboard_address="127.0.0.1:0",
                 worker_dashboard_address="127.0.0.1:0",
@@ -160,7 +170,8 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
     """Workers of a running cluster.
 
     Args:
-        address: of its scheduler, ``tcp://host:port``.
+        address: of its scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS Dask is told the certificates by
+            its own configuration, ``distributed.comm.tls``.
         tell: told that there are no workers yet.
 
     Raises:
@@ -168,7 +179,7 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
         ClusterError: it has no workers.
     """
     if not address.startswith(SCHEMES):
-        raise InputErrorText(f"--scheduler {address}: not an address; write it as tcp://host:8786")
+        raise InputErrorText(f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786")
     _silence()
     settings = {
         "distributed.comm.timeouts.connect": f"{REACH_SECONDS}s",
@@ -209,24 +220,32 @@ def _differences(client: Client) -> list[str]:
     """Versions of the workers that differ from ours: their numbers may differ in the last digits, or more.
 
     Raises:
-        InputErrorText: they cannot import the twin.
+        InputErrorText: they cannot import the twin, or have another one.
     """
     try:
-        theirs = client.run(versions, on_error="return")
+        theirs = client.run(_program, on_error="return")
     except Exception as error:
         raise ClusterError(f"the workers do not answer: {error}") from error
-    ours = versions()
+    ours, source = _program()
     out = []
     for address, found in theirs.items():
         if isinstance(found, BaseException):
             text = f"the worker {address} cannot import the twin ({found}); start it from the twin's environment"
             raise InputErrorText(text)
+        if found[1] != source:
+            text = f"the worker {address} has other source files of the twin than this command; install the same there"
+            raise InputErrorText(text)
         different = [
-            f"{name} {found.get(name)} instead of {own}" for name, own in ours.items() if found.get(name) != own
+            f"{name} {found[0].get(name)} instead of {own}" for name, own in ours.items() if found[0].get(name) != own
         ]
         if different:
             out.append(f"the worker {address} has other versions: {', '.join(different)}")
     return out
+
+
+def _program() -> tuple[dict[str, str], str]:
+    """Versions of the packages, checksum of the program's own source files."""
+    return versions(), source_digest()
 
 
 def _silence() -> None:

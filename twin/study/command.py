@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from optics.threads import cores
-from twin.cli import INTERRUPTED, TERMINATED, InputErrorText, check_backend
-from twin.run_folder import RunFolderError, next_free
+from twin.cli import InputErrorText, check_backend, ending_signals
+from twin.run_folder import RunFolderError, chosen
 from twin.study.chunk_store import ChunkStore
 from twin.study.cluster import LEAST_MEMORY, Workers, local_workers, remote_workers
 from twin.study.engine import Engine, Progress, fit_workers
@@ -53,9 +53,9 @@ class Broken(Exception):
         code: exit code.
     """
 
-    def __init__(self, code: int) -> None:
-        super().__init__("interrupted" if code == INTERRUPTED else "terminated")
-        self.code = code
+    def __init__(self, number: int) -> None:
+        super().__init__("interrupted" if number == signal.SIGINT else "terminated")
+        self.code = 128 + number
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def run_study(
     Raises:
         InputError, InputErrorText, RunFolderError: bad input; nothing that was there is lost.
         IncompleteError, ClusterError: not all runs could be done; the others stay for --resume.
-        Broken: SIGINT or SIGTERM; what is done stays.
+        Broken: SIGINT, SIGTERM or SIGHUP; what is done stays.
     """
     check_backend(options.backend)
     if options.workers is not None and options.scheduler is not None:
@@ -110,17 +110,16 @@ def run_study(
 
     progress.warn = remember
     started = time.time()
-    path = options.out if options.out is not None else next_free(Path("runs"), file.stem)
     with broken_by_signals():
         # a scheduler that cannot be reached is told before anything is written
         with (
             _workers(options, setup, remember) as start,
-            StudyFolder(path, setup, options.resume, options.force) as folder,
+            StudyFolder(chosen(options.out, file.stem), setup, options.resume, options.force) as folder,
         ):
             store = ChunkStore(folder.path, plan)
             store.open()
-            for name in store.corrupt:
-                remember(f"chunk {name} is corrupt; it was moved aside as {name}.corrupt and is computed again")
+            for text in store.corrupt:
+                remember(text)
             opened(folder.path)
             engine = Engine(plan, store, options.backend, progress)
             count = 0
@@ -137,7 +136,7 @@ def run_study(
 
             facts = StudyFacts(options.backend, started, engine.seconds, engine.computed, count, tuple(warnings))
             numbers = write_study(plan, store.result(), facts, folder)
-    return StudyRun(numbers, path, plan, tuple(warnings))
+    return StudyRun(numbers, folder.path, plan, tuple(warnings))
 
 
 def _check_size(setup: StudySetup, confirmed: bool) -> None:
@@ -179,7 +178,7 @@ def _own_memory() -> float:
 
 @contextmanager
 def broken_by_signals() -> Iterator[None]:
-    """Let SIGTERM and Ctrl-C end the block as Broken, whatever the libraries in between make of them."""
+    """Let SIGTERM, SIGHUP and Ctrl-C end the block as Broken, whatever the libraries in between make of them."""
     got: list[int] = []
 
     def leave(number: int, frame: object) -> None:
@@ -187,7 +186,7 @@ def broken_by_signals() -> Iterator[None]:
             got.append(number)
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGINT)}
+    before = {number: signal.signal(number, leave) for number in (*ending_signals(), signal.SIGINT)}
     try:
         yield
     except BaseException:
@@ -197,7 +196,7 @@ def broken_by_signals() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
     if got:
-        raise Broken(INTERRUPTED if got[0] == signal.SIGINT else TERMINATED)
+        raise Broken(got[0])
 
 
 __all__ = ["Broken", "RunFolderError", "StudyOptions", "StudyRun", "run_study"]

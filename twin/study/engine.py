@@ -15,6 +15,7 @@ from twin.study.cluster import ClusterError, Workers, killed
 from twin.study.plan import Plan
 from twin.study.setup import StudySetup
 from twin.study.task import Pilot, Task, evaluate, pilot
+from twin.versions import source_digest
 
 CHUNK_SECONDS = 6.0
 """How long a worker is to be busy with a chunk: what is lost when it dies, against what handing over costs."""
@@ -182,7 +183,13 @@ class Engine:
             raise IncompleteError(f"not computed: {_runs_text(bad)} ({'; '.join(reasons)})")
 
     def _task(self, config: str, blocks: range) -> Task:
-        return Task(config, self.backend, blocks.start, tuple(tuple(runs) for runs in self.plan.runs_of(blocks)))
+        return Task(
+            config,
+            source_digest(),
+            self.backend,
+            blocks.start,
+            tuple(tuple(runs) for runs in self.plan.runs_of(blocks)),
+        )
 
 
 def check_responses(setup: StudySetup, sample: Any) -> None:

@@ -6,21 +6,73 @@ import fcntl
 import hashlib
 import json
 import os
-import secrets
-import shutil
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any, Literal, TextIO
 
-from twin.run_folder import MANIFEST, RunFolderError, is_run_folder
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from twin.run_folder import (
+    MANIFEST,
+    NAMED,
+    STUDY_LOCK,
+    STUDY_STATE,
+    Numbered,
+    RunFolderError,
+    refuse_others,
+    remove_replaced,
+    remove_run,
+    remove_study,
+    unlisted,
+)
 from twin.study.chunk_store import FOLDER, INDEX
 from twin.study.safe_file import write_safely
 from twin.study.setup import StudySetup
+from twin.unfinished import OLD, Unfinished, sweep
+from twin.versions import sources, versions
 
-IDENTITY = "study_state.json"
-"""Says which study a folder belongs to, from the beginning; the manifest is written at the end."""
-LOCK = ".lock"
 PROGRAM = "twin.study"
+
+
+class StudyState(BaseModel):
+    """What the folder of a study says of it from its beginning.
+
+    Attributes:
+        program: PROGRAM.
+        name: of the study.
+        fingerprint: of all that its numbers depend on.
+        content: of these, its factors, design and base.
+        versions: of the packages that compute.
+        sources: source files of the program that computes -> checksum.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True)
+
+    program: Literal["twin.study"]
+    name: str
+    fingerprint: str
+    content: str
+    versions: dict[str, str]
+    sources: dict[str, str]
+
+    @classmethod
+    def of(cls, setup: StudySetup) -> StudyState:
+        """Of a study run by this program."""
+        return cls(
+            program="twin.study",
+            name=setup.study.name,
+            fingerprint=setup.fingerprint,
+            content=setup.content,
+            versions=versions(),
+            sources=sources(),
+        )
+
+
+def _differences(before: Mapping[str, str], now: Mapping[str, str], told: Callable[[str, str, str], str]) -> list[str]:
+    names = sorted({*before, *now})
+    pairs = [(name, before.get(name, "not there"), now.get(name, "not there")) for name in names]
+    return [told(name, old, new) for name, old, new in pairs if old != new]
 
 
 class StudyFolder:
@@ -30,35 +82,41 @@ class StudyFolder:
     with the process, however it ends.
 
     Args:
-        path: of the folder.
+        path: of the folder. Of several studies that start together with the same ``Numbered``, each gets a number of
+            its own.
         setup: the study.
         resume: go on with what is there.
         force: replace what is there.
 
     Raises:
-        RunFolderError: on entering; the folder exists, belongs to another study or to a running command, or cannot be
-            made.
+        RunFolderError: on entering; the folder exists, belongs to another study or to a running command, holds files
+            that it is not to lose, or cannot be made.
     """
 
-    def __init__(self, path: Path, setup: StudySetup, resume: bool = False, force: bool = False) -> None:
-        self.path, self.setup, self.resume, self.force = path, setup, resume, force
+    def __init__(self, path: Path | Numbered, setup: StudySetup, resume: bool = False, force: bool = False) -> None:
+        self._numbered = path if isinstance(path, Numbered) else None
+        self.path = path.free() if isinstance(path, Numbered) else path
+        self.setup, self.resume, self.force = setup, resume, force
         self._locks: list[TextIO] = []
-        self._aside: Path | None = None
+        self._aside: Unfinished | None = None
         self._fresh = False
 
     def __enter__(self) -> StudyFolder:
         """Make the folder or take it up, and lock it."""
         try:
-            self._check()
-            if self.path.exists():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            sweep(self.path.parent, remove_replaced)
+            if self._numbered is None:
+                self._check()
+            if self._numbered is None and self.path.exists():
                 self._take_lock()
                 if self.force and not self.resume:
-                    self._aside = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}.old")
-                    self.path.rename(self._aside)
-            if not self.path.exists():
-                self.path.mkdir(parents=True)
+                    self._aside = Unfinished(self.path)
+                    self.path.rename(self._aside.path(OLD))
+            if self._numbered is not None or not self.path.exists():
+                self._make()
                 self._take_lock()
-            if (self.path / IDENTITY).exists():
+            if (self.path / STUDY_STATE).exists():
                 self._check_identity()
             else:
                 self._fresh = True
@@ -78,13 +136,19 @@ class StudyFolder:
         self._leave()
 
     def _leave(self) -> None:
-        if self._fresh and not (self.path / FOLDER / INDEX).exists() and not self.complete:
-            shutil.rmtree(self.path, ignore_errors=True)
-            if self._aside is not None:
-                self._aside.rename(self.path)
-        elif self._aside is not None:
-            shutil.rmtree(self._aside, ignore_errors=True)
-        self._aside = None
+        nothing_done = self._fresh and not (self.path / FOLDER / INDEX).exists() and not self.complete
+        if nothing_done:
+            remove_study(self.path)
+        if self._aside is not None:
+            old = self._aside.path(OLD)
+            if old.exists() and self.path.exists() and not nothing_done:
+                remove_run(old, self.path)
+            elif old.exists():
+                if self.path.exists():  # what somebody put there meanwhile
+                    remove_run(self.path, old)
+                old.rename(self.path)
+            self._aside.close()
+            self._aside = None
         for lock in self._locks:
             lock.close()
         self._locks = []
@@ -99,25 +163,38 @@ class StudyFolder:
             return
         if not self.path.is_dir():
             raise RunFolderError(f"output {self.path} exists and is not a folder; choose another with --out")
-        if not any(path.name != LOCK for path in self.path.iterdir()):
+        if not any(path.name != STUDY_LOCK for path in self.path.iterdir()):
             return
-        ours = (self.path / IDENTITY).exists() or is_run_folder(self.path)
+        others = unlisted(self.path)
         if self.resume:
-            if not (self.path / IDENTITY).exists():
+            if not (self.path / STUDY_STATE).exists():
                 raise RunFolderError(f"{self.path} is not the folder of a study, so there is nothing to resume")
         elif not self.force:
-            also = ", go on with it with --resume," if (self.path / IDENTITY).exists() else ""
+            also = ", go on with it with --resume," if (self.path / STUDY_STATE).exists() else ""
             raise RunFolderError(
                 f"output folder {self.path} exists; choose another with --out{also} or replace it with --force"
             )
-        elif not ours:
+        elif others is None:
             raise RunFolderError(
                 f"output folder {self.path} is not the folder of a study or run, so --force does not replace it; "
                 "choose another with --out"
             )
+        else:
+            refuse_others(self.path, others)
+
+    def _make(self) -> None:
+        """Make the folder; of several commands only one can."""
+        while True:
+            try:
+                self.path.mkdir()
+                return
+            except FileExistsError:
+                if self._numbered is None:
+                    raise
+                self.path = self._numbered.free()
 
     def _take_lock(self) -> None:
-        lock = (self.path / LOCK).open("a+", encoding="utf-8")
+        lock = (self.path / STUDY_LOCK).open("a+", encoding="utf-8")
         self._locks.append(lock)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -125,20 +202,31 @@ class StudyFolder:
             raise RunFolderError(f"another command is working in {self.path}; wait until it has ended") from None
 
     def _check_identity(self) -> None:
+        """Refuse to go on with what another study, or another program, has begun: their numbers do not mix."""
         try:
-            found = json.loads((self.path / IDENTITY).read_text("utf-8"))["fingerprint"]
-        except (ValueError, KeyError, TypeError):
-            raise RunFolderError(f"{self.path / IDENTITY} cannot be read; start again with --force") from None
-        if found != self.setup.fingerprint:
+            found = StudyState.model_validate_json((self.path / STUDY_STATE).read_bytes())
+        except ValidationError:
+            text = f"{self.path / STUDY_STATE} cannot be read, or is of an older version; start again with --force"
+            raise RunFolderError(text) from None
+        own = StudyState.of(self.setup)
+        remedy = "start again in another folder with --out, or replace this one with --force"
+        if found.content != own.content:
+            text = f"{self.path} holds another study: its factors, design or base differ; {remedy}"
+            raise RunFolderError(text)
+        changed = [
+            *_differences(found.versions, own.versions, lambda name, old, new: f"{name} was {old} and is {new}"),
+            *_differences(found.sources, own.sources, lambda name, old, new: name),
+        ]
+        if changed or found.fingerprint != own.fingerprint:
+            named = ", ".join(changed[:NAMED]) + (f" and {len(changed) - NAMED} more" if len(changed) > NAMED else "")
             raise RunFolderError(
-                f"{self.path} holds another study: its factors, design, base or the program's versions differ; "
-                "choose another folder with --out, or replace it with --force"
+                f"{self.path} was begun with another version of the program, whose numbers would stand beside new ones "
+                f"(changed: {named}); go on with the program as it was, or {remedy}"
             )
 
     def _begin(self) -> None:
         self.write("config.yaml", self.setup.to_yaml().encode())
-        facts = {"program": PROGRAM, "name": self.setup.study.name, "fingerprint": self.setup.fingerprint}
-        self.write(IDENTITY, (json.dumps(facts, indent=2) + "\n").encode())
+        self.write(STUDY_STATE, (StudyState.of(self.setup).model_dump_json(indent=2) + "\n").encode())
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file so that under its name it is whole or not there."""

@@ -11,7 +11,7 @@ from typing import Any
 from optics.backend import load_backend
 from twin.artefact import Artefact, SvgFigure
 from twin.cli import InputErrorText, check_backend
-from twin.run_folder import MANIFEST, RunFolder, next_free
+from twin.run_folder import MANIFEST, RunFolder, chosen
 from twin.study.command import StudyOptions, broken_by_signals
 from twin.study.folder import PROGRAM
 from twin.study.gradient import AD, Gradient, study_gradient
@@ -46,7 +46,7 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
 
     Raises:
         InputError, InputErrorText, RunFolderError: bad input; nothing that was there is lost.
-        Broken: SIGINT or SIGTERM; nothing is kept.
+        Broken: SIGINT, SIGTERM or SIGHUP; nothing is kept.
     """
     check_backend(options.backend)
     for given, name in (
@@ -58,9 +58,8 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
         if given:
             raise InputErrorText(f"--gradient differentiates at the base in this process, so {name} has no meaning")
     setup = resolve_study(file)
-    target = options.out if options.out is not None else next_free(Path("runs"), f"{file.stem}-gradient")
     started, began = time.time(), time.perf_counter()
-    with broken_by_signals(), RunFolder(target, options.force) as folder:
+    with broken_by_signals(), RunFolder(chosen(options.out, f"{file.stem}-gradient"), options.force) as folder:
         found = study_gradient(setup, load_backend(options.backend), advance)
         advance("writing the report")
         from twin.study.gradient_table import plain_data, whole_table
@@ -81,7 +80,7 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
             "sha256": folder.checksums(),
         }
         folder.write_json(MANIFEST, manifest)
-    return GradientRun(found, numbers, target)
+    return GradientRun(found, numbers, folder.target)
 
 
 def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None:

@@ -23,7 +23,7 @@ from scenes.translate import validate
 from scenes.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
 from twin.study.base_job import BaseJob, base_job
 from twin.study.config_tree import Tree, with_place, with_values
-from twin.versions import versions
+from twin.versions import source_digest, versions
 
 WHERE = {"render": EXAMPLES, "lab": LIBRARY / LAB, "orbit": LIBRARY / ORBIT}
 """First word of a base's command -> folder of the library with its files."""
@@ -53,12 +53,19 @@ class StudySetup:
         return dump_yaml({"study": self.study.plain(), "base": self.tree})
 
     @cached_property
-    def fingerprint(self) -> str:
-        """Tells studies with other numbers apart: everything that a number depends on, versions included."""
+    def content(self) -> str:
+        """Checksum of everything in the study that a number depends on; the base's tree has all library files."""
         study = {key: value for key, value in self.study.plain().items() if key not in DATA_ONLY}
         study["base"] = {"command": self.study.base.command}
-        content = json.dumps([study, self.tree, self.job.block, versions()], sort_keys=True)
+        content = json.dumps([study, self.tree, self.job.block], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Tells studies with other numbers apart: the content, the program's source files and the versions of what it
+        uses.
+        """
+        return hashlib.sha256(json.dumps([self.content, versions(), source_digest()]).encode()).hexdigest()
 
     def error(self, problem: Problem | str, key: KeyPath, allowed: str | None = None) -> InputError:
         """Something wrong at ``key`` of the study."""

@@ -16,6 +16,7 @@ from scenes.errors import InputError
 from twin.study.base_job import Failure, Run
 from twin.study.block_result import BlockResult
 from twin.study.setup import StudySetup, study_from_text
+from twin.versions import source_digest
 
 ONE_THREAD = {
     LIMIT: "1",
@@ -33,12 +34,14 @@ class Task:
 
     Attributes:
         config: text of the study's config.yaml.
+        source: checksum of the program's source files, which the worker's must have too.
         backend: where to trace.
         first: number of the first block.
         blocks: runs of each.
     """
 
     config: str
+    source: str
     backend: str
     first: int
     blocks: tuple[tuple[Run, ...], ...]
@@ -108,7 +111,13 @@ def _block(setup: StudySetup, backend: Backend, runs: Sequence[Run]) -> tuple[Bl
     return BlockResult.of(outcomes, setup.study.responses, time.monotonic() - start), sample
 
 
+class OtherProgramError(Exception):
+    """The worker does not run the program that the study was started with."""
+
+
 def _prepared(task: Task) -> tuple[StudySetup, Backend]:
+    if task.source != source_digest():
+        raise OtherProgramError("the worker has other source files than the command: changed since it was started?")
     one_thread()
     return _setup(task.config), load_backend(task.backend)
 

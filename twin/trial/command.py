@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from rich.table import Table
 
 from optics.backend import Backend, load_backend
 from scenes.errors import InputError
+from scenes.standard_output import Terminal, print_json, to_stdout
 from twin.cli import (
     BACKEND_HELP,
     LARGEST_SEED,
@@ -29,7 +28,7 @@ from twin.cli import (
     progress_columns,
 )
 from twin.report.page import cell_text
-from twin.run_folder import RunFolder, next_free
+from twin.run_folder import RunFolder, chosen
 from twin.trial.bench_error import BenchError
 from twin.trial.output import RunFacts, write_lab
 from twin.trial.result import Advance, LabResult
@@ -124,9 +123,7 @@ def run_test(
         check_backend(options.backend)
         setup = resolve(file)
         number = setup.test.seed if options.seed is None else options.seed
-        folder = RunFolder(
-            options.out if options.out is not None else next_free(Path("runs"), file.stem), options.force
-        )
+        folder = RunFolder(chosen(options.out, file.stem), options.force)
         tracer = load_backend(options.backend)
         started, clock = time.time(), time.monotonic()
         hidden = options.as_json or options.quiet or not errors.is_terminal
@@ -150,11 +147,11 @@ def run_test(
             seconds = time.monotonic() - clock
             facts = RunFacts(config, str(file), tracer.name, number, started, seconds, program, command)
             write_lab(result, facts, folder)
-    if options.as_json:
-        json.dump(dict(result.data), sys.stdout, allow_nan=False)
-        sys.stdout.write("\n")
-    elif not options.quiet:
-        _print_result(result, folder.target)
+    with to_stdout(errors, f"the run is complete in {folder.target}"):
+        if options.as_json:
+            print_json(dict(result.data))
+        elif not options.quiet:
+            _print_result(result, folder.target)
 
 
 def _explained_at(test: Any, error: BenchError) -> InputError:
@@ -172,7 +169,7 @@ def _print_result(result: LabResult, target: Path) -> None:
         table.add_column(head, justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
         table.add_row(*(cell_text(cell) for cell in row))
-    console = Console()
+    console = Terminal()
     print_whole(console, table)
     for line in result.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,112 @@
+"""Hidden names beside a folder that is being made or replaced, and what killed processes left of theirs.
+
+They are ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (what it replaces) and
+``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The lock is the operating system's and ends
+with the process, however that ends; so a name without a held lock is nobody's.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import TextIO
+
+PARTIAL, OLD, LOCK = "partial", "old", "lock"
+
+_NAME = re.compile(rf"\.(?P<name>.+)\.(?P<token>[0-9a-f]{{8}})\.(?:{PARTIAL}|{OLD}|{LOCK})")
+
+
+class Unfinished:
+    """Hidden names beside ``target`` that are this process's own until ``close``.
+
+    Args:
+        target: the folder that is being made; the one it stands in exists.
+
+    Raises:
+        OSError: nothing can be written beside it.
+    """
+
+    def __init__(self, target: Path) -> None:
+        self._target = target
+        self._token, self._lock = self._locked()
+
+    def _locked(self) -> tuple[str, TextIO]:
+        while True:
+            token = secrets.token_hex(4)
+            place = self._beside(token, LOCK)
+            lock = place.open("x", encoding="utf-8")
+            # whoever sweeps the folder between these lines takes the file for one that a killed process left
+            if _take(lock) is not False and place.exists() and os.path.samestat(os.fstat(lock.fileno()), place.stat()):
+                return token, lock
+            lock.close()
+
+    def _beside(self, token: str, ending: str) -> Path:
+        return self._target.with_name(f".{self._target.name}.{token}.{ending}")
+
+    def path(self, ending: str) -> Path:
+        """The hidden name with that ending, PARTIAL or OLD."""
+        return self._beside(self._token, ending)
+
+    def close(self) -> None:
+        """Give the names up; nothing is to stand under them any more."""
+        self._beside(self._token, LOCK).unlink(missing_ok=True)
+        self._lock.close()
+
+
+def sweep(folder: Path, replaced: Callable[[Path, Path], bool]) -> None:
+    """Clear away what dead processes left in ``folder``; what belongs to a live one is not touched.
+
+    What was half written is removed. What was to be replaced is put back when nothing has taken its place.
+
+    Args:
+        folder: where runs stand.
+        replaced: given what was to be replaced and what has its place now; removes the former, if that is right, and
+            returns whether it did.
+    """
+    try:
+        found = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
+    except OSError:  # a folder that cannot be read is told of when it is written to
+        return
+    for name, token in sorted(found):
+        places = {ending: folder / f".{name}.{token}.{ending}" for ending in (PARTIAL, OLD, LOCK)}
+        try:
+            lock = places[LOCK].open("r+", encoding="utf-8")
+        except FileNotFoundError:
+            lock = None
+        except OSError:  # somebody else's, or no file at all
+            continue
+        try:
+            if lock is None or _take(lock):
+                _clear(folder / name, places, replaced)
+        except OSError:  # not ours to remove; it stays for who may
+            pass
+        finally:
+            if lock is not None:
+                lock.close()
+
+
+def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
+    if places[PARTIAL].is_dir() and not places[PARTIAL].is_symlink():
+        shutil.rmtree(places[PARTIAL])
+    if places[OLD].is_dir() and not places[OLD].is_symlink():
+        if not (target.exists() or target.is_symlink()):
+            places[OLD].rename(target)
+        elif not replaced(places[OLD], target):
+            return
+    places[LOCK].unlink(missing_ok=True)
+
+
+def _take(lock: TextIO) -> bool | None:
+    """Lock a file: True, False when another process has it, None where the file system has no locks."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
