@@ -1,5 +1,6 @@
 """`python -m twin.study` as a user runs it: the same numbers however it is run, and what it refuses."""
 
+import asyncio
 import csv
 import hashlib
 import json
@@ -10,10 +11,15 @@ import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 import xarray as xr
+from distributed.core import rpc
+from distributed.security import Security
 
 import twin.study.__main__ as command
 from tests.twin.commands import files, invoke
@@ -122,6 +128,33 @@ def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_p
         np.testing.assert_array_equal(result.sigmas[:, 0], data["df_sigma"].values)
 
 
+def test_nobody_else_can_talk_to_the_workers(workers) -> None:
+    """Whoever may send them a task runs programs as this user: without the study's own key nobody may."""
+    facts = workers.client.scheduler_info(n_workers=-1)
+    addresses = [facts["address"]]
+    for address, worker in facts["workers"].items():
+        addresses += [address, worker["nanny"]]
+    assert len(addresses) == 5
+    for address in addresses:
+        assert address.startswith("tls://127.0.0.1:"), address
+        for security in (None, Security.temporary()):
+            plain = address.replace("tls://", "tcp://") if security is None else address
+            with pytest.raises((OSError, TimeoutError)):
+                asyncio.run(greet(plain, security))
+    # what Dask serves by HTTP has a port of its own, with nothing on it
+    ports = [facts["services"].get("dashboard", 0), *(w["services"]["dashboard"] for w in facts["workers"].values())]
+    for port in filter(None, ports):
+        for page in ("", "health", "info/main/workers.html", "metrics", "json/identity.json"):
+            with pytest.raises(HTTPError, match="404"):
+                urlopen(f"http://127.0.0.1:{port}/{page}", timeout=10)
+
+
+async def greet(address: str, security: Security | None) -> object:
+    """What a server of Dask says of itself."""
+    async with rpc(address, connection_args={} if security is None else security.get_connection_args("client")) as it:
+        return await asyncio.wait_for(it.identity(), 5)
+
+
 def test_a_corrupt_chunk_is_computed_again(done) -> None:
     """A damaged chunk, a half-written file and a torn line of the index; afterwards every byte is as it was."""
     folder, path, _ = done
@@ -228,7 +261,7 @@ def test_a_scheduler_that_is_not_there(tmp_path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     """To the whole group of processes, as the terminal's Ctrl-C is, and to the command alone, as kill is."""
     path = write_study(tmp_path / "in", ("runs: 100", "runs: 4000"))
@@ -251,26 +284,62 @@ def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     assert not (tmp_path / "run" / "study.nc").exists()
 
 
+def certificates(folder: Path) -> tuple[list[str], dict[str, str]]:
+    """Options of Dask's programs and environment of the command, with an authority and a certificate for each."""
+    key = Security.temporary()
+    files = {"ca-file": key.tls_ca_file, "cert": key.tls_client_cert, "key": key.tls_client_key}
+    for name, text in files.items():
+        (folder / f"{name}.pem").write_text(text, "utf-8")
+    place = {name: str(folder / f"{name}.pem") for name in files}
+    options = [word for name in files for word in (f"--tls-{name}", place[name])]
+    start = "DASK_DISTRIBUTED__COMM__TLS__"
+    variables = {"CA_FILE": place["ca-file"], "CLIENT__CERT": place["cert"], "CLIENT__KEY": place["key"]}
+    return options, {f"{start}{name}": value for name, value in variables.items()}
+
+
 @pytest.mark.slow
-def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_a_real_scheduler_with_two_workers(done, tmp_path, protocol) -> None:
     """As a user sets it up by hand; the numbers are those of the local processes."""
     folder, path, _ = done
+    own, client = certificates(tmp_path) if protocol == "tls" else ([], {})
     program = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     place = tmp_path / "scheduler.json"
     quiet = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(
-        [*program, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)], **quiet
+        [
+            *program,
+            "--protocol",
+            protocol,
+            *own,
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--scheduler-file",
+            str(place),
+        ],
+        **quiet,
     ) as scheduler:
         wait_for(lambda: place.exists() and place.stat().st_size > 0)
         address = json.loads(place.read_text("utf-8"))["address"]
+        assert address.startswith(f"{protocol}://")
         program = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+        program += own
         two = [
             subprocess.Popen([*program, "--local-directory", str(tmp_path), "--name", f"w{k}"], **quiet)
             for k in range(2)
         ]
         try:
-            result = run(path, "--out", tmp_path / "run", "--scheduler", address)
-            assert result.exit_code == 0, result.stderr
+            # the command reads where the certificates are when it starts
+            words = [str(path), "--out", str(tmp_path / "run"), "--scheduler", address]
+            command = [sys.executable, "-m", "twin.study", *words]
+            environment = {**os.environ, **client}
+            study = subprocess.run(
+                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
+            )
+            assert study.returncode == 0, study.stderr
             assert (tmp_path / "run" / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
         finally:
             for process in (*two, scheduler):
