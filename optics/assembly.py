@@ -78,6 +78,14 @@ class Assembly:
 
 
 def points_to_world(placed: PlacedBodies, body: str, points: np.ndarray) -> np.ndarray:
-    """Map points (P, 3) fixed in a body's frame to the world for each state: (S, P, 3), metres."""
+    """Where points of a body are in each state, world, (S, P, 3), metres; complex where ``placed`` is.
+
+    Args:
+        placed: the bodies.
+        body: its path.
+        points: of its material, named by their places on the nominal body, (P, 3), metres in its frame: they move apart
+            as the body grows. A place in space that is told in the body's frame, as a ray's hit, takes its ``pose``.
+    """
     i = placed.index[body]
-    return np.asarray(np.einsum("sij,pj->spi", placed.rotation[:, i], points) + placed.translation[:, i, None])
+    grown = placed.scale[:, i, None, None] * points
+    return np.asarray(np.einsum("sij,spj->spi", placed.rotation[:, i], grown) + placed.translation[:, i, None])

@@ -45,6 +45,14 @@ class PupilField:
         """Some of the images."""
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
+    def in_lengths_of(self, size: np.ndarray) -> PupilField:
+        """The same images in coordinates x / size, y / size: those of pixels that have grown by ``size``, (B,).
+
+        Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
+        """
+        size = np.asarray(size)[:, None]
+        return PupilField(self.u * size, self.v * size, self.eikonal, self.amplitude * size, self.wavelength)
+
     def repeated(self, count: int) -> PupilField:
         """Every image ``count`` times in a row."""
         u, v, eikonal, amplitude = (np.repeat(a, count, axis=0) for a in (self.u, self.v, self.eikonal, self.amplitude))

@@ -64,7 +64,9 @@ class LineChange:
     Attributes:
         d_alpha, d_beta: rotation of the line of sight about the nominal camera's Y and X, radians (right-hand rule).
         d_gamma: rotation of the imaged line about the line of sight, radians.
-        principal_distance: f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres.
+        principal_distance: f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres. L is counted in
+            pixels times their nominal pitch, so that f is what the pixels see: a camera that grows with its line CCD
+            has the angle of a pixel, and f, that it had.
         d_f: its change, metres.
         nominal_distance: principal distance of the nominal state, metres.
     """
@@ -84,7 +86,7 @@ def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> 
         sight: object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M
         odd, the
             middle point is the line's centre.
-        position: coordinate of the points along camera Y on the focal plane, (M,), metres.
+        position: coordinate of the points along camera Y on the nominal line CCD, (M,), metres.
         camera: columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
     """
     local = product(sight, camera)

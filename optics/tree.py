@@ -105,6 +105,10 @@ class PlacedBodies:
         i = self.index[path]
         return Pose(self.rotation[state, i].real, self.translation[state, i].real)
 
+    def size(self, path: str) -> np.ndarray:
+        """Size of one body relative to nominal in each state, (S,) (real part)."""
+        return np.asarray(self.scale[:, self.index[path]].real)
+
 
 @dataclass(frozen=True)
 class RigidTree:

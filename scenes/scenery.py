@@ -18,6 +18,7 @@ from optics.finish import BLACK, Finish
 from optics.pose import Pose
 from optics.tree import PlacedBodies, State
 from scenes.baffle import Plate, box
+from scenes.camera_assembly import line_body
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from scenes.scene_surface import (
@@ -144,20 +145,24 @@ def _focal_plane(
     """Detectors of one focal plane and the board behind them."""
     model = instrument.cameras[camera]
     body = f"{BASE}/{camera}/focal_plane"
-    line, element = model.spec.line, f"{camera}/focal_plane"
+    line, element = model.spec.line, f"{camera}/line"
     channels = [c for c in instrument.channels if c.camera == camera]
     reach_x, reach_y = _reach(instrument, camera)
     facing = placed.pose(body) @ FACING_THE_LIGHT
     if whole:
         pitch = 1e-3
-        grid = Detector(element, round(2.0 * reach_x / pitch), round(2.0 * reach_y / pitch), (pitch, pitch))
+        name = f"{camera}/focal_plane"
+        grid = Detector(name, round(2.0 * reach_x / pitch), round(2.0 * reach_y / pitch), (pitch, pitch))
         return [detector_surface(grid, facing, finishes, (element,))], [grid]
-    grids = [Detector(f"{camera}/line", 1, line.pixels, (line.pitch, line.pitch))]
-    surfaces = [detector_surface(grids[0], placed.pose(f"{body}/line") @ FACING_THE_LIGHT, finishes, (element,))]
+    chip = line_body(f"{BASE}/{camera}")
+    pitch = line.pitch * float(placed.size(chip)[0])
+    grids = [Detector(element, 1, line.pixels, (pitch, pitch))]
+    surfaces = [detector_surface(grids[0], placed.pose(chip) @ FACING_THE_LIGHT, finishes, (element,))]
     ccd = instrument.spec.monitor.area_ccd
     for channel in channels:
         name = f"{channel.key}/area_ccd"
-        grid = Detector(name, ccd.columns, ccd.rows, (ccd.pitch, ccd.pitch))
+        pitch = ccd.pitch * float(placed.size(channel.ccd_body)[0])
+        grid = Detector(name, ccd.columns, ccd.rows, (pitch, pitch))
         grids.append(grid)
         surfaces.append(detector_surface(grid, placed.pose(channel.ccd_body), finishes, (name,)))
     board = Pose(np.eye(3), np.array([0.0, 0.0, BOARD]))

@@ -24,19 +24,17 @@ from optics.aim import AimError
 from optics.aperture import Circle
 from optics.assembly import points_to_world
 from optics.backend import Backend
-from optics.element import Element, Interaction
 from optics.imaging import ImagingRays, imaging_rays
 from optics.line_of_sight import chief_rays
 from optics.pupil_edge import WORST_BEND
 from optics.pupil_function import WORST_RESIDUAL
 from optics.pupil_stack import PupilStack
-from optics.surface import plane
 from optics.system import assemble
 from optics.trace import BeamMissedError
 from optics.tree import State
 from optics.wavefront import eikonal, path_to_sphere
 from scenes.camera import CameraSpec
-from scenes.camera_assembly import focal_plane_body
+from scenes.camera_assembly import line_body
 from scenes.camera_model import LAUNCH_DISTANCE
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
@@ -206,7 +204,7 @@ class _CameraBench:
         line = spec.line if band is None else band
         along = 0.5 * line.pixels * line.pitch * np.array(fields)
         across = np.full(len(along), 0.0 if band is None else band.offset)
-        self.body = f"{focal_plane_body(f'{BASE}/{name}')}/line"
+        self.body = line_body(f"{BASE}/{name}")
         self.points = np.stack([across, along, np.zeros_like(along)], axis=-1)
         self.nyquist = 0.5 / line.pitch
         self.frequency = self.nyquist * np.eye(2)
@@ -224,15 +222,12 @@ class _CameraBench:
         self.stop = stop
         self.nodes = quadrature.disk(RINGS)
         self.tilts = zernike.basis(3, self.nodes.x, self.nodes.y)
-        key = f"{name}/line"
-        # a line CCD may be moved in its focal-plane assembly
-        self.assembly = instrument.assembly.with_element(Element(key, self.body, plane(), Interaction.PASS))
-        self.imaging = (*self.assembly.sequences[f"{name}/imaging"][:-1], key)
+        self.assembly = instrument.assembly
 
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
         """Work out some states; where the light of one is lost, both halves by themselves."""
         try:
-            rays = self._trace([states[s] for s in which])
+            rays, size = self._trace([states[s] for s in which])
         except (AimError, BeamMissedError) as error:
             if len(which) == 1:
                 reasons[which[0]] = str(error)
@@ -241,7 +236,7 @@ class _CameraBench:
             self.fill(states, which[:half], out, reasons)
             self.fill(states, which[half:], out, reasons)
             return
-        values, dark, rough = self._numbers(rays)
+        values, dark, rough = self._numbers(rays, size)
         count = len(self.points)
         out[:, which] = values.reshape(len(values), len(which), count)
         for k, s in enumerate(which):
@@ -252,8 +247,8 @@ class _CameraBench:
             elif np.any(rough[own]):
                 reasons[s] = "no MTF: the wavefront or the pupil's edge is too rough for its polynomials"
 
-    def _trace(self, states: list[State]) -> ImagingRays:
-        """Beams to the line CCD, state by state and field by field.
+    def _trace(self, states: list[State]) -> tuple[ImagingRays, np.ndarray]:
+        """Beams to the line CCD, state by state and field by field, and for each the CCD's size, (B,).
 
         Raises:
             AimError, BeamMissedError: the light of some state is lost.
@@ -269,16 +264,17 @@ class _CameraBench:
         places, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
         every = np.repeat(np.arange(len(states)), len(self.points))
         imaging, forward = (
-            assemble(assembly, [way], states, placed=placed).take(every) for way in (self.imaging, f"{name}/to_stop")
+            assemble(assembly, [way], states, placed=placed).take(every) for way in (f"{name}/imaging", f"{name}/to_stop")
         )
         launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
-        return imaging_rays(
+        rays = imaging_rays(
             self.backend, imaging, forward, -sight.reshape(-1, 3), launch, self.stop, self.nodes, first=axis
         )
+        return rays, placed.size(self.body)[every]
 
-    def _numbers(self, rays: ImagingRays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _numbers(self, rays: ImagingRays, size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (_COLUMNS, B), the share of each beam that is cut, and whether an MTF is not to be had."""
-        origin = np.tile(self.points, (len(rays.path) // len(self.points), 1))[:, None]
+        origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
         radius = float(self.model.first_order.exit_pupil_distance[0])
         share = self.nodes.share
 
@@ -296,7 +292,8 @@ class _CameraBench:
         lit = np.flatnonzero(dark == 0.0)
         if len(lit):
             # the image's first axis runs along the line, Y', the second along the track, X'
-            v, u = np.moveaxis(rays.direction[lit, :, :2], -1, 0)
+            # per length of the nominal CCD, in which the pixels keep their pitch
+            v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
             path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
             pupils = PupilStack.fit(u, v, path - path[:, :1], rays.amplitude[lit], self.nodes)
             smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))

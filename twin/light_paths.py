@@ -115,7 +115,7 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
     out = []
     for i, (camera, chain) in enumerate(zip(names, chains, strict=True)):
         hits = [traced.hit(k)[i] for k in range(len(chain))]
-        path = [points_to_world(placed, assembly.elements[n].body, h)[0] for n, h in zip(chain, hits, strict=True)]
+        path = [placed.pose(assembly.elements[n].body).apply(h) for n, h in zip(chain, hits, strict=True)]
         # end on a plane square to the middle ray
         square = leaving[i, rays]
         along = (path[-1][rays] + reach * square - path[-1]) @ square / (leaving[i] @ square)
@@ -144,7 +144,7 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
         path = [position[i]]
         prints: dict[tuple[str, int], np.ndarray] = {}
         for k, name in enumerate(assembly.sequences[f"{channel.key}/monitor"]):
-            path.append(points_to_world(placed, assembly.elements[name].body, hits[k][i])[0])
+            path.append(placed.pose(assembly.elements[name].body).apply(hits[k][i]))
             mirror = name.rpartition("/")[2]
             if mirror in instrument.cameras[channel.camera].mirrors:
                 prints[mirror, int((mirror, 0) in prints)] = hits[k][i][:, :2]

@@ -72,6 +72,7 @@ class Scouted:
     Attributes:
         fan: of the rays from the pinholes.
         outgoing, back: systems from the pinholes to the return face, and on to the CCDs.
+        size: of each channel's CCD relative to nominal, (C*S,).
         turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
         place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
     """
@@ -79,6 +80,7 @@ class Scouted:
     fan: RayFan
     outgoing: SystemBatch
     back: SystemBatch
+    size: np.ndarray
     turn: np.ndarray
     place: np.ndarray
 
@@ -87,17 +89,28 @@ class Scouted:
         channels, count = self.place.shape[:2]
         own = (np.arange(channels)[:, None] * count + states).ravel()
         fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
-        return Scouted(fan, self.outgoing.take(own), self.back.take(own), self.turn[:, own], self.place[:, states])
+        outgoing, back = self.outgoing.take(own), self.back.take(own)
+        return Scouted(fan, outgoing, back, self.size[own], self.turn[:, own], self.place[:, states])
 
 
 @dataclass(frozen=True, eq=False)
 class CcdRays:
-    """Rays at the CCDs in each CCD's frame: position and direction (B, N, 3), optical path and validity (B, N)."""
+    """Rays at the CCDs in each CCD's frame.
+
+    Attributes:
+        position: on the chip, whose pixels grow with it: metres over ``size``, so that pixels have the nominal pitch,
+            (B, N, 3).
+        direction: unit, (B, N, 3).
+        path: optical path, metres, (B, N).
+        valid: (B, N).
+        size: of the CCD relative to nominal, (B,).
+    """
 
     position: np.ndarray
     direction: np.ndarray
     path: np.ndarray
     valid: np.ndarray
+    size: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +254,9 @@ class MonitorPath:
         q, _ = aim(self.backend, outgoing, fan, scout._target, start, slope, AIM_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
-        place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / self.pitch
-        return Scouted(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
+        size = np.concatenate([placed.size(c.ccd_body) for c in self.channels])
+        place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / (self.pitch * size[:, None])
+        return Scouted(fan, outgoing, back, size, turn, place.reshape(len(self.channels), count, 2))
 
     def rays(self, states: Sequence[State], scouted: Scouted | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
@@ -267,7 +281,8 @@ class MonitorPath:
             q, _ = aim(self.backend, known.outgoing, known.fan, self._target, q, slope, AIM_TOLERANCE)
             launch = known.fan.at(q)
             traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
-        rays = CcdRays(*traced.numpy())
+        position, direction, length, valid = traced.numpy()
+        rays = CcdRays(position / known.size[:, None, None], direction, length, valid, known.size)
         for i, channel in enumerate(self.channels):
             own = slice(i * len(states), (i + 1) * len(states))
             if not np.all(np.any(rays.valid[own], axis=1)):
@@ -286,7 +301,7 @@ class MonitorPath:
         return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
 
     def fields(self, states: Sequence[State]) -> PupilField:
-        """Plane waves at the CCDs for C channels x S states, channel-major, in each CCD's x, y about its centre.
+        """Plane waves at the CCDs for C channels x S states, channel-major, in each chip's own x, y about its centre.
 
         Raises:
             BeamMissedError, AimError: as ``rays``.
@@ -299,12 +314,12 @@ class MonitorPath:
         u, v = direction[..., 0], direction[..., 1]
         # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.diffraction, with A the face's area
         amplitude = np.sqrt(np.abs(self.area_ratio(u, v)) / np.pi) * self.nodes.weight * rays.valid
-        phase = eikonal(rays.position, direction, rays.path, np.zeros(3))
+        phase = eikonal(rays.size[:, None, None] * rays.position, direction, rays.path, np.zeros(3))
         phase = phase - phase[:, :1]
-        return PupilField(u, v, phase, amplitude, self.wavelength)
+        return PupilField(u, v, phase, amplitude, self.wavelength).in_lengths_of(rays.size)
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
-        """Raise BeamMissedError when the middle of a spot (rays (S, N, 3) at the CCD) is outside its CCD."""
+        """Raise BeamMissedError when the middle of a spot (rays (S, N, 3) on the chip) is outside its CCD."""
         half = 0.5 * (np.array(self.shape) - 1)
         place = np.einsum("n,snk->sk", self.nodes.share, position[..., 1::-1]) / self.pitch
         beyond = np.linalg.norm(np.maximum(np.abs(place) - half, 0.0), axis=-1)
@@ -319,7 +334,7 @@ class MonitorPath:
 
     @cached_property
     def response(self) -> PixelResponse:
-        """What pixel and pinhole do to the image."""
+        """What pixel and pinhole do to the image; a pinhole is taken to grow with the CCD beside it."""
         pinhole = self.instrument.spec.monitor.reticle.pinhole
         return PixelResponse.fit(self.pitch, pinhole, cutoff=2.0 * self.numerical_aperture / self.wavelength)
 
@@ -397,7 +412,7 @@ class MonitorPath:
         return float(self.instrument.spec.monitor.reticle.photons_per_frame * self.pitch**2)
 
     def grid(self, axis: int, margin: int = 0) -> Grid:
-        """Pixel centres of the rows (0) or columns (1) in detector coordinates from the CCD's centre."""
+        """Pixel centres of the rows (0) or columns (1) on the chip, from the CCD's centre, in nominal metres."""
         n = self.shape[axis]
         return Grid(-(0.5 * (n - 1) + margin) * self.pitch, self.pitch, n + 2 * margin)
 

@@ -79,6 +79,8 @@ def spot_gradient(
     out = np.zeros((len(path.channels), 2, len(motions)))
     once = np.arange(0, outgoing.count, 2)
     rays = max(chunk // len(path.channels), 1)
+    chips = path.instrument.assembly.place([about])
+    pitch = path.pitch * np.repeat([chips.size(c.ccd_body)[0] for c in path.channels], 2)
     for start in range(0, path.nodes.count, rays):
         piece = slice(start, start + rays)
         place, heading = launch[:, piece], launched[:, piece]
@@ -86,7 +88,7 @@ def spot_gradient(
         place, heading, across = (np.repeat(array, 2, axis=0) for array in (place, heading, across))
         # system 2c is the row of channel c's spot (y of the CCD), 2c + 1 its column (x)
         share = path.nodes.share[piece, None] * np.array([[[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]])
-        weight = np.tile(share / path.pitch, (len(path.channels), 1, 1))
+        weight = np.tile(share, (len(path.channels), 1, 1)) / pitch[:, None, None]
         there = pull_back(path.backend, monitor, place, heading, weight, monitor_steps.names)
         turn = np.einsum("bnkx,bnx->bnk", across, there.direction)
         back = -np.linalg.solve(np.repeat(np.swapaxes(slope, -1, -2), 2, axis=0), turn[..., None])[..., 0]

@@ -24,7 +24,7 @@ from optics.pupil_function import PupilFunction, fit_pupils
 from optics.system import SystemBatch, assemble
 from optics.trace import make_rays, require_some, trace
 from optics.tree import State
-from scenes.camera_assembly import focal_plane_body
+from scenes.camera_assembly import line_body
 from scenes.camera_model import LAUNCH_DISTANCE, CameraModel
 
 RINGS = 14
@@ -106,10 +106,10 @@ class TargetPath:
 
     def directions(self, places: np.ndarray) -> np.ndarray:
         """Directions of the light, world, (F, 3), that the unperturbed camera images at places (F, 2), (along, across),
-        metres, of its focal plane.
+        metres, of its line CCD.
         """
         placed = self.assembly.place()
-        body = focal_plane_body(self.root)
+        body = line_body(self.root)
         local = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         guess = self.model.toward_optics(placed.rotation[:, placed.index[body]].real)
         sight = chief_directions(
@@ -123,22 +123,26 @@ class TargetPath:
         return np.asarray(-sight[0])
 
     def places(self, state: State, directions: np.ndarray) -> np.ndarray:
-        """Where chief rays of directions (F, 3) meet the focal plane, (F, 2) (along, across), metres.
+        """Where chief rays of directions (F, 3) meet the line CCD, (F, 2) (along, across).
+
+        In metres of the nominal CCD: its pixels keep their pitch in these coordinates when it grows.
 
         Raises:
-            BeamMissedError: a chief ray does not reach the focal plane.
+            BeamMissedError: a chief ray does not reach the line CCD.
         """
-        systems, to_stop = self._systems(state, len(directions))
+        systems, to_stop, size = self._systems(state, len(directions))
         launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), self._stop_centre)
         traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]))
         position, _, _, valid = traced.numpy()
         require_some(valid, "the imaging path")
-        return np.asarray(position[:, 0, 1::-1])
+        return np.asarray(position[:, 0, 1::-1] / size[:, None])
 
     def pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, target_shift: float = 0.0
     ) -> tuple[PupilFunction, ...]:
-        """Pupil of the image of each direction (F, 3), about its own place (F, 2) on the focal plane.
+        """Pupil of the image of each direction (F, 3), about its own place (F, 2) on the line CCD.
+
+        Its lengths are those of ``places``.
 
         Args:
             state: of the assembly.
@@ -150,8 +154,8 @@ class TargetPath:
             BeamMissedError, AimError: the beam does not get through.
             ValueError: it is vignetted.
         """
-        systems, to_stop = self._systems(state, len(directions))
-        origin = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        systems, to_stop, size = self._systems(state, len(directions))
+        origin = size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         field = imaging_field(
             self.backend,
@@ -168,7 +172,7 @@ class TargetPath:
             self._axes[:, 1],
         )
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        return fit_pupils(turned, self.nodes)
+        return fit_pupils(turned.in_lengths_of(size), self.nodes)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
@@ -200,12 +204,12 @@ class TargetPath:
     def _stop_centre(self) -> np.ndarray:
         return np.array(self.stop.centre)[None]
 
-    def _systems(self, state: State, count: int) -> tuple[SystemBatch, SystemBatch]:
-        """The way to the focal plane and the way to the stop, once for every direction."""
+    def _systems(self, state: State, count: int) -> tuple[SystemBatch, SystemBatch, np.ndarray]:
+        """The way to the line CCD and the way to the stop, once for every direction, and the CCD's size."""
         placed = self.assembly.place([state])
         every = np.zeros(count, dtype=int)
         systems, to_stop = (
             assemble(self.assembly, [f"{self.name}/{way}"], [state], placed=placed).take(every)
             for way in ("imaging", "to_stop")
         )
-        return systems, to_stop
+        return systems, to_stop, np.repeat(placed.size(line_body(self.root)), count)

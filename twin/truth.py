@@ -12,6 +12,7 @@ from optics.backend import Backend
 from optics.line_of_sight import LineChange, chief_directions, line_change
 from optics.system import assemble
 from optics.tree import PlacedBodies, State
+from scenes.camera_assembly import line_body
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from twin.motions import ElementaryMotion
@@ -47,17 +48,17 @@ def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State
 
 
 def line_points(instrument: Instrument, camera: str) -> np.ndarray:
-    """Where along camera Y the points of the line CCD lie, (LINE_POINTS,), metres."""
+    """Where along camera Y the points of the nominal line CCD lie, (LINE_POINTS,), metres."""
     line = instrument.cameras[camera].spec.line
     half = 0.5 * line.pixels * line.pitch
     return np.linspace(-half, half, LINE_POINTS)
 
 
 def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
-    """The points of the line CCD in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
+    """The points of the line CCD, grown as it is, in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
     position = line_points(instrument, camera)
     line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
-    return points_to_world(placed, f"{BASE}/{camera}/focal_plane/line", line)
+    return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)
 
 
 def trace_sight(instrument: Instrument, backend: Backend, states: Sequence[State]) -> np.ndarray:

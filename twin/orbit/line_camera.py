@@ -20,6 +20,7 @@ from optics.line_of_sight import chief_rays
 from optics.rotation import about_axis, rotation_matrix
 from optics.system import assemble
 from optics.tree import State
+from scenes.camera_assembly import line_body
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from scenes.three_line_camera import LineCameraSpec, ThreeLineCameraSpec
@@ -132,7 +133,7 @@ def traced_line_cameras(instrument: Instrument, backend: Backend, state: State |
     for name, line in lines.items():
         y = (_nodes(line.pixels, TRACED_POINTS) - 0.5 * (line.pixels - 1)) * line.pitch
         on_line = np.stack([np.zeros_like(y), y, np.zeros_like(y)], axis=-1)
-        points.append(points_to_world(placed, f"{BASE}/{name}/focal_plane/line", on_line))
+        points.append(points_to_world(placed, line_body(f"{BASE}/{name}"), on_line))
         guesses.append(instrument.toward_optics(placed, name))
     to_stop = assemble(instrument.assembly, [f"{name}/image_to_stop" for name in names], states, placed=placed)
     to_object = assemble(instrument.assembly, [f"{name}/image_to_object" for name in names], states, placed=placed)
