@@ -82,10 +82,11 @@ def aim(
         backend: where to trace.
         systems: B systems that end at the element to be hit; apertures are not looked at.
         fan: the families of rays.
-        target: local x, y on that element, metres, broadcastable to (B, N, 2).
+        target: x, y on that element, metres of its nominal size, broadcastable to (B, N, 2): points of an aperture,
+            which grows with its body.
         start: parameters to start from, broadcastable to (B, N, 2); default 0.
         jacobian: d(hit)/dq to start from, broadcastable to (B, N, 2, 2); default by differences of size ``step``.
-        tolerance: largest distance from the target, metres.
+        tolerance: largest distance from the target there, metres.
         step: difference step of the parameters (metres or radians).
 
     Returns:
@@ -104,7 +105,7 @@ def aim(
     rays = max(fan.position.shape[1], fan.direction.shape[1], np.shape(target)[-2] if np.ndim(target) > 1 else 1)
     shape = (count, rays, 2)
     q = np.array(np.broadcast_to(0.0 if start is None else start, shape), dtype=np.float64)
-    goal = np.broadcast_to(target, shape)
+    goal = np.broadcast_to(target, shape) * systems.size[:, None, None]
     here = hit(q)
     if jacobian is None:
         columns = [(hit(q + step * np.eye(2)[k]) - here) / step for k in range(2)]

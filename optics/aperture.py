@@ -34,6 +34,10 @@ class Circle:
         (cx, cy), r = self.centre, self.radius
         return cx - r, cx + r, cy - r, cy + r
 
+    def grown(self, size: float) -> Circle:
+        """The same on a body of another size, 1 being the nominal one."""
+        return Circle(size * self.radius, (size * self.centre[0], size * self.centre[1]), size * self.inner)
+
     def outline(self, points: int = 96) -> np.ndarray:
         """Closed outline, shape (points, 2), metres."""
         t = np.linspace(0.0, 2.0 * np.pi, points)
@@ -64,6 +68,11 @@ class Rectangle:
         """x_min, x_max, y_min, y_max, metres."""
         (cx, cy) = self.centre
         return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    def grown(self, size: float) -> Rectangle:
+        """The same on a body of another size, 1 being the nominal one."""
+        x, y = self.centre
+        return Rectangle(size * self.half_x, size * self.half_y, (size * x, size * y))
 
     def outline(self, points: int = 96) -> np.ndarray:
         """Closed outline, shape (n, 2), metres."""
@@ -98,6 +107,11 @@ class Ellipse:
         """x_min, x_max, y_min, y_max, metres."""
         (cx, cy) = self.centre
         return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    def grown(self, size: float) -> Ellipse:
+        """The same on a body of another size, 1 being the nominal one."""
+        x, y = self.centre
+        return Ellipse(size * self.half_x, size * self.half_y, (size * x, size * y))
 
     def outline(self, points: int = 96) -> np.ndarray:
         """Closed outline, shape (points, 2), metres."""

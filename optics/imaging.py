@@ -46,7 +46,7 @@ def aim_collimated(
         direction: of the light, world, unit, (3,) or (B, 3).
         launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane
             wavefront through it.
-        target: stop coordinates, (N, 2), metres.
+        target: stop coordinates, (N, 2), metres of its nominal size.
         first: world vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the
             coordinate axis least along it, which is not the same for all directions.
 
@@ -118,7 +118,7 @@ def imaging_rays(
     )
     place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
     require_some(valid, "the imaging path")
-    launch_area = stop.radius**2 * nodes.weight / np.abs(np.linalg.det(hit))
+    launch_area = (to_stop.size[:, None] * stop.radius) ** 2 * nodes.weight / np.abs(np.linalg.det(hit))
     amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
     return ImagingRays(place, leaving, path, amplitude, launched, launch_area, axes)
 

@@ -64,9 +64,9 @@ class LineChange:
     Attributes:
         d_alpha, d_beta: rotation of the line of sight about the nominal camera's Y and X, radians (right-hand rule).
         d_gamma: rotation of the imaged line about the line of sight, radians.
-        principal_distance: f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres. L is counted in
-            pixels times their nominal pitch, so that f is what the pixels see: a camera that grows with its line CCD
-            has the angle of a pixel, and f, that it had.
+        principal_distance: f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres. L is counted
+            in pixels times their nominal pitch, so that f is what the pixels see: a camera that grows with its line
+            CCD keeps the angle of a pixel, and so f.
         d_f: its change, metres.
         nominal_distance: principal distance of the nominal state, metres.
     """

@@ -39,7 +39,7 @@ class SystemBatch:
     """Numbers of B systems: element by element, name -> array of shape (B,).
 
     ``R00..R22``, ``T0..T2`` take the ray from the frame of the element before (the world for the first) into the
-    frame of this element; ``W...``/``P...`` are the element's world pose.
+    frame of this element; ``W...``/``P...`` are the element's world pose, ``S`` the size of its body.
 
     Attributes:
         structure: per element.
@@ -56,6 +56,11 @@ class SystemBatch:
     grids: tuple[np.ndarray | None, ...]
     count: int
     states: int
+
+    @property
+    def size(self) -> np.ndarray:
+        """Size of the last element's body relative to nominal, (B,)."""
+        return self.values[-1]["S"]
 
     def upload(self, backend: Backend) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients."""
@@ -289,6 +294,7 @@ def _numbers(
             out[f"R{a}{b}"] = relative[:, a, b]
             out[f"W{a}{b}"] = rotation[:, a, b]
     scale = placed.scale[:, body]
+    out["S"] = scale.real
     surface = element.surface
     if not structure.plane:
         out["c"] = surface.curvature / scale
@@ -306,14 +312,13 @@ def _numbers(
         out.update({name: np.full(count, value) for name, value in grid.items()})
     aperture = element.aperture
     if aperture is not None:
-        out["ax"] = np.full(count, aperture.centre[0])
-        out["ay"] = np.full(count, aperture.centre[1])
+        # an edge has no derivative: it lets a ray pass or stops it
+        grown = scale.real
+        out["ax"], out["ay"] = grown * aperture.centre[0], grown * aperture.centre[1]
         if isinstance(aperture, Circle):
-            out["ar2"] = np.full(count, aperture.radius**2)
-            out["ai2"] = np.full(count, aperture.inner**2)
+            out["ar2"], out["ai2"] = (grown * aperture.radius) ** 2, (grown * aperture.inner) ** 2
         else:
-            out["ahx"] = np.full(count, aperture.half_x)
-            out["ahy"] = np.full(count, aperture.half_y)
+            out["ahx"], out["ahy"] = grown * aperture.half_x, grown * aperture.half_y
     return out
 
 

@@ -135,7 +135,7 @@ def trace(
     hits: dict[int, Any] = {}
     differentiable = uploaded.differentiable or dr.grad_enabled(p) or dr.grad_enabled(d)
     for i, structure in enumerate(uploaded.structure):
-        g = {name: lookup(array) for name, array in uploaded.values[i].items() if name[0] not in "WP"}
+        g = {name: lookup(array) for name, array in uploaded.values[i].items() if name[0] not in "WPS"}
         p, d = _into_frame(backend, p, d, g)
         t, ok = _distance(backend, p, d, g, structure, uploaded.grids[i], differentiable)
         if structure.graded[0]:

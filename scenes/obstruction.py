@@ -19,6 +19,7 @@ from optics.backend import Backend
 from optics.solid import solid_mesh
 from optics.system import assemble, media_along
 from optics.trace import make_rays, trace
+from scenes.camera_assembly import line_body
 from scenes.channel import BASE
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def _imaging(instrument: Instrument, backend: Backend, camera: str) -> list[np.n
     assembly, model, placed = instrument.assembly, instrument.cameras[camera], instrument.assembly.place()
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
     line = np.array([[0.0, y, 0.0] for y in (half, 0.0, -half)])
-    points = points_to_world(placed, f"{BASE}/{camera}/focal_plane/line", line)[0]
+    points = points_to_world(placed, line_body(f"{BASE}/{camera}"), line)[0]
     stop = assembly.elements[f"{camera}/{model.spec.stop}"].aperture
     assert stop is not None
     radius = stop.radius if isinstance(stop, Circle) else min(stop.half_x, stop.half_y)

@@ -141,8 +141,9 @@ def mirror_surface(element: Element, placed: PlacedBodies, finishes: Finishes, l
     """
     if element.aperture is None:
         raise ValueError(f"{element.name}: a mirror without a clear aperture cannot stand in a scene")
-    surface = grown(element.surface, float(placed.scale[0, placed.index[element.body]].real))
-    vertices, triangles, apart = sheet_mesh(surface, element.aperture)
+    size = float(placed.size(element.body)[0])
+    surface, aperture = grown(element.surface, size), element.aperture.grown(size)
+    vertices, triangles, apart = sheet_mesh(surface, aperture)
     optical, rear = finishes.mirror, finishes.mirror_back
     return SceneSurface(
         element.name,
@@ -154,7 +155,7 @@ def mirror_surface(element: Element, placed: PlacedBodies, finishes: Finishes, l
         triangles,
         front=optical if lit_side > 0.0 else rear,
         back=rear if lit_side > 0.0 else optical,
-        apertures=(element.aperture,),
+        apertures=(aperture,),
         clearance=LEAST_CLEARANCE + apart,
     )
 
@@ -181,10 +182,10 @@ def solid_surfaces(
         if not len(polygon):
             continue
         on_it = _elements_on(face, solid, assembly, nominal)
-        apertures = tuple(dict.fromkeys(aperture for _, aperture in on_it if aperture is not None))
+        scale = float(placed.size(face.body)[0])
+        apertures = tuple(dict.fromkeys(aperture.grown(scale) for _, aperture in on_it if aperture is not None))
         if len(apertures) > 2:
             raise ValueError(f"{solid.path}: face {face.name!r} has {len(apertures)} clear apertures; at most two")
-        scale = float(placed.scale[0, placed.index[face.body]].real)
         pose = placed.pose(face.body) @ Pose(face.pose.rotation, scale * face.pose.translation)
         vertices, triangles = polygon_mesh(pose.inverse().apply(own.apply(polygon)))
         finish = finishes.of(face.coating)

@@ -84,7 +84,7 @@ def build_scenery(
         state: what is perturbed.
         finishes: what surfaces do with light; by default those of ``Finishes``.
         baffles: more parts than the instrument's own.
-        whole_focal_planes: make each focal plane one large detector, named as the focal plane's element, in the place
+        whole_focal_planes: make each focal plane one large detector, named ``CAMERA/focal_plane``, in the place
             of its CCDs and its board: for light from the scene.
     """
     finishes = finishes or Finishes()

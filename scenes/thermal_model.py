@@ -188,10 +188,8 @@ class ThermalModel:
             own = Motion(pivot=pivot, stretch=own.stretch, index=change, index_gradient=slope)
         out: dict[str, Motion] = {path: own}
         if path in self._solids or path in self._mirrors:
-            # the tree's stretch carries the faces; a face with two footprints carries these
-            out.update(
-                {face.path: Motion(stretch=own.stretch) for face in self._carried[path] if self._carried[face.path]}
-            )
+            # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
+            out.update({face: Motion(stretch=own.stretch) for face in self._bodies if face.startswith(f"{path}/")})
             if not bent:
                 return out
             bending = {face: _superposed(units, gradient) for face, units in self._response(path, progress).items()}

@@ -264,13 +264,13 @@ class _CameraBench:
         places, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
         every = np.repeat(np.arange(len(states)), len(self.points))
         imaging, forward = (
-            assemble(assembly, [way], states, placed=placed).take(every) for way in (f"{name}/imaging", f"{name}/to_stop")
+            assemble(assembly, [f"{name}/{way}"], states, placed=placed).take(every) for way in ("imaging", "to_stop")
         )
         launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
         rays = imaging_rays(
             self.backend, imaging, forward, -sight.reshape(-1, 3), launch, self.stop, self.nodes, first=axis
         )
-        return rays, placed.size(self.body)[every]
+        return rays, imaging.size
 
     def _numbers(self, rays: ImagingRays, size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (_COLUMNS, B), the share of each beam that is cut, and whether an MTF is not to be had."""

@@ -14,6 +14,7 @@ from optics.backend import Backend
 from optics.system import SystemBatch, assemble
 from optics.trace import make_rays, trace
 from optics.tree import PlacedBodies, State
+from scenes.camera_assembly import line_body
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 
@@ -98,9 +99,10 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
     rays = 1 + RIM
     points, guesses, targets = [], [], []
     for camera in names:
-        model, plane = instrument.cameras[camera], f"{BASE}/{camera}/focal_plane"
+        model = instrument.cameras[camera]
         half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
-        ends = points_to_world(placed, f"{plane}/line", np.array([[0.0, y, 0.0] for y in (half, 0.0, -half)]))[0]
+        ends = np.array([[0.0, y, 0.0] for y in (half, 0.0, -half)])
+        ends = points_to_world(placed, line_body(f"{BASE}/{camera}"), ends)[0]
         points.append(np.repeat(ends, rays, axis=0))
         guesses.append(instrument.toward_optics(placed, camera)[0])
         stop = assembly.elements[f"{camera}/{model.spec.stop}"].aperture

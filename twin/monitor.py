@@ -72,7 +72,6 @@ class Scouted:
     Attributes:
         fan: of the rays from the pinholes.
         outgoing, back: systems from the pinholes to the return face, and on to the CCDs.
-        size: of each channel's CCD relative to nominal, (C*S,).
         turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
         place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
     """
@@ -80,7 +79,6 @@ class Scouted:
     fan: RayFan
     outgoing: SystemBatch
     back: SystemBatch
-    size: np.ndarray
     turn: np.ndarray
     place: np.ndarray
 
@@ -89,8 +87,7 @@ class Scouted:
         channels, count = self.place.shape[:2]
         own = (np.arange(channels)[:, None] * count + states).ravel()
         fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
-        outgoing, back = self.outgoing.take(own), self.back.take(own)
-        return Scouted(fan, outgoing, back, self.size[own], self.turn[:, own], self.place[:, states])
+        return Scouted(fan, self.outgoing.take(own), self.back.take(own), self.turn[:, own], self.place[:, states])
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,9 +251,9 @@ class MonitorPath:
         q, _ = aim(self.backend, outgoing, fan, scout._target, start, slope, AIM_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
-        size = np.concatenate([placed.size(c.ccd_body) for c in self.channels])
-        place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / (self.pitch * size[:, None])
-        return Scouted(fan, outgoing, back, size, turn, place.reshape(len(self.channels), count, 2))
+        pitch = self.pitch * back.size[:, None]
+        place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / pitch
+        return Scouted(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
 
     def rays(self, states: Sequence[State], scouted: Scouted | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
@@ -276,13 +273,13 @@ class MonitorPath:
         uploaded = known.back.upload(self.backend)
         face = len(known.outgoing.structure) - 1
         traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
-        if not np.max(np.abs(traced.place(face) - self._target)) <= AIM_TOLERANCE:
+        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * self._target)) <= AIM_TOLERANCE:
             # a change that is not smooth enough for its few terms
             q, _ = aim(self.backend, known.outgoing, known.fan, self._target, q, slope, AIM_TOLERANCE)
             launch = known.fan.at(q)
             traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
         position, direction, length, valid = traced.numpy()
-        rays = CcdRays(position / known.size[:, None, None], direction, length, valid, known.size)
+        rays = CcdRays(position / known.back.size[:, None, None], direction, length, valid, known.back.size)
         for i, channel in enumerate(self.channels):
             own = slice(i * len(states), (i + 1) * len(states))
             if not np.all(np.any(rays.valid[own], axis=1)):

@@ -79,8 +79,7 @@ def spot_gradient(
     out = np.zeros((len(path.channels), 2, len(motions)))
     once = np.arange(0, outgoing.count, 2)
     rays = max(chunk // len(path.channels), 1)
-    chips = path.instrument.assembly.place([about])
-    pitch = path.pitch * np.repeat([chips.size(c.ccd_body)[0] for c in path.channels], 2)
+    pitch = path.pitch * monitor.size
     for start in range(0, path.nodes.count, rays):
         piece = slice(start, start + rays)
         place, heading = launch[:, piece], launched[:, piece]
@@ -112,7 +111,7 @@ class _Tangents:
         assert systems.tangents is not None
         return cls(
             tuple(
-                {k: v.reshape(channels, -1) for k, v in own.items() if k[0] not in "WP" and np.any(v)}
+                {k: v.reshape(channels, -1) for k, v in own.items() if k[0] not in "WPS" and np.any(v)}
                 for own in systems.tangents
             )
         )

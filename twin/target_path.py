@@ -130,12 +130,12 @@ class TargetPath:
         Raises:
             BeamMissedError: a chief ray does not reach the line CCD.
         """
-        systems, to_stop, size = self._systems(state, len(directions))
+        systems, to_stop = self._systems(state, len(directions))
         launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), self._stop_centre)
         traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]))
         position, _, _, valid = traced.numpy()
         require_some(valid, "the imaging path")
-        return np.asarray(position[:, 0, 1::-1] / size[:, None])
+        return np.asarray(position[:, 0, 1::-1] / systems.size[:, None])
 
     def pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, target_shift: float = 0.0
@@ -154,8 +154,8 @@ class TargetPath:
             BeamMissedError, AimError: the beam does not get through.
             ValueError: it is vignetted.
         """
-        systems, to_stop, size = self._systems(state, len(directions))
-        origin = size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        systems, to_stop = self._systems(state, len(directions))
+        origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         field = imaging_field(
             self.backend,
@@ -172,7 +172,7 @@ class TargetPath:
             self._axes[:, 1],
         )
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        return fit_pupils(turned.in_lengths_of(size), self.nodes)
+        return fit_pupils(turned.in_lengths_of(systems.size), self.nodes)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
@@ -204,12 +204,12 @@ class TargetPath:
     def _stop_centre(self) -> np.ndarray:
         return np.array(self.stop.centre)[None]
 
-    def _systems(self, state: State, count: int) -> tuple[SystemBatch, SystemBatch, np.ndarray]:
-        """The way to the line CCD and the way to the stop, once for every direction, and the CCD's size."""
+    def _systems(self, state: State, count: int) -> tuple[SystemBatch, SystemBatch]:
+        """The way to the line CCD and the way to the stop, once for every direction."""
         placed = self.assembly.place([state])
         every = np.zeros(count, dtype=int)
         systems, to_stop = (
             assemble(self.assembly, [f"{self.name}/{way}"], [state], placed=placed).take(every)
             for way in ("imaging", "to_stop")
         )
-        return systems, to_stop, np.repeat(placed.size(line_body(self.root)), count)
+        return systems, to_stop

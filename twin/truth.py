@@ -55,7 +55,7 @@ def line_points(instrument: Instrument, camera: str) -> np.ndarray:
 
 
 def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
-    """The points of the line CCD, grown as it is, in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
+    """The points of the line CCD in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
     position = line_points(instrument, camera)
     line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
     return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)

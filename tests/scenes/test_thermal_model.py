@@ -22,8 +22,6 @@ from scenes.load import load_camera, load_instrument, load_job
 from scenes.resolved import resolve, resolve_job
 from scenes.thermal_model import TERMS, TemperatureError, ThermalModel
 from twin.experiment import MonitorExperiment
-from twin.monitor import MonitorPath
-from twin.truth import trace_truth
 
 SILICA = material("fused silica")
 WAVELENGTH = 650e-9
@@ -105,7 +103,7 @@ def test_a_structure_carries_its_children_and_a_mirror_grows_about_its_centre(ba
     np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
 
 
-def test_one_material_at_one_temperature_only_grows(one_material, backend) -> None:
+def test_one_material_at_one_temperature_only_grows(one_material) -> None:
     change = 10.0
     grown = 1.0 + SILICA.expansion * change
     instrument = one_material.instrument
@@ -113,18 +111,8 @@ def test_one_material_at_one_temperature_only_grows(one_material, backend) -> No
     placed = instrument.assembly.place([{}, state])
     np.testing.assert_allclose(placed.translation[1], grown * placed.translation[0], rtol=0, atol=3e-15)
     np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
-    truth = trace_truth(instrument, backend, [state])
-    assert abs(truth.angle_change[0]) < 1e-14
-    for name, moved in truth.cameras.items():
-        assert max(abs(moved.d_alpha[0]), abs(moved.d_beta[0]), abs(moved.d_gamma[0])) < 1e-14
-        # the line's points stay where they were in metres, so that distortion enters with 6e-4 of the change
-        assert moved.d_f[0] == pytest.approx((grown - 1.0) * truth.principal_distance[name], rel=1e-3)
-    path = MonitorPath(instrument, backend).coarse
-    rays = path.rays([{}, state])
-    spots = np.einsum("n,bnk->bk", path.nodes.share, rays.position[..., :2]).reshape(4, 2, 2) / path.pitch
-    assert np.all(np.abs(spots[:, 1] / grown - spots[:, 0]) < 1e-6)
-    assert np.all(np.abs(spots[:, 0]) < 0.1)  # the spots stand in the middle, so also look at the rays around them
-    np.testing.assert_allclose(rays.position[1::2] / grown, rays.position[::2], rtol=0, atol=3e-11)
+    # every body, faces of prisms and their footprints, too; what that does to the light: tests/twin/test_similarity.py
+    np.testing.assert_allclose(placed.scale[1], grown, rtol=1e-15)
 
 
 def test_carried_motion_is_the_free_field_and_its_rotation() -> None:

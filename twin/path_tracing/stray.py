@@ -88,7 +88,7 @@ def pinhole(
         cone = CONE_ROOM * 0.5 * model.spec.entrance_pupil / model.line_focal_length
     place = placed.pose(channel.reticle_body).translation
     axis = instrument.toward_optics(placed, channel.camera)[0]
-    radius = 0.5 * instrument.spec.monitor.reticle.pinhole
+    radius = 0.5 * instrument.spec.monitor.reticle.pinhole * float(placed.size(channel.reticle_body)[0])
     aimed = aimed or nominal_rays(instrument, backend)
     number = instrument.channels.index(channel)
     return DiskSource.along(place, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_ROOM)

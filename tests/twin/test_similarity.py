@@ -1,0 +1,306 @@
+"""An instrument of one material that is heated evenly only grows: no angle changes, and no image moves on its pixels.
+
+The growth is exact, so that what is compared agrees to rounding: for every camera of the library, every material,
+mirrors, prisms, line and area CCDs, at rest or moved. Light does not grow with the instrument, so that images agree
+only as far as diffraction stays. Glass also changes its index; that is looked at by itself, since it is no similarity.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from optics.heat import Temperature
+from optics.material import MATERIALS, Material, material
+from optics.system import assemble
+from optics.trace import make_rays, trace
+from optics.transfer import polychromatic_transfer
+from optics.tree import Motion, State
+from scenes.camera_assembly import line_body
+from scenes.instrument_model import Instrument, build_instrument
+from scenes.load import load_camera, load_instrument
+from scenes.scenery import build_scenery
+from scenes.thermal_model import ThermalModel
+from twin.image_quality import image_quality
+from twin.light_paths import trace_light_paths
+from twin.monitor import CcdRays, MonitorPath
+from twin.orbit.line_camera import traced_line_cameras
+from twin.target_path import TargetPath
+from twin.truth import trace_truth
+
+ARCSEC = np.pi / 648000.0
+CAMERAS = {"gf7": "gf7_pair", "gf7_conic": "gf7_pair", "gf7_short": "gf7_pair", "monitor": "monitor_pair"}
+ALUMINIUM = material("aluminium")
+WARMER = 5.0
+"""Kelvin: aluminium grows by 1.2e-4 then, a hundred thousand times the rounding of what is measured."""
+ROUNDING = 1e-14
+"""Radians: some sums of float64 numbers near 1, each good to 1e-16."""
+PIXELS = 5e-9
+"""Of a spot, pixels: rounding of paths of 40 m to and fro over the pixel of 12 um is 4e-10 for each of many steps."""
+
+MOVED: State = {
+    "base/forward/focal_plane": Motion(shift=(60e-6, -90e-6, 20e-6), rotate=(0.0, 20 * ARCSEC, 100 * ARCSEC)),
+    "base/forward/M2": Motion(shift=(5e-6, -3e-6, 2e-6), rotate=(1 * ARCSEC, 2 * ARCSEC, 0.0), pivot="centre"),
+    "base/backward": Motion(rotate=(2 * ARCSEC, -3 * ARCSEC, 5 * ARCSEC)),
+    "base/backward/focal_plane/line": Motion(shift=(10e-6, 200e-6, 0.0)),
+    "base/backward/monitor/right/prism_180": Motion(shift=(1e-4, 2e-4, -1e-4), rotate=(30 * ARCSEC, 0.0, 50 * ARCSEC)),
+}
+"""Lengths and turns of everything that is tried; on a body that has grown the lengths have grown with it."""
+
+
+@pytest.fixture(scope="module")
+def with_camera(backend):
+    """Function: camera of the library -> an instrument of the library with two of it."""
+
+    @cache
+    def build(name: str) -> Instrument:
+        spec = load_instrument(CAMERAS[name])
+        sites = {key: site.model_copy(update={"camera": name}) for key, site in spec.cameras.items()}
+        changed = spec.model_copy(update={"cameras": type(spec.cameras)(sites)})
+        return build_instrument(changed, {name: load_camera(name)}, backend)
+
+    return build
+
+
+def heated(
+    instrument: Instrument,
+    stuff: Material,
+    change: float = WARMER,
+    motions: State | None = None,
+    index: bool = False,
+    only: str = "base",
+) -> State:
+    """The state in which all of it is of one material, prisms, too, and warmer by ``change``.
+
+    A prism of aluminium keeps the index of its glass; ``index`` tells whether that changes with temperature.
+    """
+    heat = ThermalModel(instrument)
+    heat.materials = dict.fromkeys(heat.materials, stuff)  # type: ignore[misc]
+    state = heat.state({only: Temperature(change)}, motions)
+    return state if index else {path: replace(motion, index=0.0) for path, motion in state.items()}
+
+
+def spots(path: MonitorPath, rays: CcdRays) -> np.ndarray:
+    """Mean places of the spots, pixels, (C, S, 2)."""
+    mean = np.einsum("n,bnk->bk", path.nodes.share, rays.position[..., :2]) / path.pitch
+    return mean.reshape(len(path.channels), -1, 2)
+
+
+# --- nothing changes --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_no_angle_changes_and_no_spot_moves_on_its_pixels(camera: str, with_camera, backend) -> None:
+    instrument = with_camera(camera)
+    states = [heated(instrument, stuff, change) for stuff in MATERIALS.values() for change in (WARMER, -WARMER)]
+    truth = trace_truth(instrument, backend, states)
+    assert np.all(np.abs(truth.angle_change) < ROUNDING)
+    for name, change in truth.cameras.items():
+        for turn in (change.d_alpha, change.d_beta, change.d_gamma):
+            assert np.all(np.abs(turn) < ROUNDING)
+        assert np.all(np.abs(change.d_f) < ROUNDING * truth.principal_distance[name])
+    path = MonitorPath(instrument, backend).coarse
+    found = spots(path, path.rays([{}, *states]))
+    np.testing.assert_allclose(found[:, 1:] - found[:, :1], 0.0, rtol=0, atol=PIXELS)
+
+
+@pytest.mark.parametrize("camera", ["gf7", "monitor"])
+def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, backend) -> None:
+    """Spots far off the middle of their CCDs, lines and mirrors out of place."""
+    instrument = with_camera(camera)
+    states = [MOVED, heated(instrument, ALUMINIUM, motions=MOVED), heated(instrument, ALUMINIUM, -40.0, MOVED)]
+    truth = trace_truth(instrument, backend, states)
+    assert np.ptp(truth.angle_change) < ROUNDING
+    for name, change in truth.cameras.items():
+        assert abs(change.d_alpha[0]) > ARCSEC
+        for turn in (change.d_alpha, change.d_beta, change.d_gamma):
+            assert np.ptp(turn) < ROUNDING
+        assert np.ptp(change.d_f) < ROUNDING * truth.principal_distance[name]
+    path = MonitorPath(instrument, backend).coarse
+    found = spots(path, path.rays(states))
+    assert np.abs(found).max() > 15.0
+    np.testing.assert_allclose(found[:, 1:] - found[:, :1], 0.0, rtol=0, atol=PIXELS)
+    scouted = path.scouted(states).place
+    np.testing.assert_allclose(scouted[:, 1:] - scouted[:, :1], 0.0, rtol=0, atol=PIXELS)
+
+
+@pytest.mark.parametrize("camera", ["gf7", "monitor"])
+def test_every_ray_meets_every_mirror_and_face_at_the_grown_place(camera: str, with_camera, backend) -> None:
+    """Not only the means: rays of the nominal instrument, started at grown places, in the grown one."""
+    instrument, grown = with_camera(camera), 1.0 + ALUMINIUM.expansion * WARMER
+    state, path = heated(instrument, ALUMINIUM), MonitorPath(instrument, backend).scout
+    for kind in ("monitor", "outgoing"):
+        names = [f"{channel.key}/{kind}" for channel in path.channels]
+        every = range(len(instrument.assembly.sequences[names[0]]))
+        start, along = np.broadcast_arrays(path.nominal.position, path.nominal.direction)
+        traced = [
+            trace(backend, assemble(instrument.assembly, names, [s]), make_rays(backend, g * start, along), every, True)
+            for s, g in (({}, 1.0), (state, grown))
+        ]
+        for k in every:
+            # a path's rounding, metres, after up to 40 of them
+            np.testing.assert_allclose(traced[1].hit(k), grown * traced[0].hit(k), rtol=0, atol=1e-13)
+        before, after = (t.numpy(t.world) for t in traced)
+        np.testing.assert_allclose(after[1], before[1], rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(after[2], grown * before[2], rtol=1e-14)
+        np.testing.assert_array_equal(after[3], before[3])
+
+
+def test_the_lines_of_the_satellite_keep_their_looks(with_camera, backend) -> None:
+    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
+    for motions in ({}, MOVED):
+        before = traced_line_cameras(instrument, backend, motions)
+        after = traced_line_cameras(instrument, backend, heated(instrument, ALUMINIUM, motions=motions))
+        for name, camera in after.items():
+            pixel = np.linspace(0.0, camera.pixels - 1.0, 101)
+            np.testing.assert_allclose(camera.look(pixel), before[name].look(pixel), rtol=0, atol=ROUNDING)
+            ray = camera.origin(pixel) - grown * before[name].origin(pixel)
+            # a point anywhere on the ray
+            np.testing.assert_allclose(np.cross(ray, camera.look(pixel)), 0.0, atol=1e-13)
+
+
+def test_targets_are_imaged_on_the_same_pixels(with_camera, backend) -> None:
+    instrument = with_camera("gf7")
+    model = instrument.cameras["backward"]
+    path = TargetPath(instrument.assembly, "backward", "base/backward", model, backend)
+    places = np.array([[0.11, 0.004], [0.0, -0.003], [-0.08, 0.0]])
+    directions = path.directions(places)
+    frequency = 0.5 / model.spec.line.pitch * np.array([[1.0, 0.0], [0.0, 1.0], [0.6, 0.3]])
+    for motions in ({}, MOVED):
+        state = heated(instrument, ALUMINIUM, motions=motions)
+        before, after = path.places(motions, directions), path.places(state, directions)
+        np.testing.assert_allclose(after, before, rtol=0, atol=1e-13)
+        maps = [path.local_map(s, directions[0], 1e-3) for s in (motions, state)]
+        np.testing.assert_allclose(maps[1].jacobian, maps[0].jacobian, rtol=1e-9, atol=1e-9)
+        pupils = [path.pupils(s, directions, before) for s in (motions, state)]
+        for one, other in zip(*pupils, strict=True):
+            colour = np.array([model.spec.wavelength]), np.ones(1)
+            old, new = (polychromatic_transfer(p, frequency, *colour, np.zeros(1))[0] for p in (one, other))
+            # to the share by which the wavefront error, below a wave, grows against the wavelength
+            np.testing.assert_allclose(new, old, rtol=0, atol=2.0 * np.pi * ALUMINIUM.expansion * WARMER)
+
+
+def test_image_quality_grows_with_the_instrument(with_camera, backend) -> None:
+    instrument, size = with_camera("gf7"), ALUMINIUM.expansion * WARMER
+    before, after = image_quality(instrument, backend, [MOVED, heated(instrument, ALUMINIUM, motions=MOVED)]).to_dicts()
+    for name in instrument.cameras:
+        old, new = before["cameras"][name], after["cameras"][name]
+        assert new["wfe_worst_waves"] == pytest.approx((1.0 + size) * old["wfe_worst_waves"], rel=1e-6)
+        for place, defocus in old["defocus_um"].items():
+            # 1e-14 m of rounding in a path is 1e-11 m of defocus at F/9
+            assert new["defocus_um"][place] == pytest.approx((1.0 + size) * defocus, abs=3e-5)
+        for key in ("mtf_along_line", "mtf_along_track"):
+            for place, mtf in old[key].items():
+                assert new[key][place] == pytest.approx(mtf, abs=10.0 * size)
+
+
+def test_rendered_spots_stay_on_their_pixels(with_camera, backend) -> None:
+    """Expected images; light does not grow, so that rings are narrower on the pixels by the growth."""
+    instrument = with_camera("gf7")
+    path = MonitorPath(instrument, backend)
+    far = {"base/forward/focal_plane": Motion(shift=(80e-6, -120e-6, 0.0))}
+    still, warm = path.expected_photons([far, heated(instrument, ALUMINIUM, 20.0, far)], single=False)
+    size = 20.0 * ALUMINIUM.expansion
+    assert np.abs(warm - still).max() < 3.0 * size * still.max()
+    np.testing.assert_allclose(warm.sum(axis=(1, 2)), still.sum(axis=(1, 2)), rtol=0.1 * size)
+    axes = [np.arange(n) - 0.5 * (n - 1) for n in path.shape]
+    core = still > 0.05 * still.max(axis=(1, 2), keepdims=True)
+    for k, axis in enumerate(axes):
+        where = np.expand_dims(axis, 1 - k)
+        old, new = (np.sum(f * core * where, axis=(1, 2)) / np.sum(f * core, axis=(1, 2)) for f in (still, warm))
+        assert np.abs(old).max() > 10.0
+        # a pixel grid that did not grow would move the far spots by 6e-3 to 1e-2 pixels
+        np.testing.assert_allclose(new, old, rtol=0, atol=3e-4)
+
+
+def test_drawn_beams_grow(with_camera, backend) -> None:
+    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
+    before, after = (trace_light_paths(instrument, backend, s).beams for s in ({}, heated(instrument, ALUMINIUM)))
+    for one, other in zip(before, after, strict=True):
+        first = 1 if "imaging" in one.name else 0  # where the scene's beam is cut off is not on the instrument
+        # rays are aimed to 1e-9 m
+        np.testing.assert_allclose(other.vertices[:, first:], grown * one.vertices[:, first:], rtol=0, atol=1e-7)
+
+
+def test_detectors_of_the_path_tracer_have_grown_pixels(with_camera, backend) -> None:
+    instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
+    nominal, warm = (build_scenery(instrument, s) for s in ({}, heated(instrument, ALUMINIUM)))
+    for one, other in zip(nominal.detectors, warm.detectors, strict=True):
+        assert (one.name, one.rows, one.columns) == (other.name, other.rows, other.columns)
+        assert other.pitch == pytest.approx([grown * p for p in one.pitch], rel=1e-15)
+    optics = [s for s in nominal.surfaces if s.elements]
+    assert len(optics) > 30
+    for surface in optics:
+        other = warm.surfaces[warm.of_element(surface.elements[0])]
+        for mine, its in zip(surface.apertures, other.apertures, strict=True):
+            np.testing.assert_allclose(its.bounds, mine.grown(grown).bounds, rtol=1e-12, atol=1e-15)
+
+
+# --- what a CCD does by itself ----------------------------------------------------------------------------------------
+
+
+def test_a_line_that_alone_is_warm_has_larger_pixels(with_camera, backend) -> None:
+    """Its pixels see larger angles: the principal distance that they count is shorter by the growth."""
+    instrument = with_camera("monitor")
+    body = line_body("base/forward")
+    state = heated(instrument, ALUMINIUM, only=body)
+    truth = trace_truth(instrument, backend, [state])
+    size = ALUMINIUM.expansion * WARMER
+    change = truth.cameras["forward"]
+    # distortion makes the distance 0.17 % longer over the line than at its centre; with the square of the line's length
+    assert change.d_f[0] == pytest.approx(-size * truth.principal_distance["forward"], rel=4e-3)
+    assert max(abs(change.d_alpha[0]), abs(change.d_beta[0]), abs(change.d_gamma[0])) < ROUNDING
+    assert truth.cameras["backward"].d_f[0] == 0.0
+    nominal, warm = (traced_line_cameras(instrument, backend, s)["forward"] for s in ({}, state))
+    pixel = np.linspace(0.0, nominal.pixels - 1.0, 7)
+    middle = 0.5 * (nominal.pixels - 1)
+    # a pixel of the grown line lies where another one lay
+    inside = np.abs(pixel - middle) * (1.0 + size) < middle
+    there = middle + (1.0 + size) * (pixel[inside] - middle)
+    np.testing.assert_allclose(warm.look(pixel[inside]), nominal.look(there), rtol=0, atol=ROUNDING)
+
+
+def test_an_area_ccd_that_alone_is_warm_has_larger_pixels(with_camera, backend) -> None:
+    """Places are counted in the chip's own pixels, which the analysis takes to have the nominal pitch."""
+    instrument = with_camera("gf7")
+    path = MonitorPath(instrument, backend).coarse
+    far = {"base/forward/focal_plane": Motion(shift=(80e-6, -120e-6, 0.0))}
+    body = instrument.channels[0].ccd_body
+    found = spots(path, path.rays([far, heated(instrument, ALUMINIUM, motions=far, only=body)]))
+    size = ALUMINIUM.expansion * WARMER
+    np.testing.assert_allclose(found[0, 1], found[0, 0] / (1.0 + size), rtol=1e-12)
+    assert np.all(np.abs(found[0, 0]) > 10.0)
+    np.testing.assert_array_equal(found[1:, 1], found[1:, 0])
+
+
+def test_a_scaled_camera_keeps_its_detectors(with_camera, backend) -> None:
+    """`scale` is not heat: mirrors and spacings grow and CCDs do not, so that the principal distance grows."""
+    instrument = with_camera("gf7")
+    state = {"base/forward": Motion(scale=20e-6)}
+    placed = instrument.assembly.place([state])
+    for body in (line_body("base/forward"), instrument.channels[0].ccd_body):
+        assert placed.size(body)[0] == 1.0
+    change = trace_truth(instrument, backend, [state])
+    assert change.cameras["forward"].d_f[0] == pytest.approx(20e-6 * change.principal_distance["forward"], rel=2e-3)
+
+
+# --- glass ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", ["gf7", "monitor"])
+def test_the_index_of_the_prisms_turns_no_beam(camera: str, with_camera, backend) -> None:
+    """The change of index is no similarity: it moves beams sideways in tilted prisms, by less than 0.1 um for 5 K.
+
+    Every prism sends the beam out as it came whatever its index, so that spots move only as the wavefront's aberration
+    differs between so near parts of the pupil.
+    """
+    instrument, stuff = with_camera(camera), material("fused silica")
+    states = [heated(instrument, stuff, index=index) for index in (False, True)]
+    prisms = [motion for path, motion in states[1].items() if path.endswith("/prism_180")]
+    assert len(prisms) == 4
+    assert all(motion.index > 2e-5 for motion in prisms)
+    path = MonitorPath(instrument, backend).coarse
+    found = spots(path, path.rays(states))
+    moved = np.abs(found[:, 1] - found[:, 0])
+    assert 1e-9 < moved.max() < 1e-6
