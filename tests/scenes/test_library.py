@@ -61,7 +61,9 @@ def test_cameras(name: str) -> None:
     assert camera.stop == "M2"
     assert camera.field_bias == pytest.approx(math.radians(6))
     assert camera.edge_margin == 0.005
-    assert camera.line.pitch == 7e-6
+    assert (camera.line.pixels, camera.line.pitch) == (102_400 if name == "monitor" else 32_768, 7e-6)
+    # the whole line lies in the field for which the camera was designed
+    assert 0.5 * camera.line.pixels * camera.line.pitch < camera.focal_length * math.tan(camera.field.x)
 
 
 def test_aspheric_terms() -> None:

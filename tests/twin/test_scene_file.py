@@ -230,6 +230,9 @@ def test_beams_go_where_they_must(gf7_pair, paths):
         else:
             plane = paths.placed.pose(f"{BASE}/{beam.camera}/focal_plane").inverse().apply(beam.vertices[:, -1])
             assert np.abs(plane[:, [0, 2]]).max() < 1e-9
+            half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
+            share = {"left edge": 1.0, "centre": 0.0, "right edge": -1.0}[beam.name.rpartition("/")[2]]
+            assert plane[:, 1] == pytest.approx(share * half, abs=1e-9)
             stop = beam.footprints[model.spec.stop, 0]
             radius = model.apertures[model.spec.stop].bounds[1]
             assert np.linalg.norm(stop[1:], axis=1) == pytest.approx(radius, abs=2e-6)
