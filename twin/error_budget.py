@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.monitoring import ARCSEC, coefficients
 from analysis.recovery import ESTIMATORS, Recovery, measure_spots, recover
 from optics.backend import Backend
 from optics.heat import Temperature
@@ -23,6 +23,7 @@ from scenes.channel import BASE, CENTRAL_PRISM
 from scenes.error_budget import ErrorBudgetSpec
 from scenes.resolved import ResolvedJob
 from twin.experiment import MonitorExperiment
+from twin.truth import trace_truth
 
 LINES = (
     "centroid",
@@ -72,8 +73,9 @@ class Together:
 
     Attributes:
         spot: three sigma of a spot's angle error per axis and its standard deviation, radians.
-        parameters: estimator -> parameter -> (three sigma, its standard deviation), radians and metres, over trials and
-            both cameras.
+        parameters: estimator -> parameter -> (three sigma, its standard deviation) of reading - truth, radians and
+            metres, over trials and both cameras. Where the focal plane's temperature changes the camera itself, which
+            it does as its line CCD grows, the reading of that is no error.
     """
 
     spot: tuple[float, float]
@@ -174,6 +176,16 @@ class ErrorBudget:
                 else:
                     turns[body] = Motion(rotate=triple(getattr(steady, f"{prism}_rotation")), pivot="centre")
 
+    def grown_focal_planes(self) -> tuple[float, float]:
+        """True change of d_f when every focal plane is warmer by the input, 3 sigma, and what (7) reads, metres."""
+        experiment, change = self.experiment, Temperature(self.spec.steadiness.focal_plane_temperature)
+        names = list(experiment.instrument.cameras)
+        state = experiment.thermal.state({f"{BASE}/{camera}/focal_plane": change for camera in names})
+        true = trace_truth(experiment.instrument, experiment.backend, [state]).cameras[names[0]].d_f[0]
+        shift = _shifts(experiment, [state])[0, :2].ravel()
+        geometry = experiment.calibration.cameras[names[0]].geometry
+        return float(true), float(coefficients("paper_single", geometry)[3] @ shift)
+
     def halved_glass(self) -> tuple[float, float, float]:
         """What halving the 180-deg prisms' glass does to the line of their temperature gradient.
 
@@ -255,6 +267,7 @@ class ErrorBudget:
         states = self.states(LINES[1:], self.spec.all_together, len(LINES))
         calibration = self.experiment.calibration
         before = self.experiment.frames_before(self.spec.frames, self.seed)
+        truth = trace_truth(self.experiment.instrument, self.experiment.backend, states).cameras
         pieces: list[Recovery] = []
         for piece, photons in self.experiment.path.iterate_photons(states, chunk=25):
             progress(0.1 + 0.9 * piece.start / len(states), "all causes: render and measure")
@@ -268,6 +281,7 @@ class ErrorBudget:
             for name in PARAMETER_FIELDS:
                 values = [
                     np.concatenate([np.asarray(getattr(p.parameters[c][estimator], name)) for p in pieces])
+                    - getattr(truth[c], name.rpartition("_")[0])
                     for c in self.experiment.instrument.cameras
                 ]
                 parameters[estimator][name] = _three_sigma(np.stack(values, axis=-1))

@@ -45,6 +45,7 @@ class BudgetImages:
         radians_per_pixel: the unit of a spot's angle error.
         inputs: trials per line (twice as many for FEW_DRAWS), with all causes, and groups of frames.
         lines: of Table 3.
+        focal_plane: true and read change of d_f by the focal plane's temperature, m.
         halved: glass path of the 180-deg prism before and after halving, m, and the ratio of its errors.
         together: all causes at once.
         scatter: of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
@@ -55,6 +56,7 @@ class BudgetImages:
     radians_per_pixel: float
     inputs: tuple[int, int, int]
     lines: dict[str, BudgetLine]
+    focal_plane: tuple[float, float] | None
     halved: tuple[float, float, float] | None
     together: Together | None
     scatter: tuple[tuple[float, float], tuple[float, float]] | None
@@ -74,6 +76,7 @@ def measured(context: Context) -> BudgetImages:
     for i, name in enumerate(wanted):
         context.progress(0.05 + 0.4 * i / len(wanted), name)
         lines[name] = more_trials(budget, 2 if name in FEW_DRAWS else 1).line(name)
+    grown = budget.grown_focal_planes() if "coordinate_thermal" in lines else None
     halved = None
     if "001.table3.prism_180_thermal.halved" in context.selected:
         context.progress(0.45, "half the glass path")
@@ -88,7 +91,7 @@ def measured(context: Context) -> BudgetImages:
         causes = budget.together(lambda done, text: context.progress(0.55 + 0.4 * done, text))
     geometry = next(iter(budget.experiment.calibration.cameras.values())).geometry
     inputs = (trials, together, groups)
-    return BudgetImages(geometry, budget.radians_per_pixel, inputs, lines, halved, causes, scatter, roll)
+    return BudgetImages(geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, roll)
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:

@@ -58,7 +58,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     images = measured(context)
     for name, line in images.lines.items():
         if f"001.table3.{name}" in context.selected:
-            yield _line(context, line, images.inputs[0] * (2 if name in FEW_DRAWS else 1))
+            yield _line(context, images, line)
     if images.halved is not None:
         before, after, ratio = images.halved
         how = (
@@ -78,14 +78,21 @@ def measured(context: Context) -> BudgetImages:
     return budget_images.measured(context)
 
 
-def _line(context: Context, line: BudgetLine, trials: int) -> CheckResult:
+def _line(context: Context, images: BudgetImages, line: BudgetLine) -> CheckResult:
+    trials = images.inputs[0] * (2 if line.name in FEW_DRAWS else 1)
     how = (
         f"Input (3σ): {line.value:.4g} {line.unit}. {trials} random states, rendered, spots measured; 3 x rms over all "
         f"spots, along the line {line.by_axis[0] / ARCSEC:.3f}, across {line.by_axis[1] / ARCSEC:.3f} arcsec. "
         f"For 0.1 arcsec: {line.allowed:.3g} {line.unit}."
     )
     if line.name == "coordinate_thermal":
-        how += " It moves both spots of a camera apart, not together: all of it is d_f, none of it rotation."
+        assert images.focal_plane is not None
+        true, read = images.focal_plane
+        how += (
+            " It moves both spots of a camera apart, not together: all of it is d_f, none of it rotation. The line CCD "
+            f"grows with its focal plane, so that this is a true change of {1e6 * true:.2f} um, which (7) reads as "
+            f"{1e6 * read:.2f}; an error of the monitor it is where the line CCD does not follow."
+        )
     check = context.check(f"001.table3.{line.name}")
     return check.judge(line.three_sigma / ARCSEC, line.sigma / ARCSEC, how)
 

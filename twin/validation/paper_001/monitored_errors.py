@@ -91,12 +91,13 @@ def _simulated(context: Context, images: BudgetImages, together: Together, name:
     formula = error_propagation.propagated(together.spot[0], images.geometry)[name] / size
     how = (
         f"{images.inputs[1]} random states with all causes through images of {error_propagation.FRAMES} frames, "
-        f"printed factor. By formula from the simulated error of one spot: {formula:.3g}; corrected factors by Monte "
-        f"Carlo: {values['derived'][0]:.3g} ± {values['derived'][1]:.2g} {unit}."
+        f"printed factor, reading - traced truth. By formula from the simulated error of one spot: {formula:.3g}; "
+        f"corrected factors by Monte Carlo: {values['derived'][0]:.3g} ± {values['derived'][1]:.2g} {unit}."
     )
     if name == "d_gamma":
         how += " The printed (5) is twice too large, so the monitor is twice as good as printed."
     if name == "d_f":
+        how += " The focal plane's growth is read rightly and is no part of it."
         joint = values["paper_joint"]
         how += f" Table 1's joint form gives half: {joint[0]:.3g} ± {joint[1]:.2g} mm."
     single = values["paper_single"]
