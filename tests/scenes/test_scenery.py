@@ -182,6 +182,9 @@ def test_detectors_have_the_grids_of_the_wave_path(scene) -> None:
         detector = next(d for d in scenery.detectors if d.name == name)
         assert detector.shape == (ccd.rows, ccd.columns)
         assert by_name(scenery, name).pose == placed.pose(channel.ccd_body)
+    for camera, model in instrument.cameras.items():
+        detector = next(d for d in scenery.detectors if d.name == f"{camera}/line")
+        assert detector.shape == (model.spec.line.pixels, 1)
     line = by_name(scenery, "forward/line")
     # it faces the light, which comes along the focal plane's +Z
     assert line.pose.rotation[:, 2] @ placed.pose("base/forward/focal_plane").rotation[:, 2] == pytest.approx(-1.0)
