@@ -222,16 +222,16 @@ class MonitorPath:
         return RayFan(np.concatenate(position)[:, None].real, guess, axes), systems
 
     @cached_property
-    def _target(self) -> np.ndarray:
-        """Nodes on the return face, (N, 2), metres."""
+    def target(self) -> np.ndarray:
+        """Nodes on the return face, (N, 2), metres of its nominal size."""
         return self.face_radius * np.stack([self.nodes.x, self.nodes.y], axis=-1)
 
     def _aim_nominal(self) -> Aimed:
         """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
         middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
-        near = middle + np.einsum("bnij,pj->bpi", inverse(slope), self._target)
-        q, slope = aim(self.backend, outgoing, fan, self._target, near, slope, AIM_TOLERANCE)
+        near = middle + np.einsum("bnij,pj->bpi", inverse(slope), self.target)
+        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, AIM_TOLERANCE)
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
 
@@ -248,7 +248,7 @@ class MonitorPath:
         back = assemble(self.instrument.assembly, names, states, placed=placed)
         nominal = scout.nominal
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
-        q, _ = aim(self.backend, outgoing, fan, scout._target, start, slope, AIM_TOLERANCE)
+        q, _ = aim(self.backend, outgoing, fan, scout.target, start, slope, AIM_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
         pitch = self.pitch * back.size[:, None]
@@ -273,9 +273,9 @@ class MonitorPath:
         uploaded = known.back.upload(self.backend)
         face = len(known.outgoing.structure) - 1
         traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
-        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * self._target)) <= AIM_TOLERANCE:
+        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * self.target)) <= AIM_TOLERANCE:
             # a change that is not smooth enough for its few terms
-            q, _ = aim(self.backend, known.outgoing, known.fan, self._target, q, slope, AIM_TOLERANCE)
+            q, _ = aim(self.backend, known.outgoing, known.fan, self.target, q, slope, AIM_TOLERANCE)
             launch = known.fan.at(q)
             traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
         position, direction, length, valid = traced.numpy()

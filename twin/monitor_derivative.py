@@ -12,15 +12,22 @@ from optics.backend import Backend
 from optics.diffraction import PupilTangent, image_derivative
 from optics.push_forward import RayTangents, push_forward
 from optics.system import SystemBatch, assemble
-from optics.tree import COMPLEX_STEP
+from optics.tree import COMPLEX_STEP, PlacedBodies
 from twin.monitor import MonitorPath
 from twin.motions import ElementaryMotion, pivot_states
 
 
-def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayTangents:
+def size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
+    """Derivative of the sizes of C bodies by the steps of M states, (C, M)."""
+    return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
+
+
+def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tuple[RayTangents, np.ndarray]:
     """Push motions forward through the traced path, about the unperturbed instrument; rays stay on their nodes.
 
-    The result is for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit.
+    Returns:
+        Derivatives for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit, and
+        those of the CCDs' sizes, (C*M,).
 
     The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
     """
@@ -41,8 +48,10 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> RayT
     outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
-    q_step = -turned(np.repeat(inverse(slopes), m, axis=0), drift)
-    return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0)))
+    faces = size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
+    q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.target - drift)
+    sizes = size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
+    return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
 
 def hit_slopes(
@@ -78,7 +87,11 @@ def spot_jacobian(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.
     Returns:
         (C, 2, M): row and column, pixels per radian, metre or unit.
     """
-    mean = np.einsum("n,bnk->bk", path.coarse.nodes.share, ray_tangents(path.coarse, motions).position[..., 1::-1])
+    tangents, sizes = ray_tangents(path.coarse, motions)
+    place = tangents.traced.numpy()[0]
+    # a place is counted in pixels, which grow with the chip
+    moved = tangents.position - sizes[:, None, None] * place
+    mean = np.einsum("n,bnk->bk", path.coarse.nodes.share, moved[..., 1::-1])
     return np.asarray(mean.reshape(len(path.channels), len(motions), 2).swapaxes(1, 2)) / path.pitch
 
 
@@ -92,11 +105,13 @@ def photon_derivative(path: MonitorPath, motions: Sequence[ElementaryMotion]) ->
     Returns:
         (M, C, rows, columns), photons per radian, metre or unit.
     """
-    tangents = ray_tangents(path, motions)
+    tangents, sizes = ray_tangents(path, motions)
     count = len(motions)
     rays = path.rays([{}])
     field = path.field_of(rays)
-    u_step, v_step = tangents.direction[..., 0], tangents.direction[..., 1]
+    # per nominal length of the chip, see ``PupilField.in_lengths_of``
+    grown = tangents.direction + sizes[:, None, None] * np.repeat(rays.direction, count, axis=0)
+    u_step, v_step = grown[..., 0], grown[..., 1]
     # eikonal = path - d . position with the CCD's centre as the origin
     position, direction = (np.repeat(a, count, axis=0) for a in (rays.position, rays.direction))
     eikonal_step = tangents.path - np.sum(tangents.direction * position + direction * tangents.position, axis=-1)

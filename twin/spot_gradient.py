@@ -21,10 +21,11 @@ import numpy as np
 from optics.aim import RayFan, aim
 from optics.pull_back import pull_back
 from optics.system import SystemBatch, assemble
+from optics.trace import make_rays, trace
 from optics.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State
 from scenes.instrument_model import Instrument
 from twin.monitor import AIM_TOLERANCE, MonitorPath
-from twin.monitor_derivative import hit_slopes
+from twin.monitor_derivative import hit_slopes, size_steps
 from twin.motions import FIGURE_TERMS, ElementaryMotion
 
 CHUNK = 1 << 17
@@ -79,7 +80,10 @@ def spot_gradient(
     out = np.zeros((len(path.channels), 2, len(motions)))
     once = np.arange(0, outgoing.count, 2)
     rays = max(chunk // len(path.channels), 1)
+    size = monitor.size[once]
     pitch = path.pitch * monitor.size
+    face_steps = size_steps(placed, [channel.face_body for channel in path.channels])
+    chip_steps = size_steps(placed, [channel.ccd_body for channel in path.channels])
     for start in range(0, path.nodes.count, rays):
         piece = slice(start, start + rays)
         place, heading = launch[:, piece], launched[:, piece]
@@ -96,6 +100,13 @@ def spot_gradient(
         pinhole = (there.position + node.position).sum(axis=1).reshape(len(path.channels), 2, 3)
         out += monitor_steps.dot(there.values) + outgoing_steps.dot(node.values)
         out += np.einsum("ckx,cmx->ckm", pinhole, source)
+        # nodes ride on the return face as it grows, and places are counted in pixels, which grow with the chip
+        ridden = np.einsum("bnx,nx->b", back, path.target[piece]).reshape(-1, 2)
+        out -= ridden[:, :, None] * face_steps[:, None]
+        start_rays = make_rays(path.backend, launch[:, piece], launched[:, piece])
+        hit = trace(path.backend, monitor.take(once), start_rays).place()[..., ::-1]
+        spot = np.einsum("n,bnk->bk", path.nodes.share[piece], hit) / (path.pitch * size[:, None] ** 2)
+        out -= spot[:, :, None] * chip_steps[:, None]
     return out
 
 
@@ -184,6 +195,5 @@ def _aimed(path: MonitorPath, about: State) -> tuple[np.ndarray, np.ndarray]:
     place = np.broadcast_to(origin[:, None], start.shape)
     axes, slopes = hit_slopes(path.backend, systems, place, nominal.direction)
     fan = RayFan(place, nominal.direction, axes)
-    nodes = path.face_radius * np.stack([path.nodes.x, path.nodes.y], axis=-1)
-    q, _ = aim(path.backend, systems, fan, nodes, jacobian=slopes, tolerance=AIM_TOLERANCE)
+    q, _ = aim(path.backend, systems, fan, path.target, jacobian=slopes, tolerance=AIM_TOLERANCE)
     return fan.at(q)
