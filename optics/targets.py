@@ -1,4 +1,4 @@
-"""Test targets of optical benches as vector shapes: knife edge, bar group, bars with level references, star, pinhole.
+"""Test targets of optical benches as vector shapes: knife edge, bar group, star, pinhole.
 
 A target lies in its own plane, metres, about the origin. ``Target.mapped`` takes it into an image plane, where columns
 count along x and rows along y. Levels are transmittances, 0 to 1.
@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from optics.aperture import Rectangle
 from optics.vector_shape import BEND_TOLERANCE, Disk, HalfPlane, PointMap, Polygon, Shape
 
 
@@ -55,20 +54,6 @@ class Target:
         return Target(self.background, tuple((part[0], shape) for part, shape in zip(self.parts, shapes, strict=True)))
 
 
-@dataclass(frozen=True)
-class BarLayout:
-    """Where an analysis finds what it needs on a bar target; all sides lie along x and y, metres in the target's plane.
-
-    Attributes:
-        group: inside the group, at least the clearance away from the bars' ends; upright bars fill it to its sides.
-        bright, dark: of even level, at least the clearance away from everything else.
-    """
-
-    group: Rectangle
-    bright: Rectangle
-    dark: Rectangle
-
-
 def slanted_edge(angle: float, direction: Literal["x", "y"] = "y") -> Target:
     """A knife edge through the origin, bright on one side, for the slanted-edge method (ISO 12233).
 
@@ -92,78 +77,18 @@ def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) ->
         length: of a bar, metres.
         angle: of the bars' normal from +x toward +y, radians.
     """
-    return Target(0.0, tuple((1.0, bar) for bar in _bars(frequency, bars, length, angle, (0.0, 0.0))))
-
-
-def bar_target(
-    frequency: float,
-    bars: int,
-    region: Rectangle,
-    clearance: float,
-    direction: Literal["x", "y"] = "x",
-    tilt: float = 0.0,
-) -> tuple[Target, BarLayout]:
-    """A bar group with a large bright square and a dark patch as level references, on dark.
-
-    Half of the region, on the negative side of the axis along the bars, holds the group, whose bars are as long as they
-    can be. The other half holds the bright square at the negative end of the bars' normal and is dark at the other.
-
-    Args:
-        frequency: along the bars' normal, cycles/m.
-        bars: number of bright bars.
-        region: what the target has to fit into.
-        clearance: kept free around the group and the square, and taken off the patches of the layout, metres: several
-            times the width of the blur.
-        direction: the axis along which the bars repeat.
-        tilt: by which the normal is turned from that axis, from +x toward +y, radians, below 45 degrees either way.
-
-    Raises:
-        ValueError: the bars do not fit, or the region leaves nothing of a patch.
-    """
-    if not clearance >= 0.0:
-        raise ValueError(f"the clearance must not be negative, found {clearance}")
-    if not abs(tilt) < 0.25 * np.pi:
-        raise ValueError(f"a bar target needs a tilt below 45 degrees, found {np.degrees(tilt):g}")
-    swap = _is_y(direction)
-    along, across = (region.half_y, region.half_x) if swap else (region.half_x, region.half_y)
-    _check_bars(frequency, bars)
-    half_width = 0.25 * (2 * bars - 1) / frequency
-    cosine, sine = np.cos(tilt), abs(np.sin(tilt))
-    # the tilted group touches its cell (half sizes: along, across/2) less the clearance
-    half_length = (0.5 * across - clearance - half_width * sine) / cosine
-    if half_length <= 0.0 or half_width * cosine + half_length * sine > along - clearance:
-        raise ValueError(
-            f"{bars} bars of {frequency:g} cycles/m are {2.0 * half_width:.3g} m wide; with a clearance of"
-            f" {clearance:g} m they do not fit a region of {2.0 * along:.3g} m by {2.0 * across:.3g} m"
-        )
-    side = min(0.5 * along, 0.5 * across) - clearance
-    # the largest upright rectangle between the bars' ends, drawn in by the clearance
-    short = half_length - clearance
-    inner_p = (half_width * cosine - short * sine) / np.cos(2.0 * tilt)
-    inner_q = (short * cosine - half_width * sine) / np.cos(2.0 * tilt)
-    if min(side - clearance, inner_p, inner_q) <= 0.0:
-        raise ValueError(
-            f"a clearance of {clearance:g} m and a tilt of {np.degrees(tilt):g} degrees leave no room for the patches"
-            f" of bars and levels in a region of {2.0 * along:.3g} m by {2.0 * across:.3g} m"
-        )
-
-    def place(p: float, q: float) -> tuple[float, float]:
-        x, y = (q, p) if swap else (p, q)
-        return region.centre[0] + x, region.centre[1] + y
-
-    def patch(p: float, q: float, half_p: float, half_q: float) -> Rectangle:
-        return Rectangle(half_q, half_p, place(p, q)) if swap else Rectangle(half_p, half_q, place(p, q))
-
-    group = place(0.0, -0.5 * across)
-    angle = tilt + (0.5 * np.pi if swap else 0.0)
-    square = patch(-0.5 * along, 0.5 * across, side, side)
-    parts = [*_bars(frequency, bars, 2.0 * half_length, angle, group), _rectangle(square)]
-    layout = BarLayout(
-        patch(0.0, -0.5 * across, inner_p, inner_q),
-        patch(-0.5 * along, 0.5 * across, side - clearance, side - clearance),
-        patch(0.5 * along, 0.5 * across, 0.5 * along - clearance, 0.5 * across - clearance),
-    )
-    return Target(0.0, tuple((1.0, part) for part in parts)), layout
+    if not (np.isfinite(frequency) and frequency > 0.0):
+        raise ValueError(f"bars need a positive frequency in cycles/m, found {frequency}")
+    if bars < 1 or bars != int(bars):
+        raise ValueError(f"a bar group needs a whole number of bars, 1 or more, found {bars}")
+    if not (np.isfinite(length) and length > 0.0):
+        raise ValueError(f"bars need a positive length, found {length}")
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    along = np.array([-normal[1], normal[0]])
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    upright = corners[:, :1] * 0.25 / frequency * normal + corners[:, 1:] * 0.5 * length * along
+    middles = (np.arange(int(bars)) - 0.5 * (bars - 1)) / frequency
+    return Target(0.0, tuple((1.0, Polygon(middle * normal + upright)) for middle in middles))
 
 
 def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
@@ -191,30 +116,6 @@ def pinhole(diameter: float) -> Target:
     if not (np.isfinite(diameter) and diameter > 0.0):
         raise ValueError(f"a pinhole needs a positive diameter, found {diameter}")
     return Target(0.0, ((1.0, Disk(np.zeros(2), 0.5 * diameter)),))
-
-
-def _bars(frequency: float, bars: int, length: float, angle: float, centre: tuple[float, float]) -> list[Polygon]:
-    _check_bars(frequency, bars)
-    if not (np.isfinite(length) and length > 0.0):
-        raise ValueError(f"bars need a positive length, found {length}")
-    normal = np.array([np.cos(angle), np.sin(angle)])
-    along = np.array([-normal[1], normal[0]])
-    quarter = 0.25 / frequency
-    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    upright = corners[:, :1] * quarter * normal + corners[:, 1:] * 0.5 * length * along
-    return [Polygon(np.array(centre) + (i - 0.5 * (bars - 1)) / frequency * normal + upright) for i in range(int(bars))]
-
-
-def _check_bars(frequency: float, bars: int) -> None:
-    if not (np.isfinite(frequency) and frequency > 0.0):
-        raise ValueError(f"bars need a positive frequency in cycles/m, found {frequency}")
-    if bars < 1 or bars != int(bars):
-        raise ValueError(f"a bar group needs a whole number of bars, 1 or more, found {bars}")
-
-
-def _rectangle(rectangle: Rectangle) -> Polygon:
-    x0, x1, y0, y1 = rectangle.bounds
-    return Polygon(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
 
 
 def _is_y(direction: str) -> bool:

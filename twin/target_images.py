@@ -7,28 +7,23 @@ recorded follows the image by whole pixels, so that the image lies on the pixels
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
 from optics.aim import AimError
-from optics.aperture import Rectangle
 from optics.diffraction import Grid
 from optics.pupil_function import PupilFunction
 from optics.target_image import target_image
-from optics.targets import BarLayout, Target, bar_target, pinhole, siemens_star
+from optics.targets import Target, bar_group, pinhole, siemens_star
 from optics.trace import BeamMissedError
 from optics.transfer import TransferTable, polychromatic_transfer
 from optics.tree import State
 from scenes.band import BandSpec
-from twin.edge_images import ALONG, TRACK, EdgeImager, EdgeOptics, knife_edge
+from twin.edge_images import ALONG, EdgeImager, EdgeOptics, knife_edge
 from twin.line_ccd import LineCcd, band_wavelengths
 from twin.target_path import LocalMap, TargetPath
-
-AXES: Mapping[str, Literal["x", "y"]] = {ALONG: "x", TRACK: "y"}
 
 PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Places on the line by their share of its usable half; left is the +Y' end."""
@@ -37,13 +32,13 @@ MARGIN = 0.02
 """Share of the line's pixels kept between each end and the nominal windows, so that an image may move."""
 
 BAR_TILT = float(np.radians(7.0))
-"""Of the bars' normal from the axis: within the group every sampling phase occurs twice, even in 112 pixels."""
+"""Of the bars' normal from the axis: within the group every sampling phase occurs four times, even in 112 pixels."""
 
-BAR_SHARE = 0.36
-"""Half width of the bar group, as a share of half the region: leaves room for the bars' length when they are tilted."""
+BAR_SHARE = 0.45
+"""Side of the bar group, as a share of the region's."""
 
 CLEARANCE = 6.0
-"""Pixels kept free about bars and level patches: the diffraction tails are then about 1% of the contrast."""
+"""Pixels of the group about the part that is measured."""
 
 SPOKES = 36
 STAR_SHARE = 0.9
@@ -127,21 +122,19 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class BarDesign:
-    """A bar target that has the Nyquist frequency on the nominal image, and where an analysis finds its parts.
+    """Bars in a window's middle that have the Nyquist frequency on the nominal image, and what is measured of them.
 
     Attributes:
-        target: the bars and the level references.
+        target: the bars.
         frequency: on the target, (2,), cycles/m.
         nominal: on the nominal image, (2,), cycles/m.
-        group, bright, dark: (rows, columns) of the window.
+        group: (rows, columns) of the window that lie well inside the group.
     """
 
     target: Target
     frequency: np.ndarray
     nominal: np.ndarray
     group: tuple[slice, slice]
-    bright: tuple[slice, slice]
-    dark: tuple[slice, slice]
 
     @classmethod
     def build(cls, view: View, direction: str) -> BarDesign:
@@ -151,13 +144,16 @@ class BarDesign:
         nominal = view.band.nyquist * np.array([np.cos(turn), np.sin(turn)])
         # phases agree on target and image: f_target . q = f_image . (J q)
         frequency = jacobian.T @ nominal
-        half = 0.5 * view.region * pitch
-        window = Rectangle(half / abs(jacobian[0, 0]), half / abs(jacobian[1, 1]), (0.0, 0.0))
-        size = float(np.hypot(*frequency))
-        bars = int(2.0 * BAR_SHARE * (0.5 * view.region * pitch) * view.band.nyquist + 0.5)
-        angle = float(np.arctan2(frequency[1], frequency[0])) - (0.0 if direction == ALONG else 0.5 * np.pi)
-        target, layout = bar_target(size, bars, window, CLEARANCE * pitch, AXES[direction], angle)
-        return cls(target, frequency, nominal, *_patches(layout, view))
+        size, angle = float(np.hypot(*frequency)), float(np.arctan2(frequency[1], frequency[0]))
+        bars = round(BAR_SHARE * view.region * pitch * view.band.nyquist)
+        # as long on the image as the group is wide there
+        stretch = float(np.hypot(*(jacobian @ np.array([-np.sin(angle), np.cos(angle)]))))
+        target = bar_group(size, bars, bars / (view.band.nyquist * stretch), angle)
+        # the upright square in a tilted one; the image lies up to half a pixel beside the middle
+        inside = bars - CLEARANCE - 0.5
+        half = int(inside / (np.cos(BAR_TILT) + np.sin(BAR_TILT)))
+        sides = slice(view.region // 2 - half, view.region - view.region // 2 + half)
+        return cls(target, frequency, nominal, (sides, sides))
 
     def seen(self, view: View) -> np.ndarray:
         """Frequency on the image of a view, (2,), cycles/m."""
@@ -168,22 +164,6 @@ class BarDesign:
         """Nominal frequency over the Nyquist frequency's 0.5 cycles/pixel: (down the column, along the row)."""
         along, across = 0.5 * self.nominal / float(np.hypot(*self.nominal))
         return float(across), float(along)
-
-
-def _patches(layout: BarLayout, view: View) -> tuple[tuple[slice, slice], ...]:
-    """Pixels that lie wholly inside of the layout's rectangles as they are imaged."""
-    out = []
-    for patch in (layout.group, layout.bright, layout.dark):
-        x0, x1, y0, y1 = patch.bounds
-        corners = view.local(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])) + view.offset
-        place = corners / view.band.pitch + 0.5 * (view.region - 1)
-        sides = []
-        for k, low, high in ((1, [0, 1], [2, 3]), (0, [0, 3], [1, 2])):
-            # a pixel reaches half a pixel beyond its centre, and the window follows an image to half a pixel
-            first, last = float(np.max(place[low, k])) + 1.0, float(np.min(place[high, k])) - 1.0
-            sides.append(slice(max(int(np.ceil(first)), 0), min(int(np.floor(last)) + 1, view.region)))
-        out.append((sides[0], sides[1]))
-    return tuple(out)
 
 
 def star_target(pitch: float, region: int) -> Target:

@@ -43,6 +43,9 @@ CURVE = np.linspace(0.0, 1.0, 65)
 LARGEST_FRAMES = 400_000_000
 """Pixels of all frames together, which are kept: 0.8 GB."""
 
+EVEN_FIELDS = {"dark": 0.0, "bright": 1.0}
+"""Recorded with bars: share of the white signal."""
+
 _PATTERN, _EXPOSURE = 3, 4
 """Random streams of the job's seed, beside those of the monitor."""
 
@@ -57,7 +60,7 @@ def check_targets(resolved: ResolvedJob) -> None:
     names = job.render.target_images
     if not names:
         return
-    kinds = sum(len(DIRECTIONS) if name in ("knife_edge", "bars") else 1 for name in names)
+    kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
     each = len(resolved.instrument.cameras) * len(PLACES) * 2 * kinds * settings.region**2
     if each * (settings.frames or 1) > LARGEST_FRAMES:
         raise job.error(
@@ -143,7 +146,8 @@ class _Shooter:
     def shoot(self, view: View, seed: np.random.SeedSequence) -> TargetShots:
         """Expose and measure every target in one state."""
         frames: dict[str, np.ndarray] = {}
-        edges, bars = {}, {}
+        edges: dict[str, EdgeReading] = {}
+        bars: dict[str, BarReading] = {}
 
         def expose(name: str, share: np.ndarray) -> np.ndarray:
             photons = view.ccd.white_photons(self.settings.white) * share
@@ -155,9 +159,12 @@ class _Shooter:
                 imager = view.edge(direction, self.settings.angle)
                 mean = expose(f"knife_edge_{direction}", view.edge_image(imager))
                 edges[direction] = read_edge(view, imager.optics.normal, mean, self.count)
-        for direction, design in self.bars.items():
-            mean = expose(f"bars_{direction}", view.image(design.target))
-            bars[direction] = read_bars(view, design, mean, self.count)
+        if self.bars:
+            means = {d: expose(f"bars_{d}", view.image(design.target)) for d, design in self.bars.items()}
+            # the levels as a bench takes them: shutter closed, and the source without a target
+            even = np.ones((view.region, view.region))
+            levels = [expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items()]
+            bars = {d: read_bars(view, design, means[d], *levels, self.count) for d, design in self.bars.items()}
         if "star" in self.images:
             expose("star", view.image(star_target(view.band.pitch, view.region)))
         if "pinhole" in self.images:
@@ -179,14 +186,25 @@ def read_edge(view: View, normal: np.ndarray, mean: np.ndarray, frames: int) -> 
     return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]))
 
 
-def read_bars(view: View, design: BarDesign, mean: np.ndarray, frames: int) -> BarReading:
-    """Measure the mean (H, W) of some frames of a bar target, and trace the truth."""
+def read_bars(
+    view: View, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
+) -> BarReading:
+    """Measure the mean (H, W) of some frames of a bar target, and trace the truth.
+
+    Args:
+        view: the place.
+        design: the bars.
+        mean: (H, W) of their frames, grey values.
+        dark: (H, W) of as many frames with the shutter closed.
+        bright: (H, W) of as many frames of an even field, as bright as the bars.
+        frames: how many.
+    """
     true = float(np.abs(view.transfer(design.seen(view)[None]))[0])
     found: BarMtf | None = None
     reason = ""
     try:
         found = measure_bars(
-            mean[design.group], mean[design.dark], mean[design.bright], design.per_pixel,
+            mean[design.group], dark[design.group], bright[design.group], design.per_pixel,
             noise=view.ccd.noise, frames=frames,
         )  # fmt: skip
     except BarError as error:

@@ -82,6 +82,25 @@ def test_maximum_likelihood_reaches_the_cramer_rao_bound(runs):
     assert 0.95 < spread < 1.10, spread
 
 
+def test_frames_before_and_after_have_noise_of_their_own(runs):
+    """Of one seed and of one state, so that nothing but the noise differs. Differences of frames hold no pattern."""
+    setup, *_ = runs
+    before = setup.frames_before(2, 3)
+    after = setup.frames_after(np.stack([setup.nominal_photons] * 3), 2, 3)
+    again = setup.frames_after(setup.nominal_photons[None], 2, 4)
+    differences = [(frames[:, 1].astype(float) - frames[:, 0]).ravel() for frames in (before, *after, *again)]
+    limit = stats.norm.isf(FALSE_ALARM / 2 / 10)
+    for k, first in enumerate(differences):
+        for second in differences[:k]:
+            products = first * second
+            assert abs(np.sum(products)) < limit * np.sqrt(np.sum(products**2))
+    # and the channels of one exposure
+    for channels in (before, after[0]):
+        each = [(frames[1].astype(float) - frames[0]).ravel() for frames in channels]
+        for k, first in enumerate(each):
+            assert all(abs(np.sum(first * s)) < limit * np.sqrt(np.sum((first * s) ** 2)) for s in each[:k])
+
+
 def test_default_light_does_not_saturate(runs):
     setup, photons, *_ = runs
     frames = setup.frames_after(photons, FRAMES, 0)[0]

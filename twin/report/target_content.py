@@ -72,10 +72,7 @@ def _readings(targets: PlaceTargets, direction: str, kind: str) -> list[tuple[st
 
 
 def _cell(key: str, reading: EdgeReading | BarReading) -> dict[str, str]:
-    """One measured value and its truth; the bars' sigma is small beside their systematic error, so it
-    gives no verdict.
-    """
-    is_edge = isinstance(reading, EdgeReading)
+    """One measured value and its truth."""
     found = reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
     if found is None:
         nothing = dict.fromkeys(("sigma", "residual", "mark"), "")
@@ -83,14 +80,13 @@ def _cell(key: str, reading: EdgeReading | BarReading) -> dict[str, str]:
     value, sigma = found
     true = reading.true_nyquist
     ratio = residual(value - true, sigma)
-    far = is_edge and ratio is not None and abs(ratio) > FAR
-    difference = fixed(value - true, DECIMALS, sign=True)
+    far = ratio is not None and abs(ratio) > FAR
     return {
         "key": key,
         "value": fixed(value, DECIMALS),
-        "sigma": fixed(sigma, DECIMALS) if is_edge else "",
-        "residual": f"{residual_text(ratio)} \N{GREEK SMALL LETTER SIGMA}" if is_edge else difference,
-        "mark": "" if not is_edge else "far" if far else "near",
+        "sigma": fixed(sigma, DECIMALS),
+        "residual": f"{residual_text(ratio)} \N{GREEK SMALL LETTER SIGMA}",
+        "mark": "far" if far else "near",
         "true": fixed(true, DECIMALS),
     }
 

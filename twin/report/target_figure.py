@@ -23,6 +23,8 @@ IMAGE_NAMES = {
     "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
     "bars_along": "bars, along line",
     "bars_track": "bars, along track",
+    "bars_dark": "shutter closed",
+    "bars_bright": "even light",
     "star": "star",
     "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
 }
