@@ -4,8 +4,9 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
+from scenes.detector import PixelPitch
 from scenes.errors import Problem
-from scenes.quantity import Length, PositiveLength, Quantity, Vector
+from scenes.quantity import Length, Quantity, Vector
 from scenes.spec import Number, Reference, Spec, Whole
 from scenes.units import LENGTH, SCALE, TIME, format_quantity
 
@@ -49,7 +50,7 @@ class BandSpec(Spec):
 
     offset: Length = 0.0
     pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
-    pitch: PositiveLength
+    pitch: PixelPitch
     spectrum: Spectrum
     detector: Reference
     diffusion: Diffusion = 0.0
@@ -62,6 +63,11 @@ class BandSpec(Spec):
             found = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
             raise Problem("the spectrum's wavelengths are in the wrong order", found, "[shortest, longest]")
         return self
+
+    @property
+    def exposure(self) -> float:
+        """Of all stages, over which dark current is collected, seconds; the data sheet gives it for all stages."""
+        return self.tdi.stages * self.tdi.line_time
 
     @property
     def nyquist(self) -> float:

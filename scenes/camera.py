@@ -6,6 +6,7 @@ from pydantic import Field, model_validator
 
 from optics.frozen_map import FrozenMap
 from scenes.band import BandSpec
+from scenes.detector import PixelPitch
 from scenes.errors import Problem, names_text, nearest, shown
 from scenes.quantity import AsphereTerms, Length, PositiveLength, Quantity, Wavelength
 from scenes.spec import Name, Named, Number, Spec, Text, Whole
@@ -53,7 +54,7 @@ class LineSpec(Spec):
     """The line CCD, centred on the field bias: number of pixels and their pitch, metres."""
 
     pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
-    pitch: PositiveLength
+    pitch: PixelPitch
 
 
 class CameraSpec(Spec):

@@ -1,4 +1,6 @@
-"""An area detector by the numbers of its EMVA 1288 data sheet, as a file in scenes/detectors gives it."""
+"""A detector by the numbers of its EMVA 1288 data sheet, as a file in scenes/detectors gives it, and what limits its
+pixels.
+"""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -6,7 +8,16 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from scenes.errors import KeyPath, Problem, names_text
+from scenes.quantity import Quantity
 from scenes.spec import Name, Number, Spec, Text, Whole
+from scenes.units import LENGTH, TIME, format_quantity
+
+AreaSide = Annotated[Whole, Field(ge=24, le=8192)]
+"""Rows or columns of an area CCD, from what a spot can be measured in on."""
+PixelPitch = Annotated[float, Quantity(LENGTH, smallest="0.5 um", largest="1 mm")]
+"""Metres; pixels smaller than the smallest that are made would be a mistaken unit."""
+LEAST_STEPS = 1.0
+"""Grey values between the dark and a full well at least."""
 
 
 class DetectorSpec(Spec):
@@ -33,6 +44,7 @@ class DetectorSpec(Spec):
     dark_noise_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     dark_current_e_per_s: Annotated[Number, Field(ge=0.0, le=1e9)]
     full_well_e: Annotated[Number, Field(ge=1.0, le=1e9)]
+    # above 20% some responses would be negative; no image sensor is that uneven
     prnu: Annotated[Number, Field(ge=0.0, le=0.2)]
     dsnu_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     bit_depth: Annotated[Whole, Field(ge=1, le=16)]
@@ -44,7 +56,34 @@ class DetectorSpec(Spec):
         if self.offset_dn >= most:
             found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {most}"
             raise Problem("no grey values are left above the offset", found, allowed, within=("offset_dn",))
+        steps = self.system_gain_dn_per_e * self.full_well_e
+        if steps < LEAST_STEPS:
+            raise Problem(
+                "a full well is not even one grey value",
+                f"{self.system_gain_dn_per_e:g}, with which a full well makes {steps:.3g} DN",
+                f"at least {LEAST_STEPS / self.full_well_e:.3g} DN per electron",
+                within=("system_gain_dn_per_e",),
+            )
         return self
+
+    def check_exposure(self, exposure: float) -> None:
+        """See whether the dark signal leaves room for light.
+
+        Args:
+            exposure: of a frame, seconds.
+
+        Raises:
+            InputError: the dark current alone saturates the pixels.
+        """
+        limit = min(self.full_well_e, (2**self.bit_depth - 1 - self.offset_dn) / self.system_gain_dn_per_e)
+        if self.dark_current_e_per_s * exposure >= limit:
+            raise self.error(
+                "the dark current alone saturates the pixels",
+                ("dark_current_e_per_s",),
+                found=self.dark_current_e_per_s,
+                allowed=f"less than {limit / exposure:.3g} electrons per second with the exposure of"
+                f" {format_quantity(exposure, TIME)}, or a shorter exposure",
+            )
 
 
 def require_detector(setup: Spec, key: KeyPath, name: str, detectors: Mapping[str, DetectorSpec]) -> None:

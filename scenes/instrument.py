@@ -9,6 +9,7 @@ from pydantic import Field
 from optics.frozen_map import FrozenMap
 from optics.material import MATERIALS, material
 from scenes.baffle_spec import BaffleSpec
+from scenes.detector import AreaSide, PixelPitch
 from scenes.prism import CentralPrismSpec, Prism0Spec, Prism180Spec
 from scenes.quantity import PositiveLength, Quantity, Vector2, Vector3, Wavelength
 from scenes.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, Whole, name_in
@@ -63,9 +64,9 @@ class AreaCcdSpec(Spec):
     """
 
     detector: Reference
-    rows: Annotated[Whole, Field(ge=8, le=8192)]
-    columns: Annotated[Whole, Field(ge=8, le=8192)]
-    pitch: PositiveLength
+    rows: AreaSide
+    columns: AreaSide
+    pitch: PixelPitch
     offset: Vector2
     exposure: Exposure
 

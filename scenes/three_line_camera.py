@@ -9,6 +9,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from scenes.detector import PixelPitch
 from scenes.errors import Problem
 from scenes.instrument import LookAngle
 from scenes.orbit_scene import LineImageSpec
@@ -54,7 +55,7 @@ class LineCameraSpec(Spec):
     k1: Distortion3 = 0.0
     k2: Distortion5 = 0.0
     pixels: LongestLine | None = None
-    pitch: PositiveLength | None = None
+    pitch: PixelPitch | None = None
     image: LineImageSpec | None = None
 
 
@@ -80,7 +81,7 @@ class ThreeLineCameraSpec(Spec):
     name: Name
     description: Text = ""
     pixels: LongestLine
-    pitch: PositiveLength
+    pitch: PixelPitch
     lines: Annotated[Named[LineCameraSpec], AfterValidator(_some_lines)]
     image: LineImageSpec | None = None
 

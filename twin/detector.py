@@ -19,16 +19,16 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from analysis.noise import NoiseModel
 from optics.threads import cores
-
-if TYPE_CHECKING:
-    from scenes.detector import DetectorSpec
+from scenes.detector import DetectorSpec
+from scenes.errors import Problem
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
@@ -81,18 +81,18 @@ class SaturationReport:
 
 @dataclass(frozen=True)
 class EmvaDetector:
-    """A detector by the numbers of its EMVA 1288 data sheet. Raises ValueError, naming the field, for impossible
-    values.
+    """A detector by the numbers of its EMVA 1288 data sheet. Raises ValueError, naming the field, for values outside
+    the limits of `scenes.detector`.
 
-    quantum_efficiency: electrons per photon, (0, 1].
-    system_gain_dn_per_e: K, grey values per electron, > 0.
-    dark_noise_e: temporal read noise, electrons rms, >= 0.
-    dark_current_e_per_s: electrons per pixel and second, >= 0.
-    full_well_e: electrons at which the pixel saturates, > 0.
-    prnu: photo-response non-uniformity (PRNU_1288), rms fraction, [0, 0.2].
-    dsnu_e: dark-signal non-uniformity (DSNU_1288), electrons rms, >= 0.
-    bit_depth: of the converter, 1 to 16.
-    offset_dn: black level, grey values, [0, 2**bit_depth - 1).
+    quantum_efficiency: electrons per photon.
+    system_gain_dn_per_e: K, grey values per electron.
+    dark_noise_e: temporal read noise, electrons rms.
+    dark_current_e_per_s: electrons per pixel and second.
+    full_well_e: electrons at which the pixel saturates.
+    prnu: photo-response non-uniformity (PRNU_1288), rms fraction.
+    dsnu_e: dark-signal non-uniformity (DSNU_1288), electrons rms.
+    bit_depth: of the converter.
+    offset_dn: black level, grey values.
     """
 
     quantum_efficiency: float
@@ -106,33 +106,29 @@ class EmvaDetector:
     offset_dn: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-                raise ValueError(f"detector: {field.name} must be a number, found {value!r}")
-            if not math.isfinite(value):
-                raise ValueError(f"detector: {field.name} must be finite, found {value!r}")
-        self._check("quantum_efficiency", 0 < self.quantum_efficiency <= 1, "in (0, 1]")
-        self._check("system_gain_dn_per_e", 0 < self.system_gain_dn_per_e <= 1e5, "in (0, 1e5] DN per electron")
-        self._check("dark_noise_e", 0 <= self.dark_noise_e <= 1e6, "in [0, 1e6] electrons")
-        self._check("dark_current_e_per_s", 0 <= self.dark_current_e_per_s <= 1e9, "in [0, 1e9] electrons per second")
-        self._check("full_well_e", 1 <= self.full_well_e <= 1e9, "in [1, 1e9] electrons")
-        # Above 20% the normal pattern would need negative responses; no image sensor is that uneven.
-        self._check("prnu", 0 <= self.prnu <= 0.2, "a fraction in [0, 0.2]")
-        self._check("dsnu_e", 0 <= self.dsnu_e <= 1e6, "in [0, 1e6] electrons")
-        self._check(
-            "bit_depth", int(self.bit_depth) == self.bit_depth and 1 <= self.bit_depth <= 16, "an integer 1 to 16"
-        )
-        self._check("offset_dn", 0 <= self.offset_dn < self.max_dn, f"in [0, {self.max_dn}) DN")
+        try:
+            DetectorSpec.model_validate({"name": "detector", **self._numbers()})
+        except ValidationError as error:
+            first = error.errors()[0]
+            problem = first.get("ctx", {}).get("error")
+            where = problem.within if isinstance(problem, Problem) else first["loc"]
+            found = ", ".join(f"{name} {self._numbers()[str(name)]!r}" for name in where)
+            raise ValueError(f"detector: {found}: {first['msg']}") from None
 
     @classmethod
-    def from_sheet(cls, sheet: DetectorSpec) -> EmvaDetector:
-        """The detector of a data sheet's file."""
+    def from_sheet(cls, sheet: DetectorSpec, exposure: float) -> EmvaDetector:
+        """The detector of a data sheet's file, for frames of that exposure, seconds.
+
+        Raises:
+            InputError: the dark current alone saturates the pixels.
+        """
+        sheet.check_exposure(exposure)
         return cls(**{field.name: getattr(sheet, field.name) for field in fields(cls)})
 
-    def _check(self, name: str, good: bool, allowed: str) -> None:
-        if not good:
-            raise ValueError(f"detector: {name} must be {allowed}, found {getattr(self, name)!r}")
+    def _numbers(self) -> dict[str, Any]:
+        """As plain numbers, not numpy's."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
 
     @property
     def max_dn(self) -> int:

@@ -63,8 +63,12 @@ class LineCcd:
 
     @classmethod
     def from_specs(cls, band: BandSpec, sheet: DetectorSpec) -> LineCcd:
-        """From what the files say."""
-        return cls(band, EmvaDetector.from_sheet(sheet))
+        """From what the files say.
+
+        Raises:
+            InputError: the dark current alone saturates the pixels.
+        """
+        return cls(band, EmvaDetector.from_sheet(sheet, band.exposure))
 
     def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
         """Each effect's transfer, see ``band_factors``."""
@@ -97,8 +101,8 @@ class LineCcd:
 
     @property
     def exposure(self) -> float:
-        """Time over which dark current is collected, seconds: the data sheet gives it for one second of all stages."""
-        return self.band.tdi.stages * self.band.tdi.line_time
+        """Time over which dark current is collected, seconds."""
+        return self.band.exposure
 
     @property
     def noise(self) -> NoiseModel:

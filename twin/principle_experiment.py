@@ -146,8 +146,8 @@ class Reader:
     def __init__(self, setup: PrincipleSetup, backend: Backend) -> None:
         self.spec = setup.spec
         self.backend = backend
-        self.detector = EmvaDetector.from_sheet(setup.detector)
         self.exposure: float = setup.spec.autocollimator.area_ccd.exposure
+        self.detector = EmvaDetector.from_sheet(setup.detector, self.exposure)
         self._paths: dict[float, AutocollimatorPath] = {}
         self.map = self._calibrate()
 

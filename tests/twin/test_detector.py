@@ -85,6 +85,23 @@ def test_fixed_pattern_survives_averaging_and_is_the_stated_one():
     assert np.sum((frames.mean(axis=0) - flat) ** 2 / variance) > 10 * mean.size
 
 
+def test_the_response_differs_for_light_and_not_for_dark_current():
+    """PRNU of 20%: a strong dark signal is even over the pixels, and no wider than its shot noise; light is not."""
+    sensor = detector(dark_current_e_per_s=20000.0, prnu=0.2, dsnu_e=0.0, full_well_e=65000.0)
+    pattern, nothing, exposure = sensor.fixed_pattern((64, 64), 2), np.zeros((64, 64)), 1.0
+    assert np.ptp(sensor.expected_dn(nothing, exposure, pattern)) == 0.0
+    noise = sensor.noise_model(exposure)
+    dark = sensor.expose(nothing, pattern, 50, exposure, seed=4).astype(float).mean(axis=0)
+    expected = 64.0 + 0.06 * 20000.0
+    chi2 = np.sum((dark - expected) ** 2) / noise.temporal_variance_dn2(expected, 50)
+    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, dark.size) < 1 - FALSE_ALARM / 2
+    # light adds the pattern times the light alone, whatever the dark current
+    lit = sensor.expose(nothing + 20000.0, pattern, 50, exposure, seed=5).astype(float).mean(axis=0)
+    mean = expected + 0.06 * 0.6 * 20000.0 * pattern.gain
+    chi2 = np.sum((lit - mean) ** 2 / noise.temporal_variance_dn2(mean, 50))
+    assert FALSE_ALARM / 2 < stats.chi2.sf(chi2, lit.size) < 1 - FALSE_ALARM / 2
+
+
 def test_same_seed_same_bits_whatever_the_threads_and_the_company():
     sensor = detector()
     photons = np.random.default_rng(0).uniform(0, 3e4, (3, 2, 40, 30))
@@ -146,6 +163,7 @@ def test_expected_dn_by_hand():
         ("bit_depth", 17),
         ("bit_depth", 11.5),
         ("offset_dn", 5000.0),
+        ("system_gain_dn_per_e", 1e-30),
         ("prnu", "1%"),
     ],
 )
