@@ -21,7 +21,8 @@ ONLY_IN_ANALYSIS = {"analysis", "numpy", "scipy", "cv2"} | sys.stdlib_module_nam
 # Modules of analysis that may use more: commands that draw, and fits that need a library. Name each module here.
 ANALYSIS_MAY: dict[str, set[str]] = {
     "turntable/angle_network.py": {"sklearn"},
-    "mtf/__main__.py": {"typer", "rich", "matplotlib", "tifffile"},
+    "mtf/__main__.py": {"typer", "rich", "matplotlib"},
+    "mtf/image_file.py": {"tifffile"},
 }
 LONGEST_FILE = 500
 

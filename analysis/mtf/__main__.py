@@ -13,9 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
-import tifffile
 import typer
 from numpy.typing import NDArray
 from rich import box
@@ -24,12 +22,17 @@ from rich.table import Table
 
 from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
 from analysis.mtf.edge_mtf import EdgeMtf
+from analysis.mtf.image_file import ImageError, ImageFile, Region, tone_curve
 from analysis.mtf.slanted_edge import EdgeError, measure_edge
 
 Array = NDArray[np.float64]
-BAD_INPUT = 2
+BAD_INPUT, NOT_PRINTED = 2, 1
 PLOT_KINDS = (".png", ".pdf", ".svg")
 _LENGTHS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "mm": 1.0}
+# Beyond twice the sampling frequency no camera passes light.
+_HIGHEST = 2.0
+# Larger numbers are in no image.
+_NUMBERS = re.compile(r"\s*" + r"\s*,\s*".join([r"([0-9]{1,10})"] * 4) + r"\s*")
 # Table rows, cycles/pixel.
 _ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
@@ -43,7 +46,7 @@ class _Wrong(Exception):
 @app.command()
 def main(
     image: Annotated[
-        Path, typer.Argument(help="TIFF or PNG, 8 or 16 bit (or floating-point TIFF).", show_default=False)
+        Path, typer.Argument(help="TIFF, PNG or JPEG, 8 or 16 bit (or floating-point TIFF).", show_default=False)
     ],
     roi: Annotated[
         str, typer.Option(help="Region ROW,COLUMN,HEIGHT,WIDTH in pixels; the first pixel is 0,0.", show_default=False)
@@ -55,10 +58,8 @@ def main(
             help='Measure bars of this frequency: "71.4 cycles/mm" or "0.5 cycles/pixel". Needs --dark, --bright.'
         ),
     ] = None,
-    dark: Annotated[str | None, typer.Option(help="With --bars: an even patch of the dark level, as --roi.")] = None,
-    bright: Annotated[
-        str | None, typer.Option(help="With --bars: an even patch of the bright level, as --roi.")
-    ] = None,
+    dark: Annotated[str | None, typer.Option(help="With --bars: the dark level, see below.")] = None,
+    bright: Annotated[str | None, typer.Option(help="With --bars: the bright level, see below.")] = None,
     saturation: Annotated[
         float | None,
         typer.Option(help="Grey value of saturation. Default: the file type's largest, and plateaus of equal values."),
@@ -66,6 +67,15 @@ def main(
     offset: Annotated[float, typer.Option(help="Grey value without light; taken off levels and contrast.")] = 0.0,
     frames: Annotated[
         int | None, typer.Option(min=1, help="Average this many pages of a multi-page TIFF. Default: all.")
+    ] = None,
+    page: Annotated[
+        int | None, typer.Option(min=0, help="Read this page of a TIFF only; the first is 0. Default: the mean of all.")
+    ] = None,
+    gamma: Annotated[
+        str | None,
+        typer.Option(
+            help="Undo the tone curve of an integer image: srgb, or an exponent such as 2.2. 1: it is linear."
+        ),
     ] = None,
     plot: Annotated[Path | None, typer.Option(readable=False, help="Write a plot: .png, .pdf or .svg.")] = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", readable=False, help="Write the curve as CSV.")] = None,
@@ -78,48 +88,106 @@ def main(
     is near-vertical or near-horizontal is found; frequencies are counted along the edge's normal. sigma comes from the
     noise in the region, bias is how much noise lengthens the MTF (not taken off).
 
-    **Bars.** Choose a region inside a group of equal bars and spaces, slightly tilted, and two even patches with the
-    bars' dark and bright levels. The amplitude of the fundamental gives the MTF at that one frequency.
+    **Bars.** Choose a region inside a group of equal bars and spaces, slightly tilted. The amplitude of the
+    fundamental gives the MTF at that one frequency. --dark and --bright are the levels of spaces and bars: best images
+    of the closed shutter and of the light without target (their mean over the same region), else even patches
+    ROW,COLUMN,HEIGHT,WIDTH in the image. sigma does not hold what diffraction carries out of a patch: the MTF is then
+    too high, by about a per cent with patches 10 pixels from everything else, F/9 and 7 um.
 
-    Grey values must be linear in light: raw frames, not pictures from a camera with a tone curve. Colour becomes the
-    luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B). Pages of a TIFF are averaged.
+    Grey values must be linear in light: raw frames. Of a picture with a tone curve state --gamma; a JPEG without it is
+    taken as it is, with a warning. Colour becomes the luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B). Pages
+    of a TIFF are averaged. --saturation and --offset are grey values linear in light.
 
     Example: python -m analysis.mtf edge.tiff --roi 100,200,64,64 --pixel-size "7 um" --plot mtf.png
 
-    Exit codes: 0 measured; 2 bad input, with a sentence that says what to change. After 2 no file is written.
+    Exit codes: 0 measured; 2 bad input, with a sentence that says what to change; 1 the result cannot be printed.
+    After 2 no file is written.
     """
     errors = Console(stderr=True)
     try:
         pitch = _pixel_size(pixel_size)
         frequency = _frequency(bars, pitch) if bars is not None else None
+        _check_levels(saturation, offset)
         for path, kinds in ((plot, PLOT_KINDS), (csv_file, (".csv",))):
             _check_target(path, kinds, image)
-        grey, full_scale = _read(image, frames, saturation)
-        region = _cut(grey, roi, "--roi")
-        if saturation is None and np.any(region >= full_scale):
-            saturation = full_scale
+        _check_bar_options(frequency is not None, dark, bright, plot, csv_file)
+        source = ImageFile.open(image, frames, page)
+        # wrong curves are told before the pixels are read
+        tone_curve(gamma, source.full_scale)
+        regions = {"--roi": _region(roi, "--roi")}
+        fields: dict[str, ImageFile] = {}
+        for option, text in (("--dark", dark), ("--bright", bright)):
+            if text is not None and _NUMBERS.fullmatch(text) is None and Path(text).is_file():
+                fields[option] = ImageFile.open(Path(text), frames, page)
+                if (fields[option].rows, fields[option].columns) != (source.rows, source.columns):
+                    raise _Wrong(f"{option} {text} and {image} have different numbers of rows or columns")
+            elif text is not None:
+                regions[option] = _region(text, option)
+        read = source.read(regions, gamma, saturation)
+        for option, other in fields.items():
+            read[option] = other.read({"--roi": regions["--roi"]}, gamma, saturation)["--roi"]
+        warnings = _warnings([source, *fields.values()], gamma)
+        region = read["--roi"]
+        if saturation is None and np.any(region >= source.full_scale):
+            saturation = source.full_scale
+        found: BarMtf | EdgeMtf
         if frequency is not None:
-            if dark is None or bright is None:
-                raise _Wrong("--bars needs --dark and --bright: even patches with the levels of bars and spaces")
-            if plot is not None or csv_file is not None:
-                raise _Wrong("--plot and --csv are for an edge's curve; bars give one number (--json prints it)")
-            patches = _cut(grey, dark, "--dark"), _cut(grey, bright, "--bright")
-            _print_bars(
-                measure_bars(region, *patches, frequency, saturation=saturation, offset=offset), pitch, offset, as_json
+            found = measure_bars(
+                region, read["--dark"], read["--bright"], frequency, saturation=saturation, offset=offset
             )
-            return
-        if dark is not None or bright is not None:
-            raise _Wrong("--dark and --bright belong to --bars; an edge carries its own levels")
-        edge = measure_edge(region, saturation=saturation)
-        _write(plot, lambda path: _draw(edge, pitch, path))
-        _write(csv_file, lambda path: _write_csv(edge, pitch, path))
-    except (EdgeError, BarError, _Wrong) as error:
+        else:
+            found = measure_edge(region, saturation=saturation)
+        if isinstance(found, EdgeMtf):
+            edge = found
+            _write(plot, lambda path: _draw(edge, pitch, path))
+            _write(csv_file, lambda path: _write_csv(edge, pitch, path))
+    except (EdgeError, BarError, ImageError, _Wrong) as error:
         errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
         raise typer.Exit(BAD_INPUT) from None
-    if as_json:
-        _print_json(_edge_json(edge, pitch, offset))
-    else:
-        _print_edge(edge, pitch, offset, [path for path in (plot, csv_file) if path is not None])
+    for text in warnings:
+        errors.print(f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    try:
+        if isinstance(found, BarMtf):
+            _print_bars(found, pitch, offset, as_json)
+        elif as_json:
+            _print_json(_edge_json(found, pitch, offset))
+        else:
+            _print_edge(found, pitch, offset, [path for path in (plot, csv_file) if path is not None])
+        sys.stdout.flush()
+    except OSError as error:
+        errors.print(f"error: the result cannot be printed ({error.strerror})", markup=False, soft_wrap=True)
+        # what is left in the buffer would fail once more at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(NOT_PRINTED) from None
+
+
+def _check_levels(saturation: float | None, offset: float) -> None:
+    if not math.isfinite(offset):
+        raise _Wrong(f"--offset {offset} must be a finite number")
+    if saturation is not None and math.isnan(saturation):
+        raise _Wrong("--saturation nan must be a number")
+
+
+def _check_bar_options(
+    bars: bool, dark: str | None, bright: str | None, plot: Path | None, csv_file: Path | None
+) -> None:
+    if not bars and (dark is not None or bright is not None):
+        raise _Wrong("--dark and --bright belong to --bars; an edge carries its own levels")
+    if bars and (dark is None or bright is None):
+        raise _Wrong("--bars needs --dark and --bright: the levels of spaces and bars, images or even patches")
+    if bars and (plot is not None or csv_file is not None):
+        raise _Wrong("--plot and --csv are for an edge's curve; bars give one number (--json prints it)")
+
+
+def _warnings(images: list[ImageFile], gamma: str | None) -> list[str]:
+    if gamma is not None:
+        return []
+    return [
+        f"{image.path}: {image.coded}, so that its grey values probably follow a tone curve. Taken as linear they make"
+        " the MTF wrong: state --gamma srgb (or the curve's exponent), or --gamma 1 if they are linear"
+        for image in images
+        if image.coded
+    ]
 
 
 def _pixel_size(text: str) -> float:
@@ -132,8 +200,8 @@ def _pixel_size(text: str) -> float:
     unit = match[2] if match else ""
     if unit not in _LENGTHS or not math.isfinite(value):
         raise _Wrong(f'--pixel-size {text!r} is not a length with its unit: write it as "7 um" or "0.007 mm"')
-    if not 0 < value * _LENGTHS[unit] < 10:
-        raise _Wrong(f"--pixel-size {text!r} must be above 0 and below 10 mm")
+    if not 1e-6 <= value * _LENGTHS[unit] <= 10:
+        raise _Wrong(f"--pixel-size {text!r} must lie between 1 nm and 10 mm")
     return value * _LENGTHS[unit]
 
 
@@ -146,7 +214,10 @@ def _frequency(text: str, pitch: float) -> float:
         value = math.nan
     if match is None or not 0 < value < math.inf:
         raise _Wrong(f'--bars {text!r} is not a frequency with its unit: write "71.4 cycles/mm" or "0.5 cycles/pixel"')
-    return value if match[2] == "cycles/pixel" else value * pitch
+    each = value if match[2] == "cycles/pixel" else value * pitch
+    if each > _HIGHEST:
+        raise _Wrong(f"--bars {text!r} is {each:.3g} cycles/pixel; above {_HIGHEST:g} nothing can be measured")
+    return each
 
 
 def _check_target(path: Path | None, kinds: tuple[str, ...], image: Path) -> None:
@@ -160,75 +231,12 @@ def _check_target(path: Path | None, kinds: tuple[str, ...], image: Path) -> Non
         raise _Wrong(f"{path} cannot be written: it is a folder or the image itself")
 
 
-def _read(path: Path, frames: int | None, saturation: float | None) -> tuple[Array, float]:
-    """Mean grey values (H, W), and the largest value that the file's integers can hold, else infinity.
-
-    A pixel that is saturated in one page counts as saturated: its mean is put at that level.
-    """
-    if path.is_dir():
-        raise _Wrong(f"{path} is a folder, not an image")
-    if not path.is_file():
-        raise _Wrong(f"there is no image {path}")
-    try:
-        pages = _tiff_pages(path) if path.suffix.lower() in (".tif", ".tiff") else _picture(path)
-    except _Wrong:
-        raise
-    except Exception as error:
-        raise _Wrong(f"{path} cannot be read as an image ({error})") from error
-    if pages.dtype.kind not in "uif":
-        raise _Wrong(f"{path} holds {pages.dtype} values; grey values must be integers or real numbers")
-    if frames is not None and frames > len(pages):
-        raise _Wrong(f"--frames {frames} is more than the {len(pages)} pages of {path}")
-    full_scale = float(np.iinfo(pages.dtype).max) if pages.dtype.kind == "u" else math.inf
-    limit = full_scale if saturation is None else saturation
-    used = pages[:frames]
-    mean = used.mean(axis=0, dtype=np.float64)
-    return np.where(used.max(axis=0) >= limit, np.maximum(mean, limit), mean), full_scale
-
-
-def _tiff_pages(path: Path) -> NDArray[Any]:
-    """(pages, H, W)."""
-    with tifffile.TiffFile(path) as file:
-        first = file.series[0]
-        data = np.asarray(first.asarray())
-        axes = first.axes
-    if "S" in axes:
-        data = _luminance(np.moveaxis(data, axes.index("S"), -1))
-        axes = axes.replace("S", "")
-    if not axes.endswith("YX"):
-        raise _Wrong(f"{path} has axes {axes}; pages of rows and columns are needed")
-    return data.reshape(-1, *data.shape[-2:])
-
-
-def _picture(path: Path) -> NDArray[Any]:
-    data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if data is None:
-        raise _Wrong(f"{path} cannot be read as an image: give a TIFF or PNG")
-    if data.ndim == 3:
-        data = _luminance(data[..., 2::-1])
-    return np.asarray(data)[None]
-
-
-def _luminance(colour: NDArray[Any]) -> NDArray[Any]:
-    """Grey from (..., RGB and perhaps alpha), in the same type so that full scale keeps its meaning."""
-    if colour.shape[-1] < 3:
-        return colour[..., 0]
-    grey = colour[..., :3] @ np.array([0.2126, 0.7152, 0.0722])
-    # one saturated channel spoils the sum
-    if colour.dtype.kind == "u":
-        full = np.iinfo(colour.dtype).max
-        return np.where((colour[..., :3] == full).any(axis=-1), full, np.round(grey)).astype(colour.dtype)
-    return np.asarray(grey)
-
-
-def _cut(grey: Array, text: str, option: str) -> Array:
-    match = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*", text)
+def _region(text: str, option: str) -> Region:
+    match = _NUMBERS.fullmatch(text)
     if match is None:
-        raise _Wrong(f"{option} {text!r} must be four whole numbers ROW,COLUMN,HEIGHT,WIDTH")
-    row, column, height, width = (int(number) for number in match.groups())
-    if height == 0 or width == 0 or row + height > grey.shape[0] or column + width > grey.shape[1]:
-        raise _Wrong(f"{option} {text} does not lie in the image of {grey.shape[0]} rows and {grey.shape[1]} columns")
-    return grey[row : row + height, column : column + width]
+        also = "" if option == "--roi" else ", or an image of an even field"
+        raise _Wrong(f"{option} {text[:80]!r} must be four whole numbers ROW,COLUMN,HEIGHT,WIDTH{also}")
+    return Region(*(int(number) for number in match.groups()))
 
 
 def _write(target: Path | None, make: Callable[[Path], None]) -> None:

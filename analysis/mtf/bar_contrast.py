@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.mtf.edge_location import saturation_fault
+from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
 from analysis.noise import NoiseModel
 
@@ -189,10 +189,7 @@ def _checked(region: ArrayLike, saturation: float | None) -> Array:
             f"{_LEAST_SIDE} px inside the group"
         )
     grey = np.asarray(array, dtype=np.float64)
-    if not np.all(np.isfinite(grey)):
-        bad = int(np.count_nonzero(~np.isfinite(grey)))
-        raise BarError(f"{bad} pixels of the region are not finite (NaN or infinity): repair them or move the region")
-    fault = saturation_fault(grey, saturation)
+    fault = grey_fault(grey, saturation)
     if fault:
         raise BarError(fault)
     return grey
@@ -203,8 +200,12 @@ def _level(
 ) -> tuple[float, float]:
     """Mean of a patch and its sigma, grey values."""
     pixels = np.asarray(patch, dtype=np.float64).ravel()
-    if pixels.size < _LEAST_PATCH or not np.all(np.isfinite(pixels)):
-        raise BarError(f"the {name} patch needs at least {_LEAST_PATCH} finite pixels, found {pixels.size}; enlarge it")
+    finite = int(np.count_nonzero(np.abs(pixels) <= LARGEST_GREY))
+    if finite < max(_LEAST_PATCH, pixels.size):
+        raise BarError(
+            f"the {name} patch needs at least {_LEAST_PATCH} pixels, all of them finite, found {finite} of {pixels.size};"
+            " move or enlarge it"
+        )
     if saturation is not None and np.any(pixels >= saturation):
         raise BarError(
             f"the {name} patch reaches the saturation level of {saturation:g}: lower the exposure or the light"

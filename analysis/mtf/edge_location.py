@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["EdgeError", "EdgeLine", "checked_region", "locate_edge", "pixel_noise", "saturation_fault"]
+__all__ = ["LARGEST_GREY", "EdgeError", "EdgeLine", "checked_region", "grey_fault", "locate_edge", "pixel_noise"]
 
 Array = NDArray[np.float64]
 Axis = Literal["x", "y"]
@@ -26,10 +26,12 @@ LEAST_MARGIN = 10.0
 LEAST_CONTRAST = 5.0
 # |t| of the plane's slope below which there is no edge; by chance once in some 1e8 regions.
 _LEAST_SLOPE_T = 6.0
+LARGEST_GREY = 1e50
+"""Above it, and with differences below its inverse, fourth powers come near the ends of double precision."""
 # More equal extreme values than this share of the pixels is a clipped plateau.
 _CLIPPED_SHARE = 0.05
 # Above this the edge is as much of the one kind as of the other.
-_LARGEST_ANGLE = math.radians(40.0)
+LARGEST_GREY_ANGLE = math.radians(40.0)
 _HALF_WINDOWS = (8.0, 6.0, 6.0)
 _NOT_FOLLOWED = (
     "the edge cannot be followed through the region: in many lines there is no rise where the others have it (two "
@@ -77,29 +79,36 @@ def checked_region(region: ArrayLike, saturation: float | None) -> Array:
             f"the region of {array.shape[0]} x {array.shape[1]} px is too small: take at least {least}, better 64 x 64"
         )
     grey = np.ascontiguousarray(array, dtype=np.float64)
-    if not math.isfinite(grey.sum()):
-        bad = int(np.count_nonzero(~np.isfinite(grey)))
-        raise EdgeError(f"{bad} pixels of the region are not finite (NaN or infinity): repair them or move the region")
-    fault = saturation_fault(grey, saturation)
+    fault = grey_fault(grey, saturation)
     if fault:
         raise EdgeError(fault)
     return grey
 
 
-def saturation_fault(grey: Array, saturation: float | None) -> str:
-    """What is wrong with grey values (H, W) that reach saturation or heap up at their extremes; "" if nothing."""
+def grey_fault(grey: Array, saturation: float | None) -> str:
+    """What is wrong with grey values (H, W) that no fit can use: not finite, too large or too small to compute with,
+    all the same, saturated, or heaped up at their extremes; "" if nothing.
+    """
     advice = "lower the exposure or the light"
-    if saturation is not None:
+    bad = int(np.count_nonzero(~np.isfinite(grey)))
+    if bad:
+        return f"{bad} pixels of the region are not finite (NaN or infinity): repair them or move the region"
+    if saturation is not None and np.any(grey >= saturation):
         count = int(np.count_nonzero(grey >= saturation))
-        return f"{count} pixels reach the saturation level of {saturation:g}: {advice}" if count else ""
+        return f"{count} pixels reach the saturation level of {saturation:g}: {advice}"
+    low, high = float(grey.min()), float(grey.max())
+    if low == high:
+        return "no structure in the region: all pixels have the same value; move the region onto the target"
+    if max(abs(low), abs(high)) > LARGEST_GREY or high - low < 1.0 / LARGEST_GREY:
+        return f"grey values from {low:g} to {high:g} cannot be computed with: scale the image, say to 0 ... 1"
+    if saturation is not None:
+        return ""
     for side, values in (("highest", grey), ("lowest", -grey)):
         extreme = values.max()
         count = int(np.count_nonzero(values == extreme))
         if count < _CLIPPED_SHARE * grey.size:
             continue
         others = values[values < extreme]
-        if others.size == 0:
-            return "no structure in the region: all pixels have the same value; move the region onto the target"
         # noise makes a maximum rarer than its neighbour; clipping heaps it up
         if count > 2 * np.count_nonzero(values == others.max()):
             return (
@@ -136,7 +145,7 @@ def locate_edge(grey: Array) -> EdgeLine:
     offset, slope = _coarse_line(rising)
     offset, slope = _refined(rising, offset, slope)
     angle = math.atan(slope)
-    if abs(angle) > _LARGEST_ANGLE:
+    if abs(angle) > LARGEST_GREY_ANGLE:
         raise EdgeError(
             f"the edge runs at {math.degrees(abs(angle)):.0f} deg, near 45 deg, where it is neither vertical nor "
             "horizontal: tilt the target by 2 to 10 deg against rows or columns"

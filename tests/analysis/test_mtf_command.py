@@ -4,6 +4,10 @@ import csv
 import importlib.util
 import json
 import math
+import resource
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -78,6 +82,26 @@ def test_printed_table(edge_tiff):
     assert float(row[2]) == pytest.approx(gaussian_mtf(0.2), abs=0.002)
 
 
+def test_bars_with_even_fields(tmp_path):
+    """Levels from images of even fields, their mean over the region; patches beside the bars may be wrong."""
+    frame = tifffile.imread(bars_tiff(tmp_path))
+    for name, level in (("dark", 100.0), ("bright", 1100.0)):
+        noisy = level + np.random.default_rng(int(level)).normal(0, 3, frame.shape)
+        tifffile.imwrite(tmp_path / f"{name}.tiff", np.round(noisy).astype(np.uint16))
+    both = [word for name in ("dark", "bright") for word in (f"--{name}", tmp_path / f"{name}.tiff")]
+    told = [tmp_path / "bars.tiff", *BARS[:4], "--bars", "0.5 cycles/pixel"]
+    data = run_json(*told, *both)
+    assert data["mtf"] == pytest.approx(0.3, abs=5 * data["sigma"])
+    assert (data["dark_dn"], data["bright_dn"]) == pytest.approx((100, 1100), abs=0.5)
+    tifffile.imwrite(tmp_path / "bright.tiff", np.full((64, 64), 1100, np.uint16))
+    result = run(*told, *both)
+    assert result.exit_code == 2
+    assert "different numbers of rows or columns" in result.stderr
+    result = run(*told, "--dark", "none.tiff", "--bright", "0,0,9,9")
+    assert result.exit_code == 2
+    assert "or an image of an even field" in result.stderr
+
+
 def test_files(edge_tiff, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -125,6 +149,139 @@ def test_pages_are_averaged(tmp_path):
     assert all_pages["noise_dark_dn"] == pytest.approx(50 / 4, rel=0.1)
 
 
+def test_pages_of_different_size_must_be_chosen(tmp_path):
+    """They were read by the first one alone, without a word."""
+    path = tmp_path / "mixed.tiff"
+    with tifffile.TiffWriter(path) as file:
+        file.write(edge_frame(3.0, 1)[:80, :100])
+        file.write(edge_frame(3.0, 2))
+        file.write(edge_frame(3.0, 3))
+    result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+    assert result.exit_code == 2
+    assert "80 x 100 uint16 (first: 0), 90 x 110 uint16 (first: 1)" in result.stderr
+    assert "--page NUMBER" in result.stderr
+    for page in (0, 2):
+        data = run_json(path, "--roi", ROI, "--pixel-size", "7 um", "--page", page)
+        assert data["mtf_nyquist"] == pytest.approx(gaussian_mtf(0.5), abs=5 * data["mtf_nyquist_sigma"] + 5e-4)
+    assert run(path, "--roi", "10,20,80,64", "--pixel-size", "7 um", "--page", 0).exit_code == 2
+    # a thumbnail says that it is one
+    with tifffile.TiffWriter(path) as file:
+        file.write(edge_frame())
+        file.write(edge_frame()[::8, ::8], subfiletype=1)
+    assert run(path, "--roi", ROI, "--pixel-size", "7 um").exit_code == 0
+
+
+def srgb(linear):
+    """Coded share of full scale, IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1 / 2.4) - 0.055)
+
+
+def test_tone_curves(tmp_path):
+    """A JPEG of 8 bits gives a warning, and the right MTF with the curve that it was made with; PNGs that name one."""
+    linear = edge_frame(60.0) / 14000.0
+    for gamma, coded in (("srgb", srgb(linear)), ("2.2", linear ** (1 / 2.2))):
+        path = tmp_path / f"{gamma}.jpg"
+        cv2.imwrite(str(path), np.round(255 * coded).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 100])
+        plain = run(path, "--roi", ROI, "--pixel-size", "7 um", "--json")
+        assert plain.exit_code == 0
+        assert "warning: " in plain.stderr
+        assert "--gamma srgb" in plain.stderr
+        assert abs(json.loads(plain.stdout)["mtf"][16] - gaussian_mtf(0.25)) > 0.02
+        result = run(path, "--roi", ROI, "--pixel-size", "7 um", "--json", "--gamma", gamma)
+        assert result.stderr == ""
+        data = json.loads(result.stdout)
+        # JPEG's own quantisation at quality 100 is below one grey value
+        assert data["mtf"][16] == pytest.approx(gaussian_mtf(0.25), abs=5 * data["sigma"][16] + 2e-3)
+        assert data["bright_dn"] == pytest.approx(255 * 11000 / 14000, abs=1.0)
+    assert run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1").stderr == ""
+
+
+def test_a_png_that_names_its_curve_gives_a_warning(tmp_path):
+    cv2.imwrite(str(tmp_path / "plain.png"), edge_frame())
+    data = (tmp_path / "plain.png").read_bytes()
+    for name, content, warned in ((b"gAMA", 45455, True), (b"gAMA", 100000, False), (b"sRGB", None, True)):
+        body = name + (b"\0" if content is None else content.to_bytes(4, "big"))
+        chunk = (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+        (tmp_path / "named.png").write_bytes(data[:33] + chunk + data[33:])
+        result = run(tmp_path / "named.png", "--roi", ROI, "--pixel-size", "7 um")
+        assert result.exit_code == 0, result.stderr
+        assert ("warning" in result.stderr) is warned
+    assert run(tmp_path / "plain.png", "--roi", ROI, "--pixel-size", "7 um").stderr == ""
+
+
+def black_png(side):
+    """8 bits, grey, all black: some 400 kB for 400 million pixels."""
+
+    def chunk(name, content):
+        crc = zlib.crc32(name + content)
+        return len(content).to_bytes(4, "big") + name + content + crc.to_bytes(4, "big")
+
+    pack = zlib.compressobj(9)
+    line = bytes(side + 1)
+    data = b"".join([pack.compress(line) for _ in range(side)]) + pack.flush()
+    header = side.to_bytes(4, "big") * 2 + bytes([8, 0, 0, 0, 0])
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def test_images_beyond_memory_are_refused_by_their_header(tmp_path):
+    path = tmp_path / "huge.png"
+    small = bytearray(black_png(8))
+    small[16:24] = (30_000).to_bytes(4, "big") * 2
+    path.write_bytes(small)
+    begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+    assert result.exit_code == 2
+    assert "of 30000 x 30000 pixels fills 0.9 GB when it is decoded, more than 0.5 GB: cut the region" in result.stderr
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begin < 100_000  # kB
+    # packed TIFFs too
+    tifffile.imwrite(
+        tmp_path / "huge.tiff", shape=(30_000, 30_000), dtype=np.uint16, compression="zlib", tile=(30_000, 30_000),
+        data=iter([b"x"]),
+    )  # fmt: skip
+    result = run(tmp_path / "huge.tiff", "--roi", ROI, "--pixel-size", "7 um")
+    assert result.exit_code == 2
+    assert "1.8 GB" in result.stderr
+    assert run(path, "--roi", "0,0,20000,20000", "--pixel-size", "7 um").stderr.count("choose a smaller region") == 1
+
+
+def test_of_a_plain_tiff_only_the_region_is_read(tmp_path):
+    """A sparse file of 1.8 GB that holds the edge in one corner, low byte first or last."""
+    for order in "<>":
+        path = tmp_path / "large.tiff"
+        tifffile.imwrite(path, shape=(30_000, 30_000), dtype=order + "u2", byteorder=order)
+        stored = tifffile.memmap(path)
+        stored[29_900:29_990, 29_800:29_910] = edge_frame()
+        stored.flush()
+        del stored
+        begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        data = run_json(path, "--roi", "29910,29820,64,64", "--pixel-size", "7 um")
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begin < 200_000
+        assert data["mtf"][16] == pytest.approx(gaussian_mtf(0.25), abs=5 * data["sigma"][16] + 5e-4)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 5e-324, 1e300, 1.7e308])
+@pytest.mark.parametrize("what", ["even", "edge"])
+def test_numbers_at_the_ends_of_double_precision(tmp_path, scale, what):
+    """Measured or refused in a sentence."""
+    values = np.ones((90, 110)) if what == "even" else edge_frame() / 12000.0
+    with np.errstate(all="ignore"):
+        tifffile.imwrite(tmp_path / "image.tiff", values * scale)
+    for more in ((), ("--bars", "0.3 cycles/pixel", "--dark", "0,0,9,9", "--bright", "60,90,9,9")):
+        result = run(tmp_path / "image.tiff", "--roi", ROI, "--pixel-size", "7 um", *more)
+        assert result.exit_code in ({2} if what == "even" or more else {0, 2})
+        assert result.stderr.count("\n") == (1 if result.exit_code else 0)
+
+
+@pytest.mark.parametrize("options", [["--json"], []])
+def test_a_result_that_cannot_be_printed(edge_tiff, options):
+    command = [sys.executable, "-m", "analysis.mtf", str(edge_tiff), "--roi", ROI, "--pixel-size", "7 um", *options]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert "the result cannot be printed (No space left on device)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_one_saturated_page_is_enough(tmp_path):
     pages = np.stack([edge_frame(50.0, seed) for seed in range(4)])
     pages[2, 40, 80] = 65535
@@ -166,7 +323,7 @@ def test_bars(tmp_path, frequency):
     [
         ({"--pixel-size": "7"}, 'not a length with its unit: write it as "7 um"'),
         ({"--pixel-size": "7 furlong"}, "not a length with its unit"),
-        ({"--pixel-size": "-7 um"}, "must be above 0"),
+        ({"--pixel-size": "-7 um"}, "must lie between 1 nm and 10 mm"),
         ({"--roi": "10,20,64"}, "four whole numbers ROW,COLUMN,HEIGHT,WIDTH"),
         ({"--roi": "10,20,64,640"}, "does not lie in the image of 90 rows and 110 columns"),
         ({"--roi": "10,20,16,64"}, "too small"),
@@ -178,7 +335,18 @@ def test_bars(tmp_path, frequency):
         ({"--csv": "mtf.txt"}, "must end in .csv"),
         ({"--bars": "0.5"}, "not a frequency with its unit"),
         ({"--bars": "0.5 cycles/pixel"}, "needs --dark and --bright"),
+        ({"--bars": "1e300 cycles/pixel"}, "above 2 nothing can be measured"),
         ({"--dark": "0,0,9,9"}, "belong to --bars"),
+        ({"--offset": "nan"}, "--offset nan must be a finite number"),
+        ({"--offset": "inf"}, "must be a finite number"),
+        ({"--saturation": "nan"}, "--saturation nan must be a number"),
+        ({"--roi": "9" * 5000 + ",20,64,64"}, "four whole numbers"),
+        ({"--roi": "9999999999,20,64,64"}, "does not lie in the image"),
+        ({"--pixel-size": "1e-300 um"}, "must lie between 1 nm and 10 mm"),
+        ({"--gamma": "sgrb"}, "is not a tone curve: write srgb, or an exponent such as 2.2"),
+        ({"--gamma": "nan"}, "is not a tone curve"),
+        ({"--gamma": "0"}, "is not a tone curve"),
+        ({"--page": "1"}, "--page 1 does not exist"),
     ],
 )
 def test_bad_input(edge_tiff, tmp_path, changed, message):
