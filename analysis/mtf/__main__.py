@@ -144,6 +144,13 @@ def main(
     except (EdgeError, BarError, ImageError, _Wrong) as error:
         errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
         raise typer.Exit(BAD_INPUT) from None
+    except OSError as error:
+        # names that the system does not take, such as too long ones
+        name = str(error.filename)[:80]
+        errors.print(
+            f"error: {name}: {error.strerror}", style="bold red", markup=False, highlight=False, soft_wrap=True
+        )
+        raise typer.Exit(BAD_INPUT) from None
     for text in warnings:
         errors.print(f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True)
     try:

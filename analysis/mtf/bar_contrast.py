@@ -203,8 +203,8 @@ def _level(
     finite = int(np.count_nonzero(np.abs(pixels) <= LARGEST_GREY))
     if finite < max(_LEAST_PATCH, pixels.size):
         raise BarError(
-            f"the {name} patch needs at least {_LEAST_PATCH} pixels, all of them finite, found {finite} of {pixels.size};"
-            " move or enlarge it"
+            f"the {name} patch needs at least {_LEAST_PATCH} pixels, all of them finite, found {finite} finite of "
+            f"{pixels.size}; move or enlarge it"
         )
     if saturation is not None and np.any(pixels >= saturation):
         raise BarError(

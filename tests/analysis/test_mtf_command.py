@@ -139,9 +139,11 @@ def test_luminance_weighs_the_channels(tmp_path):
     assert data["bright_dn"] == pytest.approx(11000 * (0.2126 * 0.5 + 0.7152 + 0.0722 * 0.25), rel=1e-3)
 
 
-def test_pages_are_averaged(tmp_path):
+@pytest.mark.parametrize("imagej", [False, True])
+def test_pages_are_averaged(tmp_path, imagej):
     path = tmp_path / "pages.tiff"
-    tifffile.imwrite(path, np.stack([edge_frame(50.0, seed) for seed in range(16)]), photometric="minisblack")
+    pages = np.stack([edge_frame(50.0, seed) for seed in range(16)])
+    tifffile.imwrite(path, pages, photometric="minisblack", imagej=imagej)
     all_pages = run_json(path, "--roi", ROI, "--pixel-size", "7 um")
     four = run_json(path, "--roi", ROI, "--pixel-size", "7 um", "--frames", 4)
     # the noise is estimated from some 3000 pixels of each: 2%
@@ -282,6 +284,37 @@ def test_a_result_that_cannot_be_printed(edge_tiff, options):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["edge.tiff", "packed.tiff", "colour.tiff", "edge.png", "edge.jpg"])
+def test_spoilt_files_are_measured_or_refused(tmp_path, kind, seed):
+    """Cut off, with wrong bytes in header and data, with bytes taken out or put in: never a traceback."""
+    frame, path = edge_frame(), tmp_path / kind
+    if kind == "edge.jpg":
+        cv2.imwrite(str(path), (frame >> 6).astype(np.uint8))
+    elif kind == "edge.png":
+        cv2.imwrite(str(path), frame)
+    else:
+        packed = {"compression": "zlib", "predictor": True} if kind == "packed.tiff" else {}
+        colour = {"photometric": "rgb", "planarconfig": "separate"} if kind == "colour.tiff" else {}
+        tifffile.imwrite(path, np.stack([frame] * 3) if colour else frame, **packed, **colour)
+    sound = path.read_bytes()
+    rng = np.random.default_rng([seed, len(kind)])
+    place = int(rng.integers(len(sound)))
+    wrong = bytearray(sound)
+    for at in [*rng.integers(0, 250, 4), *rng.integers(0, len(sound), 4)]:
+        wrong[at] = rng.integers(256)
+    for data in (
+        sound[:place],
+        bytes(wrong),
+        sound[:place] + sound[place + 50 :],
+        sound[:place] + bytes(50) + sound[place:],
+    ):
+        path.write_bytes(data)
+        result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+        assert result.exit_code in (0, 2)
+        assert result.exit_code == 0 or result.stderr.startswith("error: ")
+
+
 def test_one_saturated_page_is_enough(tmp_path):
     pages = np.stack([edge_frame(50.0, seed) for seed in range(4)])
     pages[2, 40, 80] = 65535
@@ -347,6 +380,7 @@ def test_bars(tmp_path, frequency):
         ({"--gamma": "nan"}, "is not a tone curve"),
         ({"--gamma": "0"}, "is not a tone curve"),
         ({"--page": "1"}, "--page 1 does not exist"),
+        ({"--csv": "a" * 300 + ".csv"}, "File name too long"),
     ],
 )
 def test_bad_input(edge_tiff, tmp_path, changed, message):

@@ -23,12 +23,10 @@ IMAGE_NAMES = {
     "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
     "bars_along": "bars, along line",
     "bars_track": "bars, along track",
-    "bars_dark": "shutter closed",
-    "bars_bright": "even light",
     "star": "star",
     "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
 }
-"""Of the images, with the direction of their MTF."""
+"""Of the images that are shown, with the direction of their MTF; even fields are not."""
 CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
 """Side of what is shown, pixels; the others are shown whole."""
 STRETCH = 100.0
@@ -117,7 +115,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 def images_svg(name: str, camera: CameraTargets) -> str:
     """Mean images, a row for each target, and before and after side by side for each place."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
-    names = list(next(iter(camera.places.values())).before.frames)
+    names = [name for name in next(iter(camera.places.values())).before.frames if name in IMAGE_NAMES]
     with look(f"targets-{name}"):
         figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
         grid = figure.subplots(len(names), len(columns), squeeze=False)
