@@ -41,9 +41,9 @@ class MonitorExperiment:
 
     def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
         self.backend = backend
-        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
         self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
+        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
         self.path = MonitorPath(self.instrument, backend)
 
     @cached_property

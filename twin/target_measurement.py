@@ -163,8 +163,8 @@ class _Shooter:
             means = {d: expose(f"bars_{d}", view.image(design.target)) for d, design in self.bars.items()}
             # the levels as a bench takes them: shutter closed, and the source without a target
             even = np.ones((view.region, view.region))
-            levels = [expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items()]
-            bars = {d: read_bars(view, design, means[d], *levels, self.count) for d, design in self.bars.items()}
+            dark, bright = (expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items())
+            bars = {d: read_bars(view, design, means[d], dark, bright, self.count) for d, design in self.bars.items()}
         if "star" in self.images:
             expose("star", view.image(star_target(view.band.pitch, view.region)))
         if "pinhole" in self.images:

@@ -3,11 +3,21 @@
 Every statistical limit is a two-sided chi-square (or normal) quantile with a false-alarm rate of 1e-6 per test.
 """
 
+import re
+
 import numpy as np
 import pytest
+import yaml
 from scipy import stats
 
+from scenes.band import BandSpec
+from scenes.detector import DetectorSpec
+from scenes.errors import InputError
+from scenes.load import LIBRARY
+from tests.twin.commands import invoke
 from twin.detector import EmvaDetector, FixedPattern
+from twin.line_ccd import LineCcd
+from twin.render import app
 
 FALSE_ALARM = 1e-6
 SHEET = {
@@ -187,3 +197,49 @@ def test_impossible_data_sheets_name_the_field(field, value):
 def test_impossible_exposures_are_explained(photons, frames, exposure, seed, words):
     with pytest.raises(ValueError, match=words):
         detector().expose(photons, uniform(4, 4), frames, exposure, seed)
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value", "message"),
+    [
+        ("area_ccd", "rows", 8, "rows: outside the limits; found 8, allowed: at least 24"),
+        ("area_ccd", "columns", 23, "columns: outside the limits; found 23, allowed: at least 24"),
+        ("area_ccd", "pitch", "1 nm", "pitch: outside the limits; found '1 nm', allowed: at least 0.5 um"),
+        ("sheet", "system_gain_dn_per_e", 1e-30, "system_gain_dn_per_e: a full well is not even one grey value"),
+        ("sheet", "dark_current_e_per_s", 1e8, "less than 1e+07 electrons per second with the exposure of 10 ms"),
+        ("band", "pitch", "1 nm", "bands.P.pitch: outside the limits"),
+    ],
+)
+def test_detectors_that_cannot_work_are_told_by_file_and_line(tmp_path, part, key, value, message):
+    """They were tracebacks, some of them after minutes."""
+    files = {
+        name: yaml.safe_load((LIBRARY / f"{name}.yaml").read_text())
+        for name in ("instruments/gf7_pair", "detectors/monitor_ccd", "cameras/gf7")
+    }
+    instrument, sheet, camera = files.values()
+    ccd = instrument["monitor"]["area_ccd"]
+    {"area_ccd": ccd, "sheet": sheet, "band": camera["bands"]["P"]}[part][key] = value
+    ccd["detector"] = "sheet.yaml"
+    instrument["cameras"]["forward"]["camera"] = "camera.yaml"
+    for name, data in (("instrument", instrument), ("sheet", sheet), ("camera", camera)):
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(data))
+    (tmp_path / "job.yaml").write_text("instrument: instrument.yaml\n")
+    done = invoke(app, tmp_path / "job.yaml", "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    place = {"area_ccd": "instrument", "sheet": "sheet", "band": "camera"}[part]
+    assert message in " ".join(done.output.split())
+    assert re.search(rf"{place}\.yaml:\d+: ", done.output)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_line_ccd_knows_its_exposure():
+    """32 stages of 0.35 ms: 11.2 ms; the data sheet's dark current may fill the well in no less."""
+    band = {"pixels": 64, "pitch": "7 um", "spectrum": ["650 nm", "650 nm"], "detector": "any", "tdi": {"stages": 32}}
+    spec = BandSpec.model_validate(band)
+    assert spec.exposure == pytest.approx(11.2e-3)
+    room = min(60000.0, (4095.0 - 64.0) / 0.06)
+    sheet = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 0.99 * room / 11.2e-3})
+    assert LineCcd.from_specs(spec, sheet).noise.dark_signal_e == pytest.approx(0.99 * room)
+    full = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 1.01 * room / 11.2e-3})
+    with pytest.raises(InputError, match="dark current alone saturates"):
+        LineCcd.from_specs(spec, full)
