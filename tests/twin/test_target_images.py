@@ -25,6 +25,7 @@ from scenes.load import load_detector
 from twin.edge_images import ALONG, DIRECTIONS, TRACK
 from twin.line_ccd import LineCcd, band_wavelengths
 from twin.target_images import (
+    PLACES,
     BarDesign,
     TargetCamera,
     TargetLostError,
@@ -255,16 +256,20 @@ def test_bars(sharp, aberrated, direction):
     even = np.full((REGION, REGION), 5000.0)
     nothing = read_bars(sharp, design, even, even, even, 9)
     assert nothing.measured is None
-    assert "contrast" in nothing.reason
+    assert "no structure in the region" in nothing.reason
 
 
-def bar_readings(camera: TargetCamera, states: list[State], repeats: int, frames: int) -> np.ndarray:
-    """(measured - true) / sigma of bars at every place, in both directions, (readings,); every time other columns'
-    responses, other noise, and the image elsewhere on the pixels."""
+def bar_readings(
+    camera: TargetCamera, states: list[State], repeats: int, frames: int, places: tuple[str, ...] = tuple(PLACES)
+) -> np.ndarray:
+    """(measured - true) / sigma of bars in both directions, (readings,); every time other columns' responses and other
+    noise."""
     nominal, white = camera.views({}), camera.ccd.white_photons(0.6)
     out = []
     for state in states:
-        for number, (place, view) in enumerate(camera.views(state).items()):
+        views = camera.views(state)
+        for number, place in enumerate(places):
+            view = views[place]
             for direction in DIRECTIONS:
                 design = BarDesign.build(nominal[place], direction)
                 share = view.image(design.target)
@@ -292,7 +297,8 @@ def assert_no_chance_of(readings: np.ndarray) -> None:
 
 def test_bars_agree_with_the_traced_pupil_within_their_sigma(before_gf7):
     """24 readings of nine frames, as in a job, half of them with the image elsewhere on the pixels."""
-    readings = bar_readings(before_gf7, [{}, {"base/forward": Motion(rotate=(1.1e-6, 0.7e-6, 0.0))}], 2, 9)
+    states: list[State] = [{}, {"base/forward": Motion(rotate=(1.1e-6, 0.7e-6, 0.0))}]
+    readings = bar_readings(before_gf7, states, 6, 9, ("left",))
     assert len(readings) == 24
     assert_no_chance_of(readings)
 
