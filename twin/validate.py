@@ -26,16 +26,30 @@ from twin.cli import (
 )
 from twin.run_folder import RunFolder
 from twin.validation import registry
-from twin.validation.check import CONFIRMED, CORRECTED, FAILED, NOT_CHECKABLE, REFUTED, VERDICTS, Verdict
+from twin.validation.check import (
+    CONFIRMED,
+    CONSISTENT,
+    CORRECTED,
+    FAILED,
+    NOT_CHECKABLE,
+    REFUTED,
+    REPRODUCED,
+    UNDECIDED,
+    VERDICTS,
+    Verdict,
+)
 from twin.validation.output import write_validation
 from twin.validation.registry import Selection, UnknownCheck, select
-from twin.validation.report import measured_text, printed_text, sigma_text
+from twin.validation.report import claim_text, measured_text, sigma_text
 from twin.validation.runner import Validation, rough_seconds, run_checks
 
 STYLES: dict[Verdict, str] = {
     CONFIRMED: "green",
+    REPRODUCED: "dark_sea_green4",
+    CONSISTENT: "blue",
     CORRECTED: "yellow",
     REFUTED: "cyan",
+    UNDECIDED: "magenta",
     NOT_CHECKABLE: "dim",
     FAILED: "bold red",
 }
@@ -73,12 +87,20 @@ def main(
     Every check has a dotted id that begins with the paper's number, a tolerance that is fixed beforehand, and a
     verdict that follows from the numbers:
 
-    - **confirmed**: the simulation gives the printed value within the tolerance plus three sigma.
+    - **confirmed**: the simulation gives the printed value, or the printed statement holds, within the tolerance plus
+    three sigma, with inputs that were not chosen for it.
+
+    - **reproduced**: the same with inputs that the paper does not print and that were chosen here; they stand beside
+    it, with how far each may move.
+
+    - **consistent**: nothing is printed; the simulation agrees with the theory that the row names.
 
     - **confirmed with correction**: it does not, and it does give the value that follows when a named fault, gap or
     ambiguity of the print is put right.
 
     - **refuted**: it does not, and no correction of the print would make it do so.
+
+    - **undecided**: it agrees, but tolerance plus three sigma is more than what the row is to tell.
 
     - **not checkable**: the text does not print what a comparison needs.
 
@@ -172,9 +194,14 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
                 "paper": check.paper,
                 "equation": check.equation,
                 "statement": check.statement,
+                "also": list(check.also),
                 "printed": check.printed,
                 "unit": check.unit,
                 "tolerance": check.tolerance,
+                "because": check.because,
+                "tells": check.tells,
+                "against": check.against,
+                "basis": check.basis,
                 "expected": check.expected,
                 "group": selection.group.prefix,
                 "group_seconds": selection.group.rough_seconds(fast),
@@ -203,14 +230,14 @@ def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("check", no_wrap=True)
-    table.add_column("printed", justify="right", no_wrap=True)
+    table.add_column("claim", justify="right", no_wrap=True)
     table.add_column("measured", justify="right", no_wrap=True)
     table.add_column("sigma", justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     for r in validation.results:
         unit = "" if r.unit == "1" else r.unit
-        cells = (r.id, printed_text(r), measured_text(r), sigma_text(r), unit)
+        cells = (r.id, claim_text(r), measured_text(r), sigma_text(r), unit)
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
     console = Terminal()
     print_whole(console, table)

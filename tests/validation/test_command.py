@@ -22,15 +22,19 @@ from twin.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
 from twin.validation.check import (
     CONFIRMED,
+    CONSISTENT,
     CORRECTED,
     FAILED,
     NOT_CHECKABLE,
     REFUTED,
+    REPRODUCED,
+    UNDECIDED,
     VERDICTS,
     Check,
     CheckResult,
     Explanation,
 )
+from twin.validation.chosen import Chosen, InputRange, Supposed
 from twin.validation.group import CheckGroup, Context, matches
 from twin.validation.registry import UnknownCheck, select
 from twin.validation.runner import run_checks
@@ -40,13 +44,15 @@ run = partial(invoke, command.app)
 
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = [
-    "id", "paper", "equation", "statement", "printed", "measured", "sigma", "unit", "verdict", "how", "seconds",
+    "id", "also", "paper", "equation", "statement", "printed", "implied", "measured", "sigma", "unit", "tolerance",
+    "because", "power", "tells", "against", "theory", "inputs", "verdict", "how", "seconds",
 ]  # fmt: skip
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check(identifier: str = "001.table3.a", printed: float | None = 1.0, tolerance: float = 0.1, **more) -> Check:
-    return Check(identifier, "Table 3", f"Statement of {identifier}", "arcsec", printed, tolerance, "a reason", **more)
+    told = {"tells": 0.5, "against": "half"} | more
+    return Check(identifier, "Table 3", f"Statement of {identifier}", "arcsec", printed, tolerance, "a reason", **told)
 
 
 def answers(context: Context):
@@ -234,11 +240,11 @@ def test_claims_of_a_limit(comparison, low, high):
 
 def test_a_number_that_is_not_printed_needs_one_that_is_implied():
     silent = check(printed=None)
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(ValueError, match="implied"):
         silent.judge(1.0, None, "")
-    result = silent.judge(1.0, None, "", expected=1.05)
+    result = silent.judge(1.0, None, "", implied=1.05)
     assert (result.printed, result.verdict) == (None, CONFIRMED)
-    assert silent.judge(1.0, None, "", expected=1.2).verdict == REFUTED
+    assert silent.judge(1.0, None, "", implied=1.2).verdict == REFUTED
 
 
 def test_what_the_text_does_not_print_is_not_checked():
@@ -282,9 +288,116 @@ def test_a_fast_run_makes_fewer_trials(fake):
         assert json.loads(run("--list", "--json", *options).stdout)["checks"][0]["group_seconds"] == seconds
 
 
-def test_a_weak_check_says_so():
-    assert "weak" in check().judge(1.0, 0.05, "").how
-    assert "weak" not in check().judge(1.0, 0.03, "").how
+# --- what a row can tell ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sigma", "verdict", "corrected"), [(0.13, CONFIRMED, CORRECTED), (0.14, UNDECIDED, UNDECIDED)]
+)
+def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, corrected):
+    """0.1 + 3 sigma against the 0.5 to half of it."""
+    result = check().judge(1.0, sigma, "")
+    assert result.verdict == verdict
+    assert result.power == pytest.approx(0.1 + 3 * sigma)
+    assert ("half is 0.5 away" in result.how) == (verdict == UNDECIDED)
+    assert check().judge(2.0, sigma, "", explanations=[FAULT]).verdict == corrected
+    # what does not agree is found, however weak the row
+    assert check().judge(3.0, sigma, "", explanations=[CAMERA]).verdict == REFUTED
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"tells": None}, "what the row tells"),
+        ({"tells": 0.0}, "what the row tells"),
+        ({"against": ""}, "what the row tells"),
+        ({"tells": 0.09}, "can never tell"),
+        ({"basis": "theory"}, "a theory is named"),
+        ({"theory": "optics"}, "a theory is named"),
+        ({"basis": "theory", "theory": "optics"}, "nothing is printed"),
+        ({"also": ("002.x",)}, "check id"),
+    ],
+)
+def test_a_row_says_beforehand_what_it_tells(more, words):
+    with pytest.raises(ValueError, match=words):
+        check(**more)
+    assert check(expected=NOT_CHECKABLE, tells=None, against="").tells is None
+
+
+def test_the_verdict_of_agreement_is_that_of_the_rows_basis():
+    reproduced, theory = check(basis="chosen"), check(printed=None, basis="theory", theory="optics")
+    light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
+    result = reproduced.judge(1.0, None, "", inputs=[light])
+    assert (check().expected, reproduced.expected, theory.expected) == (CONFIRMED, REPRODUCED, CONSISTENT)
+    assert result.verdict == REPRODUCED
+    assert theory.judge(1.0, None, "", 1.0).verdict == CONSISTENT
+    assert reproduced.judge(2.0, None, "", inputs=[light]).verdict == REFUTED
+    with pytest.raises(ValueError, match="inputs"):
+        reproduced.judge(1.0, None, "")
+    with pytest.raises(ValueError, match="inputs"):
+        check().judge(1.0, None, "", inputs=[light])
+
+
+@pytest.mark.parametrize(
+    ("comparison", "power", "low", "high"),
+    [
+        ("equal", 1.0, 0.8, 1.2),
+        ("equal", 2.0, 0.8**0.5, 1.2**0.5),
+        ("equal", -1.0, 1 / 1.2, 1 / 0.8),
+        ("at most", 1.0, None, 1.2),
+        ("at least", 1.0, 0.8, None),
+        ("equal", 0.0, None, None),
+    ],
+)
+def test_how_far_a_chosen_input_can_move_before_the_row_fails(comparison, power, low, high):
+    """Tolerance 0.1 and 3 sigma of 0.1 / 3 about a printed 1, all of it measured at an input of 5 mK."""
+    row = check(basis="chosen", comparison=comparison)
+    chosen = Chosen.power("heat", 5.0, "mK", 1.0, power)
+    (found,) = row.judge(1.0, 0.1 / 3, "", inputs=[chosen]).inputs
+    for end, expected in ((found.low, low), (found.high, high)):
+        assert end == (None if expected is None else pytest.approx(5.0 * expected, rel=1e-5))
+    # there it does fail
+    for end, step in ((found.low, 0.99), (found.high, 1.01)):
+        if end is not None:
+            assert row.judge(chosen.response(step * end / 5.0), 0.1 / 3, "", inputs=[chosen]).verdict == REFUTED
+    (lost,) = row.judge(1.0 - 9.0 * (comparison == "at least") + 9.0 * (comparison != "at least"), None, "",
+                        inputs=[chosen]).inputs  # fmt: skip
+    assert (lost.low, lost.high, lost.agrees) == (None, None, False)
+
+
+def test_the_limits_of_an_input_for_a_reader():
+    def text(low, high, agrees=True):
+        return InputRange("heat", 5.0, "mK", low, high, agrees).text
+
+    assert text(4.0, 612.3) == "heat 5 mK, holds from 4.0 to 610 mK"
+    assert text(None, 6.0) == "heat 5 mK, holds up to 6.0 mK"
+    assert text(4.0, None) == "heat 5 mK, holds from 4.0 mK"
+    assert text(None, None) == "heat 5 mK, holds whatever it is"
+    assert text(None, None, False) == "heat 5 mK"
+    assert Supposed("in Rome", "holds in 3 of 4 places").range(bool, True).text == "in Rome, holds in 3 of 4 places"
+
+
+def test_a_row_of_two_equations_fails_with_either():
+    row = check(also=("001.eq6",), expected=CORRECTED)
+    right, wrong = (row.judge(v, None, "", explanations=[FAULT]) for v in (2.0, 1.0))
+    assert row.worse(right, right) is right
+    assert row.worse(right, wrong) is row.worse(wrong, right) is wrong
+
+
+def test_a_row_is_found_by_all_its_ids(fake, tmp_path):
+    both = check("001.eq5", also=("001.eq4",))
+    fake(CheckGroup("001.formulas", "Formulas", 1.0, (both,), answers))
+    found = json.loads(run("--json", "--only", "001.eq4").stdout)["checks"]
+    assert [(r["id"], r["also"]) for r in found] == [("001.eq5", ["001.eq4"])]
+    assert run("--out", tmp_path / "run").exit_code == 0
+    assert "| `001.eq5` = `001.eq4` |" in (tmp_path / "run/summary/README.md").read_text("utf-8")
+    with pytest.raises(ValueError, match=r"twice: 001\.eq4"):
+        select((CheckGroup("001.a", "", 1.0, (both,), answers), group("001.eq4", "")), None)
+
+
+def test_what_neither_agrees_nor_is_explained_can_be_told():
+    result = check().judge(3.0, None, "", otherwise="Text and table contradict each other.")
+    assert (result.verdict, result.how.splitlines()[0]) == (REFUTED, "Text and table contradict each other.")
 
 
 @pytest.mark.parametrize(
@@ -331,7 +444,7 @@ def test_the_run_folder_is_complete(fake, tmp_path):
     assert result.stdout.count("\n") == 1
     printed = json.loads(result.stdout)
     assert printed == json.loads((tmp_path / "new/run/validation.json").read_text())
-    assert (printed["schema"], printed["version"]) == ("space-camera-twin/validation", 1)
+    assert (printed["schema"], printed["version"]) == ("space-camera-twin/validation", 2)
     assert (printed["seed"], printed["backend"], printed["only"], printed["fast"]) == (7, "llvm", None, False)
     assert printed["unexpected"] == []
     assert "drjit" in printed["versions"]
@@ -352,7 +465,8 @@ def test_results_have_exactly_these_keys(fake):
         assert list(found) == KEYS
         assert (found["paper"], found["verdict"]) == ("001", CONFIRMED)
         for key in KEYS:
-            expected = (float, type(None)) if key in ("printed", "measured", "sigma", "seconds") else str
+            numbers = ("printed", "implied", "measured", "sigma", "tolerance", "power", "tells", "seconds")
+            expected = (float, type(None)) if key in numbers else list if key in ("also", "inputs") else str
             assert isinstance(found[key], expected)
 
 
@@ -375,17 +489,23 @@ def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
     def one(context: Context):
         yield context.check("001.eq5").judge(2.0, 0.001, "Twice | as much.", explanations=[FAULT])
         yield context.check("001.eq8").not_checkable("No number is printed.")
+        light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
+        yield context.check("001.eq9").judge(1.0, 0.02, "Dim.", 1.0, inputs=[light])
 
     silent = check("001.eq8", printed=None, expected=NOT_CHECKABLE)
-    fake(GOOD, CheckGroup("001.formulas", "", 1.0, (check("001.eq5", expected=CORRECTED), silent), one))
+    chosen = check("001.eq9", printed=None, basis="chosen")
+    fake(GOOD, CheckGroup("001.formulas", "", 1.0, (check("001.eq5", expected=CORRECTED), silent, chosen), one))
     assert run("--out", tmp_path / "run").exit_code == 0
     page = (tmp_path / "run/summary/README.md").read_text("utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| `")]
-    assert [row.split("`")[1] for row in rows] == [*GOOD.ids, "001.eq5", "001.eq8"]
-    assert all(row.replace("\\|", "").count("|") == 6 for row in rows)
+    assert [row.split("`")[1] for row in rows] == [*GOOD.ids, "001.eq5", "001.eq8", "001.eq9"]
+    assert all(row.replace("\\|", "").count("|") == 9 for row in rows)
     assert "2.0000 ± 0.0010 arcsec" in rows[2]
     assert "- `001.eq5` (Table 3), confirmed with correction: A factor 2 is missing. That gives 2." in page
     assert "- `001.eq8` (Table 3), not checkable: No number is printed." in page
+    # implied value, tolerance with its reason, power with its share of the claim, and what is told from what
+    assert "| [1] | 1.000 ± 0.020 arcsec | 0.1 arcsec: a reason | 0.16 arcsec, 16 % | half, 0.5 arcsec away |" in rows[4]
+    assert "- `001.eq9`: light 8 mW, holds from 6.9 to 9.5 mW" in page
     for figure in re.findall(r"\]\(([^)]+)\)", page):
         assert (tmp_path / "run/summary" / figure).is_file()
 
@@ -494,6 +614,7 @@ SLOW = """
 import runpy, signal, sys, time
 from twin.validation import registry
 from twin.validation.check import Check
+from twin.validation.chosen import Chosen, InputRange, Supposed
 from twin.validation.group import CheckGroup
 
 def sleep(context):
@@ -501,7 +622,7 @@ def sleep(context):
     time.sleep(60)
     yield
 
-registry.GROUPS = (CheckGroup("001.slow", "", 1.0, (Check("001.slow", "", "", "1", 1.0, 0.1, ""),), sleep),)
+registry.GROUPS = (CheckGroup("001.slow", "", 1.0, (Check("001.slow", "", "", "1", 1.0, 0.1, "", tells=1.0, against="none"),), sleep),)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)
 """

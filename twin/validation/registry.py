@@ -51,7 +51,7 @@ def require_unique(groups: Iterable[CheckGroup]) -> None:
     """
     groups = tuple(groups)
     names = Counter(group.prefix for group in groups)
-    ids = Counter(identifier for group in groups for identifier in group.ids)
+    ids = Counter(name for group in groups for check in group.checks for name in check.names)
     twice = [name for counter in (names, ids) for name, count in counter.items() if count > 1]
     if twice:
         raise ValueError(f"registered twice: {', '.join(twice)}")
@@ -62,13 +62,13 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
 
     Args:
         groups: all there are.
-        only: prefixes, separated by commas, that end where a part of an id ends.
+        only: prefixes, separated by commas, that end where a part of an id ends; a row's further ids count as well.
 
     Raises:
         UnknownCheck: there is nothing under one of them.
     """
     require_unique(groups)
-    ids = [identifier for group in groups for identifier in group.ids]
+    ids = [name for group in groups for check in group.checks for name in check.names]
     if only is None:
         return tuple(Selection(group, frozenset(group.ids)) for group in groups)
     prefixes = [part.strip() for part in only.split(",")]
@@ -77,7 +77,7 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
             raise UnknownCheck(_unknown(prefix, ids))
     out = []
     for group in groups:
-        chosen = frozenset(i for i in group.ids if any(matches(i, prefix) for prefix in prefixes))
+        chosen = frozenset(c.id for c in group.checks if any(matches(n, p) for n in c.names for p in prefixes))
         if chosen:
             out.append(Selection(group, chosen))
     return tuple(out)

@@ -9,12 +9,15 @@ from twin.report.numbers import decimals_for, fixed, plain, significant
 from twin.report.page import artefact_content, environment
 from twin.validation.check import (
     CONFIRMED,
+    CONSISTENT,
     CORRECTED,
     FAILED,
     NOT_CHECKABLE,
     PAPERS,
     REFUTED,
+    REPRODUCED,
     SIGMAS,
+    UNDECIDED,
     VERDICTS,
     CheckResult,
     Verdict,
@@ -25,8 +28,11 @@ from twin.versions import versions
 TEMPLATE = "validation.html.j2"
 MARKS: dict[Verdict, tuple[str, str]] = {
     CONFIRMED: ("=", "confirmed"),
+    REPRODUCED: ("⊜", "reproduced"),
+    CONSISTENT: ("∼", "consistent"),
     CORRECTED: ("≈", "corrected"),
     REFUTED: ("≠", "refuted"),
+    UNDECIDED: ("±", "undecided"),
     NOT_CHECKABLE: ("?", "silent"),
     FAILED: ("✕", "failed"),
 }
@@ -92,13 +98,35 @@ def printed_text(result: CheckResult) -> str:
     return "\N{EM DASH}" if result.printed is None else plain(result.printed)
 
 
+def claim_text(result: CheckResult) -> str:
+    """What the paper prints, or in brackets what its statement implies."""
+    if result.printed is None and result.implied is not None:
+        return f"[{plain(result.implied)}]"
+    return printed_text(result)
+
+
+def power_text(result: CheckResult) -> str:
+    """The smallest error of the statement that the row would have found, in its unit and of the claim."""
+    if result.power is None:
+        return "\N{EM DASH}"
+    text = significant(result.power, 2, floor=0.0)
+    unit = "" if result.unit == "1" else f" {result.unit}"
+    share = f", {significant(100.0 * result.power / abs(result.claim), 2, floor=0.0)} %" if result.claim else ""
+    return f"{text}{unit}{share}"
+
+
 def _row(result: CheckResult) -> dict[str, Any]:
     mark, kind = MARKS[result.verdict]
     return {
         "id": result.id,
         "equation": result.equation,
         "statement": result.statement,
-        "printed": printed_text(result),
+        "also": list(result.also),
+        "theory": result.theory,
+        "printed": claim_text(result),
+        "power": power_text(result),
+        "tells": "" if result.tells is None or result.power is None else significant(result.tells, 3, floor=0.0),
+        "against": result.against,
         "measured": measured_text(result),
         "sigma": sigma_text(result),
         "unit": "" if result.unit == "1" else result.unit,

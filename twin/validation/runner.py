@@ -18,7 +18,7 @@ from twin.validation.registry import Selection
 from twin.versions import versions
 
 SCHEMA = "space-camera-twin/validation"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Of validation.json; the version rises when a key changes its meaning or goes."""
 
 FILES = "artefacts"

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from twin.artefact import PngFigure, SvgFigure
-from twin.validation.check import CONFIRMED, PAPERS, VERDICTS, CheckResult
-from twin.validation.report import command, duration_text, measured_text, printed_text, sigma_text
+from twin.report.numbers import plain
+from twin.validation.check import AGREED, PAPERS, VERDICTS, CheckResult
+from twin.validation.report import claim_text, command, duration_text, measured_text, power_text, sigma_text
 from twin.validation.runner import Validation
 
 SUMMARY = "summary"
@@ -23,7 +24,7 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
         for a in run.artefacts
         if isinstance(a, SvgFigure | PngFigure)
     }
-    lines = [*_head(validation), *_tables(validation), *_corrections(validation)]
+    lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation)]
     if figures:
         lines += ["## Figures", ""]
     for name, artefact in figures.items():
@@ -44,6 +45,14 @@ def _head(validation: Validation) -> Iterator[str]:
         if validation.counts[verdict]:
             yield f"| {verdict} | {validation.counts[verdict]} | {meaning} |"
     yield ""
+    yield (
+        "**Claim**: what the paper prints, or in brackets what its statement implies. **Tolerance**: how far claim and "
+        "measurement may be apart without the noise, and why. **Finds**: the smallest error of the statement that the "
+        "row would have found, tolerance plus three sigma, and its share of the claim; an error just so large is found "
+        "half the time. **To be told from**: the nearest other statement and how far away it is; a row that finds less "
+        "than that is undecided."
+    )
+    yield ""
 
 
 def _tables(validation: Validation) -> Iterator[str]:
@@ -53,10 +62,12 @@ def _tables(validation: Validation) -> Iterator[str]:
             continue
         yield f"## Paper {number}: {title}"
         yield ""
-        yield "| check | what is compared | printed | measured | verdict |"
-        yield "|---|---|---:|---:|---|"
+        yield "| check | what is compared | claim | measured | tolerance | finds | to be told from | verdict |"
+        yield "|---|---|---:|---:|---|---|---|---|"
         for r in rows:
-            cells = (f"`{r.id}`", f"{r.equation}: {r.statement}", printed_text(r), _measured(r), r.verdict)
+            names, about = " = ".join(f"`{name}`" for name in (r.id, *r.also)), f"{r.equation}: {r.statement}"
+            about += f". Theory: {r.theory}" if r.theory else ""
+            cells = (names, about, claim_text(r), _measured(r), *_limits(r), r.verdict)
             yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
         yield ""
 
@@ -68,12 +79,35 @@ def _measured(result: CheckResult) -> str:
     return " ".join(part for part in parts if part)
 
 
-def _corrections(validation: Validation) -> Iterator[str]:
-    """Everything that is not simply confirmed, with its reason."""
-    found = [result for result in validation.results if result.verdict != CONFIRMED]
+def _limits(result: CheckResult) -> tuple[str, str, str]:
+    """Tolerance with its reason, what an error must have to be found, and what is to be told."""
+    if result.power is None or result.tells is None:
+        return ("", "", "")
+    unit = "" if result.unit == "1" else f" {result.unit}"
+    tolerance = f"{plain(result.tolerance)}{unit}: {result.because}"
+    return tolerance, power_text(result), f"{result.against}, {plain(result.tells, 3)}{unit} away"
+
+
+def _chosen(validation: Validation) -> Iterator[str]:
+    """Inputs that were chosen here, and how far each may move."""
+    found = [result for result in validation.results if result.inputs]
     if not found:
         return
-    yield "## Corrections, refutations and gaps"
+    yield "## Chosen inputs"
+    yield ""
+    yield "What the paper does not print and these rows need, and where each may be moved before its row fails."
+    yield ""
+    for result in found:
+        yield f"- `{result.id}`: {_cell('; '.join(i.text for i in result.inputs))}"
+    yield ""
+
+
+def _corrections(validation: Validation) -> Iterator[str]:
+    """Everything that does not agree, with its reason."""
+    found = [result for result in validation.results if result.verdict not in AGREED.values()]
+    if not found:
+        return
+    yield "## Corrections, refutations, the undecided and gaps"
     yield ""
     for result in found:
         lines = result.how.splitlines()

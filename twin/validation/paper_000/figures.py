@@ -16,6 +16,7 @@ from optics.threads import one_blas_thread
 from twin.artefact import SvgFigure, Table
 from twin.orbit.angle.flight import AnglePass, Measurement
 from twin.validation.check import CORRECTED, NOT_CHECKABLE, REFUTED, Check, CheckResult, Explanation
+from twin.validation.chosen import Chosen, Supposed
 from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_000.figures_figure import places_svg, sensitivity_svg
 from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of
@@ -41,11 +42,13 @@ TITLES = {
 CHECKS = (
     *(sentence.check() for sentence in SENTENCES),
     Check("000.fig3.ordinate", "Fig. 3, section 2.3.1", "The sentences speak of the angles, though the figures show "
-          "resection minus planes: share of the signs that come out so", "1", None, 0.0, "signs counted", "at least"),
+          "resection minus planes: share of the signs that come out so", "1", None, 0.0, "signs counted", "at least",
+          tells=1 / 6, against="one sentence of six that comes out the other way", basis="chosen"),
     Check("000.fig3.values", "Figs. 3, 4, 5", "Sizes of the changes", "arcsec", None, 0.0, "nothing to compare",
           expected=NOT_CHECKABLE),
     Check("000.fig4.single", "section 2.3.2", "Single control points do not change the result much: change of α by one "
-          "forward point over that by all, the point that does most", "1", None, 0.1, "a tenth is not much", "at most"),
+          "forward point over that by all, the point that does most", "1", None, 0.1, "a tenth is not much", "at most",
+          tells=0.33, against="a third, the share of one point of three", basis="chosen"),
 )  # fmt: skip
 
 
@@ -117,7 +120,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         if f"000.{sentence.name}" in context.selected:
             yield _judged(context, sentence, passes, found, other, places)
     if "000.fig3.ordinate" in context.selected:
-        yield _ordinate(context, found)
+        yield _ordinate(context, found, places)
     if "000.fig4.single" in context.selected:
         yield _single(context, passes)
     context.progress(0.9, "draw")
@@ -134,18 +137,27 @@ def _judged(
 ) -> CheckResult:
     values = np.array([sentence.measure(a.rises, a.growth) for a in found])
     mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in found]) for axis in AXES}
-    held = sum(sentence.holds(a.rises, a.growth) for a in places.values())
+    place = _place(sentence, places)
     lat, lon = ELSEWHERE
     how = (
         f"{len(found)} measurements of a descending pass over 40° N 116° E, Earth-fixed axes, planes fitted anew for "
         f"every metre. Change for 10 m: {', '.join(f'{axis} {v:+.3f}″' for axis, v in mean.items())}. The paper does "
-        f"not print the place: of {len(places)} from 25° to 50° N and 80° to 130° E the sentence holds at {held}; at "
-        f"{lat:g}° N {lon:g}° E the number is {sentence.measure(other.rises, other.growth):.3g}."
+        f"not print the place: the sentence {place.said}; at {lat:g}° N {lon:g}° E the number is "
+        f"{sentence.measure(other.rises, other.growth):.3g}."
     )
     value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
     return context.check(f"000.{sentence.name}").judge(
-        value, sigma, how, sentence.implied, list(_reasons(sentence, passes, other))
-    )
+        value, sigma, how, sentence.implied, list(_reasons(sentence, passes, other)),
+        [place] if sentence.basis == "chosen" else [],
+    )  # fmt: skip
+
+
+def _place(sentence: Sentence | None, places: Mapping[tuple[float, float], Answers]) -> Supposed:
+    """Where a sentence holds, or all of those on signs."""
+    said = [sentence] if sentence else [s for s in SENTENCES if s.kind == "signs"]
+    held = sum(all(s.holds(a.rises, a.growth) for s in said) for a in places.values())
+    text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
+    return Supposed("a descending pass over 40° N 116° E", text)
 
 
 def _reasons(sentence: Sentence, passes: Passes, other: Answers) -> Iterator[Explanation]:
@@ -169,7 +181,9 @@ def _reasons(sentence: Sentence, passes: Passes, other: Answers) -> Iterator[Exp
             )
 
 
-def _ordinate(context: Context, found: list[Answers]) -> CheckResult:
+def _ordinate(
+    context: Context, found: list[Answers], places: Mapping[tuple[float, float], Answers]
+) -> CheckResult:
     signs = [s for s in SENTENCES if s.kind == "signs"]
     flipped = [{key: -v for key, v in a.rises.items()} for a in found]
     share = np.mean([s.holds(a.rises, a.growth) for s in signs for a in found])
@@ -180,7 +194,7 @@ def _ordinate(context: Context, found: list[Answers]) -> CheckResult:
         f"where the resection stays, the share is {other:.2f}: the figures' curves fall where the text says that the "
         "angle rises."
     )
-    return context.check("000.fig3.ordinate").judge(float(share), None, how, 1.0)
+    return context.check("000.fig3.ordinate").judge(float(share), None, how, 1.0, inputs=[_place(None, places)])
 
 
 def _single(context: Context, passes: Passes) -> CheckResult:
@@ -206,7 +220,8 @@ def _single(context: Context, passes: Passes) -> CheckResult:
         f"{np.max(np.abs(each)) / ARCSEC:.3f}″, all together {whole / ARCSEC:.2f}″. With n points the share is about "
         "1/n, and the paper does not print n."
     )
-    return context.check("000.fig4.single").judge(value, None, how, 0.0)
+    count = Chosen.power("points on a line", float(len(each)), "1", value, -1.0)
+    return context.check("000.fig4.single").judge(value, None, how, 0.0, inputs=[count])
 
 
 def _places(context: Context) -> dict[tuple[float, float], Answers]:

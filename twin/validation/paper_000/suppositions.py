@@ -28,20 +28,25 @@ _FIRST_ORDER = "the formulas for what is expected are of first order, 6 % of hal
 CHECKS = (
     Check("000.light.aberration", "section 1.2", "Ground points lie in the plane of the line that sees them, whatever "
           "its velocity: α from true points minus the camera's, aberration alone", "arcsec", None, 0.03, _FIRST_ORDER,
-          expected=CORRECTED),
+          expected=CORRECTED,
+          tells=0.4, against="points that aberration has moved"),
     Check("000.light.refraction", "section 1.2", "Ground points lie in the plane of the line that sees them, also "
           "through air: α from true points minus the camera's, refraction alone", "arcsec", None, 0.03, _FIRST_ORDER,
-          expected=CORRECTED),
+          expected=CORRECTED,
+          tells=0.4, against="points that air has moved"),
     Check("000.light.beta", "section 2.1", "The procedure needs no correction for the light: β from true points minus "
           "the camera's, all effects together", "arcsec", None, 0.05, "the two effects' 0.03 arcsec in "
           "quadrature, rounded up",
-          expected=CORRECTED),
+          expected=CORRECTED,
+          tells=0.9, against="points that both have moved"),
     Check("000.traced", "eqs. (5), (6)", "Change of the angle of gf7_pair as the planes show it, minus the change by "
           "exact trace of the instrument", "arcsec", None, 0.05,
-          "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"),
+          "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec",
+          tells=0.44, against="a difference as large as the smaller one of Table 1"),
     Check("000.centres", "section 1.2", "The lines may be taken to have one projection centre: the same of gf7_pair, "
           "whose centres lie 2.8 m apart", "arcsec", None, 0.05,
-          "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec", expected=CORRECTED),
+          "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec", expected=CORRECTED,
+          tells=1.0, against="what centres so far apart make"),
 )  # fmt: skip
 
 

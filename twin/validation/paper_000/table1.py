@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from twin.orbit.angle.flight import Measurement
 from twin.orbit.angle.procedure import effect_rows, values_of
 from twin.orbit.angle.to_json import PRINTED_DIFFERENCE_ARCSEC
 from twin.validation.check import NOT_CHECKABLE, REFUTED, SIGMAS, Check, CheckResult, Explanation
+from twin.validation.chosen import Chosen
 from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_000.passes import PAIRS, TEST, Passes, planes_of, repeated, setup_of
 from twin.validation.paper_000.table1_figure import differences_svg
@@ -27,10 +29,15 @@ ALPHA, BETA = PRINTED_DIFFERENCE_ARCSEC["alpha"], PRINTED_DIFFERENCE_ARCSEC["bet
 POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))
 """Metres: control points of 2 m, matched to a third of a pixel of 5 m."""
 
+POINTS = float(setup_of(TEST).test.strips.points)
+"""On each line."""
+
 LIMIT = 3.44
 """Distance in two dimensions that 99.7 % keep, as three standard deviations in one."""
 
 _LIMIT = "the points' error of 2.6 m is itself known to 0.3 m, a ninth of what three standard deviations reach"
+
+_DIGIT = "half of the last printed digit"
 
 CHECKS = (
     Check("000.table1.angles", "Table 1", "α and β by resection and by planes", "arcsec", None, 0.0, "nothing "
@@ -38,25 +45,32 @@ CHECKS = (
           expected=NOT_CHECKABLE),
     Check("000.table1.alpha", "Table 1", "Resection and planes of the same points and station differ by 0.44 "
           "arcsec in α: standard deviation of their "
-          "difference", "arcsec", ALPHA, 0.03, "a twentieth of either printed difference",
-          expected=REFUTED),
+          "difference", "arcsec", ALPHA, 0.005, _DIGIT,
+          expected=REFUTED,
+          tells=0.4, against="what the two methods differ by on the same data"),
     Check("000.table1.beta", "Table 1", "Resection and planes of the same points and station differ by 1.53 "
           "arcsec in β: standard deviation of their "
-          "difference", "arcsec", BETA, 0.03, "a twentieth of either printed difference",
-          expected=REFUTED),
+          "difference", "arcsec", BETA, 0.005, _DIGIT,
+          expected=REFUTED,
+          tells=1.5, against="what the two methods differ by on the same data"),
     Check("000.table1.alpha_own", "Table 1", "0.44 arcsec in α are within reach when each method has points of its own "
           "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", ALPHA, 0.1, _LIMIT,
-          "at least"),
+          "at least",
+          tells=0.4, against="the reach of methods that share their points, 0.03 arcsec", basis="chosen"),
     Check("000.table1.beta_own", "Table 1", "1.53 arcsec in β are within reach when each method has points of its own "
           "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", BETA, 0.1, _LIMIT,
-          "at least"),
+          "at least",
+          tells=0.7, against="the reach without the light's effects", basis="chosen"),
     Check("000.table1.pair", "Table 1", "0.44 and 1.53 arcsec of one sign are within reach together: distance of the "
           "pair from such differences, in standard deviations of two dimensions", "1", None, 0.2,
-          "a twentieth of the limit, which 99.7 % of pairs keep", "at most", expected=REFUTED),
+          "a twentieth of the limit, which 99.7 % of pairs keep", "at most", expected=REFUTED,
+          tells=0.85, against="a pair as rare as one in 10 000"),
     Check("000.accuracy", "abstract, section 2.2", "The result is good to the order of 1 arcsec: larger RMS error of α "
-          "and β, light corrected", "arcsec", 1.0, 0.1, "a tenth of the order that is printed", "at most"),
+          "and β, light corrected", "arcsec", 1.0, 0.1, "a tenth of the order that is printed", "at most",
+          tells=2.1, against="the next order of magnitude, which begins at √10", basis="chosen"),
     Check("000.accuracy.light", "abstract, section 2.2", "The result is good to the order of 1 arcsec: larger "
-          "RMS error of α and β, light left as it is", "arcsec", 1.0, 0.5, "the order of 1 arcsec", "at most"),
+          "RMS error of α and β, light left as it is", "arcsec", 1.0, 0.5, "the order of 1 arcsec", "at most",
+          tells=2.1, against="the next order of magnitude, which begins at √10", basis="chosen"),
 )  # fmt: skip
 
 
@@ -185,7 +199,24 @@ def _own(context: Context, data: Data, own: Differences) -> Iterator[CheckResult
             "from aberration and refraction, which only the resection takes out. How many points the paper has, and "
             "whether the two methods share them, is not printed."
         )
-        yield context.check(identifier).judge(abs(bias) + SIGMAS * spread, noise, how)
+        reach = partial(_reach, abs(bias), SIGMAS * spread)
+        yield context.check(identifier).judge(reach(1.0), noise, how, inputs=_points(reach))
+
+
+def _reach(bias: float, spread: float, factor: float) -> float:
+    return bias + factor * spread
+
+
+def _rms(bias: float, spread: float, factor: float) -> float:
+    return float(np.hypot(bias, factor * spread))
+
+
+def _points(response: Callable[[float], float]) -> list[Chosen]:
+    """The ground points, on which the scatter of an angle hangs; response: of what is measured to a factor on that."""
+    return [
+        Chosen("error of a point", POINT_SIGMA, "m", response),
+        Chosen("points on a line", POINTS, "1", lambda factor: response(factor**-0.5)),
+    ]
 
 
 def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
@@ -244,7 +275,10 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
             f"and refraction {light}: α {mean[0]:+.2f}″ ± {np.std(off[:, 0]):.2f}″, β {mean[1]:+.2f}″ ± "
             f"{np.std(off[:, 1]):.2f}″ from the camera's true angles."
         )
-        yield context.check(identifier).judge(float(rms[worst]), float(np.std(off[:, worst]) / np.sqrt(len(off))), how)
+        bias, spread = float(mean[worst]), float(np.std(off[:, worst]))
+        noise = spread / float(np.sqrt(len(off)))
+        inputs = _points(partial(_rms, bias, spread))
+        yield context.check(identifier).judge(float(rms[worst]), noise, how, inputs=inputs)
 
 
 GROUP = CheckGroup("000.table1", "Planes against resection, Table 1", 20.0, CHECKS, run, 4.0)

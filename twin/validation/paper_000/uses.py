@@ -21,19 +21,26 @@ _TENTH = "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"
 CHECKS = (
     Check("000.height.alpha", "section 0", "1 arcsec of α makes more than 5 m of height", "m", 5.0, 0.0,
           "the bound itself",
-          "at least"),
+          "at least",
+          tells=1.0, against="no more than 4 m"),
     Check("000.height.beta", "section 0", "1 arcsec of β makes more than 5 m of height", "m", 5.0, 0.0,
           "the bound itself",
-          "at least"),
+          "at least",
+          tells=1.0, against="no more than 4 m"),
     Check("000.height.size", "section 0", "Height of 1 arcsec of α over slant range times 1 arcsec over the "
-          "sine of the rays' angle on the ground", "1", None, 0.01, "first order in the curvature of ground and orbit"),
+          "sine of the rays' angle on the ground", "1", None, 0.01, "first order in the curvature of ground and orbit",
+          tells=0.068, against="flat ground", basis="theory",
+          theory="intersection of two rays on a sphere, range times angle over the sine of theirs"),
     Check("000.outlook.high_resolution", "section 3", "Off-axis angle of the high-resolution line by planes: "
-          "angle along the track minus the true one", "arcsec", None, 0.05, _TENTH),
+          "angle along the track minus the true one", "arcsec", None, 0.05, _TENTH,
+          tells=0.44, against="a difference as large as the smaller one of Table 1"),
     Check("000.outlook.multispectral", "section 3", "Off-axis angle of the multispectral line by planes: angle "
-          "along the track minus the true one", "arcsec", None, 0.05, _TENTH),
+          "along the track minus the true one", "arcsec", None, 0.05, _TENTH,
+          tells=0.44, against="a difference as large as the smaller one of Table 1"),
     Check("000.outlook.unsigned", "section 3, eq. (6)", "(6) gives the off-axis angle of the multispectral line: its "
           "value minus the angle between the looks", "arcsec", None, 1.0, "half of the noise of one measurement",
-          expected=CORRECTED),
+          expected=CORRECTED,
+          tells=9.0, against="the twist of the arrays in place of the looks"),
 )  # fmt: skip
 
 

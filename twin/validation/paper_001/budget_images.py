@@ -49,6 +49,7 @@ class BudgetImages:
         halved: glass path of the 180-deg prism before and after halving, m, and the ratio of its errors.
         together: all causes at once.
         scatter: of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
+        line_pixel: of the line CCD, metres.
         roll_pixels: how far ROLL moves the line of sight of the line's end, pixels of the line CCD.
     """
 
@@ -60,6 +61,7 @@ class BudgetImages:
     halved: tuple[float, float, float] | None
     together: Together | None
     scatter: tuple[tuple[float, float], tuple[float, float]] | None
+    line_pixel: float
     roll_pixels: float | None
 
 
@@ -91,7 +93,10 @@ def measured(context: Context) -> BudgetImages:
         causes = budget.together(lambda done, text: context.progress(0.55 + 0.4 * done, text))
     geometry = next(iter(budget.experiment.calibration.cameras.values())).geometry
     inputs = (trials, together, groups)
-    return BudgetImages(geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, roll)
+    pitch = next(iter(budget.experiment.instrument.cameras.values())).spec.line.pitch
+    return BudgetImages(
+        geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, pitch, roll
+    )
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:

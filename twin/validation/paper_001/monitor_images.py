@@ -92,6 +92,12 @@ class MonitorImages:
         """The geometry of the first camera; both have the same prescription."""
         return self.geometry(self.cameras[0])
 
+    @property
+    def local_share(self) -> float:
+        """Focal length along the line at its centre, where d_beta is taken, over the formulas' f; of both cameras."""
+        cameras = self.experiment.instrument.cameras
+        return float(np.mean([cameras[c].line_focal_length / self.geometry(c).focal_length_m for c in self.cameras]))
+
     def parameters(self) -> Mapping[str, Mapping[str, CameraParameters]]:
         """Camera -> estimator -> what it reads from the spots, (S,)."""
         cameras = self.experiment.calibration.cameras

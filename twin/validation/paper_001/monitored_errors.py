@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from analysis.monitoring import ARCSEC
 from twin.artefact import Cell, Table
 from twin.error_budget import Together
 from twin.validation.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
+from twin.validation.chosen import Chosen, Supposed
 from twin.validation.group import Context
 from twin.validation.paper_001 import error_propagation
 from twin.validation.paper_001.budget_images import BudgetImages
@@ -23,34 +25,41 @@ _PARAMETERS = {
     "d_f": ("d_f_m", "Δf by (7), 3σ", 0.04, "mm", 0.005, _DIGITS),
 }  # fmt: skip
 _UNIT = {"arcsec": ARCSEC, "mm": 1e-3}
+_OF_GEOMETRY = ("d_gamma", "d_f")
+"""Parameters whose printed factors hold f or L, which are not printed and were chosen after Table 5."""
 _SHOWN = ("paper_single", "paper_joint", "derived")
 
 CHECKS = (
     *(
         Check(f"001.table5.{name}", "Table 5", f"{text}, all causes at once through images", unit, value, 0.2 * value,
-              _INPUTS)
+              _INPUTS, tells=0.5 * value, against="half as much or half as much again", basis="chosen")
         for name, (_, text, value, unit, *_) in _PARAMETERS.items()
     ),
     *(
         Check(f"001.table5.{name}.propagated", "Table 5, section 3.2.3", f"{text}, from the printed Table 4", unit,
-              value, tolerance, why)
+              value, tolerance, why, tells=0.4 * value, against="spots whose errors are one and the same",
+              basis="chosen" if name in _OF_GEOMETRY else "printed")
         for name, (_, text, value, unit, tolerance, why) in _PARAMETERS.items()
     ),
     Check("001.table5.d_f.by_table1", "Table 5, section 3.2.3",
           "Table 5 follows from Tables 1 and 4: Δf by Table 1's last column from the printed Table 4", "mm", 0.04,
-          0.005, _DIGITS, expected=CORRECTED),
+          0.005, _DIGITS, expected=CORRECTED,
+          tells=0.02, against="half of it"),
     Check("001.table5.x_and_y", "section 3.2.3, abstract",
           "The turns about X and Y are determined to better than 0.1″: the larger, 3σ", "arcsec", 0.1, 0.02, _INPUTS,
-          "at most"),
+          "at most",
+          tells=0.045, against="the error of a single spot, 0.145 arcsec", basis="chosen"),
     Check("001.table5.d_gamma.positioning", "section 3.2.3",
           "The error of Δγ has little influence on positioning: 2.15″ moves the line's end by at most one pixel", "px",
-          None, 0.1, "a tenth of a pixel; the text gives no limit, one ground sample is taken for little", "at most"),
+          None, 0.1, "a tenth of a pixel; the text gives no limit, one ground sample is taken for little", "at most",
+          tells=1.0, against="two pixels", basis="chosen"),
     Check("001.table5.d_gamma.removable", "section 3.2.3",
           "Later photogrammetric processing removes the error of Δγ well", "arcsec", None, 0.0,
           "nothing is printed to compare with", expected=NOT_CHECKABLE),
     Check("001.table5.d_f.field", "section 3.2.3",
           "Δf is less accurate than from a calibration field: its 3σ is at least the 0.01 mm of paper 003", "mm", None,
-          0.002, "a fifth of paper 003's 0.01 mm", "at least"),
+          0.002, "a fifth of paper 003's 0.01 mm", "at least",
+          tells=0.009, against="a monitor ten times as good as a field", basis="chosen"),
 )  # fmt: skip
 
 
@@ -77,7 +86,10 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
             "line it is nothing. For comparison, Table 5's 0.05 arcsec of Δα moves the whole line by "
             f"{0.05 * ARCSEC * images.geometry.focal_length_m / 7e-6:.2f} px of 7 µm."
         )
-        yield context.check("001.table5.d_gamma.positioning").judge(images.roll_pixels, None, how, 1.0)
+        pixel = Chosen.power("pixel of the line CCD", images.line_pixel * 1e6, "µm", images.roll_pixels, -1.0)
+        limit = Supposed("one pixel taken for little", f"holds down to {images.roll_pixels:.2f} px")
+        check = context.check("001.table5.d_gamma.positioning")
+        yield check.judge(images.roll_pixels, None, how, 1.0, inputs=[pixel, limit])
     if "001.table5.d_gamma.removable" in context.selected:
         yield context.check("001.table5.d_gamma.removable").not_checkable(
             "The text names neither a method nor what remains after it."
@@ -101,7 +113,12 @@ def _simulated(context: Context, images: BudgetImages, together: Together, name:
         joint = values["paper_joint"]
         how += f" Table 1's joint form gives half: {joint[0]:.3g} ± {joint[1]:.2g} mm."
     single = values["paper_single"]
-    return context.check(f"001.table5.{name}").judge(single[0], single[1], how)
+    return context.check(f"001.table5.{name}").judge(single[0], single[1], how, inputs=[all_causes(single[0])])
+
+
+def all_causes(value: float) -> Chosen:
+    """What all inputs make together, to which every error is proportional."""
+    return Chosen.power("errors by all inputs of scenes/budgets/monitor_pair.yaml, times", 1.0, "1", value)
 
 
 def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResult:
@@ -112,7 +129,16 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
         f"The printed factors on the printed Table 4 of every coordinate of both spots, independent; f = "
         f"{g.focal_length_m:.3f} m, L = {g.separation_m:.4f} m of the camera made after Table 5."
     )
-    return context.check(f"001.table5.{name}.propagated").judge(value, None, how)
+    inputs = []
+    if name in _OF_GEOMETRY:
+        for what, field, size in (("f", "focal_length_m", g.focal_length_m), ("L", "separation_m", g.separation_m)):
+
+            def response(factor: float, field: str = field, size: float = size) -> float:
+                changed = replace(g, **{field: factor * size})
+                return error_propagation.propagated(TABLE_4, changed)[name] / _UNIT[unit]
+
+            inputs.append(Chosen(what, size, "m", response))
+    return context.check(f"001.table5.{name}.propagated").judge(value, None, how, inputs=inputs)
 
 
 def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
@@ -124,14 +150,16 @@ def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
             f"{found['d_alpha_rad'][0] / ARCSEC:.4f} arcsec. These are errors of the monitor, not of the spot, which "
             "is determined to 0.145 arcsec only."
         )
-        yield context.check("001.table5.x_and_y").judge(value / ARCSEC, sigma / ARCSEC, how)
+        chosen = all_causes(value / ARCSEC)
+        yield context.check("001.table5.x_and_y").judge(value / ARCSEC, sigma / ARCSEC, how, inputs=[chosen])
     if "001.table5.d_f.field" in context.selected:
         value, sigma = found["d_f_m"]
         how = (
             "All causes at once through images, by (7). Paper 001 prints no figure for a field; paper 003 finds the "
             "interior orientation of its fields stable to 0.01 mm."
         )
-        yield context.check("001.table5.d_f.field").judge(value / 1e-3, sigma / 1e-3, how, 0.01)
+        chosen = all_causes(value / 1e-3)
+        yield context.check("001.table5.d_f.field").judge(value / 1e-3, sigma / 1e-3, how, 0.01, inputs=[chosen])
 
 
 def _show(context: Context, images: BudgetImages, together: Together) -> None:

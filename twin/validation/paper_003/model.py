@@ -9,8 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from analysis.monitoring import ARCSEC
-from analysis.orbit.three_line_model import BIAS
+from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.threads import one_blas_thread
+from scenes.orbit_angle import LINES
 from scenes.orbit_calibration import CalibrationImagesSpec
 from scenes.orbit_setup import CalibrationSetup
 from twin.artefact import SvgFigure, Table
@@ -21,7 +22,7 @@ from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_003 import exact, marks, rendered
 from twin.validation.paper_003.model_figure import open_svg
 from twin.validation.paper_003.rendered import FREE_INTERIOR, ROLL_PITCH, YAW, FromImages
-from twin.validation.paper_003.setups import FIELDS, IMAGES, setup_of, without_light
+from twin.validation.paper_003.setups import FIELDS, IMAGES, all_errors, setup_of, without_light
 from twin.validation.paper_003.setups import exact as exact_setup
 
 FIELD = "Beijing"
@@ -40,60 +41,76 @@ CHECKS = (
         "003.model", _SECTION, "The rigorous model of the line scanner: largest distance of marks in rendered images "
         "from where the model sees their ground points", "px", None, 0.01,
         "a matched point is known to 0.1 px; one percent of a pixel is 5 cm on the ground", "at most",
+        tells=0.1, against="what a matched point is wrong by", basis="theory",
+        theory="collinearity of station, ground point and image point",
     ),
     Check(
         "003.equations", "section 2, error equations (lost)",
         "Coefficients of f, x, y of each line, roll, pitch and yaw: largest difference from the motion of image points "
         "of the rigorous sensor, relative", "1", None, 1e-6,
         "steps of 15 µm and 15 µrad leave 1e-8 of third order and of the sensor's 1e-7 px", "at most",
+        tells=0.5, against="a coefficient with half its size, or with a wrong sign", basis="theory",
+        theory="derivatives of the collinearity equations",
     ),
     Check(
         "003.equations.exact", "section 2, error equations (lost)",
         "Exact points give back interior and biases: largest error of an unknown, as image motion", "px", None, 1e-5,
         "the sensor's image points are solved to 1e-7 px, and a hundredth of all points decides on one unknown",
         "at most",
+        tells=0.1, against="what a matched point is wrong by", basis="theory",
+        theory="least squares on exact data gives back what made them",
     ),
     Check(
         "003.model.rank", "section 2, unknowns",
-        "f, x and y of three cameras and three attitude biases, twelve unknowns, are determined: rank", "1", 12.0, 0.1,
+        "f, x and y of three cameras and three attitude biases are determined: rank of these twelve", "1", None, 0.1,
         "a whole number", expected=CORRECTED,
+        tells=1.0, against="one combination of unknowns that is left open",
     ),
     Check(
         "003.model.stepwise", "section 3.1, Fig. 1",
         "Biases and interior solved in turns and iterated give the calibration: largest difference from the "
         "simultaneous solution, sigmas", "1", None, 0.1,
         "a tenth of a sigma is lost in the noise of the points", "at most",
+        tells=1.0, against="a solution one sigma away",
     ),
     Check(
         "003.model.points", "section 4.1, control points",
         "Points in rendered images, matched with an orthophoto of another season: RMS of a coordinate against truth; "
         "the campaigns draw 0.3 px", "px", None, 0.0, "what is drawn must not be better than what is measured",
         "at most",
+        tells=0.1, against="points worse by 0.1 px than what is drawn", basis="theory",
+        theory="the 0.3 px of noise that the campaigns draw",
     ),
     Check(
         "003.model.bias", "section 4.3, Table 3",
         "Rendered field by the stepwise solution: roll and pitch are known to the class of 1″, RMS error", "arcsec",
         1.0, _SECOND, _CLASS, "at most",
+        tells=9.0, against="the class of 10″", basis="chosen",
     ),
     Check(
         "003.model.bias.yaw", "section 4.3, Table 3",
         "The same of yaw, the third axis, in the scatter that its sigma states: error over sigma", "1", None, 4.0,
         "4 sigmas: one false alarm in 16 000", "at most",
+        tells=10.0, against="a sigma three and more times too small", basis="theory",
+        theory="normal errors of the stated sigma",
     ),
     Check(
         "003.model.interior", "section 4.3, Tables 4 and 5",
         "Rendered field by the stepwise solution: the interior is known to the class of 0.01 mm, RMS error", "µm",
         10.0, 10.0 * _SECOND, _CLASS, "at most",
+        tells=90.0, against="the class of 0.1 mm", basis="chosen",
     ),
     Check(
         "003.model.plan", "sections 3.2 and 4.5",
         "The same field, check points matched in the images, no ground control: RMS in plan within 1:50 000", "m",
         None, 1.0, "a fifth of a pixel; the limit, 0.5 mm on the map, is assumed, the paper prints none", "at most",
+        tells=25.0, against="1:100 000, twice the limit", basis="chosen",
     ),
     Check(
         "003.model.height", "sections 3.2 and 4.5",
         "The same check points of the rendered field: RMS in height within 1:50 000", "m", None, 0.6,
         "a tenth of the limit, which is usual for contours of 20 m and assumed, the paper prints none", "at most",
+        tells=6.0, against="contours of 40 m, twice the limit", basis="chosen",
     ),
     Check(
         "003.fig1", "Fig. 1", "Flow of the calibration", "1", None, 0.0, "the figure is lost", expected=NOT_CHECKABLE,
@@ -200,7 +217,7 @@ def _drawn(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             "x of all three lines against pitch, x_l = x_v = x_r: one of them must be held (gauge), which the text "
             "does not say; the stepwise solution hides it, for each of its steps has full rank.",
         )
-        yield context.check("003.model.rank").judge(found.rank, None, how, explanations=(reason,))
+        yield context.check("003.model.rank").judge(found.rank, None, how, float(UNKNOWNS), (reason,))
         context.add(
             SvgFigure(
                 "open",
@@ -222,6 +239,7 @@ def _drawn(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
         yield context.check("003.model.stepwise").judge(way.distance, None, how, 0.0)
 
 
+UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
 ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)
 
 
@@ -267,7 +285,9 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             rms, sigma = _worst(found, names)
             said = " ".join(rendered.told(f, names) for f in found)
             how = f"{size}. Error and sigma: {said} The worst field counts. Rounds of the stepwise solution: {rounds}."
-            yield context.check(identifier).judge(rms / unit, sigma / unit, how)
+            yield context.check(identifier).judge(
+                rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)]
+            )
     if "003.model.bias.yaw" in context.selected:
         values = {f.name: abs(f.error[n]) / f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW}
         sigma = max(f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW) / ARCSEC
@@ -288,7 +308,8 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
                 f"the field's own parameters; {before:.0f} m before calibration. Of the same patches as the control "
                 "points, whose error in the orthophoto they share."
             )
-            yield context.check(f"003.model.{what}").judge(rms, sigma, how, getattr(setup.test.limits, what))
+            limit = getattr(setup.test.limits, what)
+            yield context.check(f"003.model.{what}").judge(rms, sigma, how, limit, inputs=[all_errors(rms)])
     _table(context, found)
 
 

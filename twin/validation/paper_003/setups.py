@@ -18,6 +18,7 @@ from twin.orbit.calibration.campaign import FieldPass, changed_payload
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.line_camera import line_cameras
 from twin.orbit.sensor import Platform, Sensor
+from twin.validation.chosen import Chosen
 
 FIELDS, IMAGES, STRIP = "calibrate.yaml", "calibrate_images.yaml", "calibrate_strip.yaml"
 """Files of scenes/orbit: seven fields of drawn points; fields of rendered images; passes with tie points."""
@@ -51,6 +52,11 @@ def exact(setup: CalibrationSetup) -> CalibrationSetup:
     tracker = errors.star_tracker.model_copy(update={"thermal": ThermalDriftSpec()})
     update = {"switched_on": False, "season": (0.0, 0.0, 0.0), "star_tracker": tracker}
     return changed(setup, errors=errors.model_copy(update=update))
+
+
+def all_errors(value: float) -> Chosen:
+    """What is assumed of biases, orbit, attitude and points, to which the errors of a calibration are proportional."""
+    return Chosen.power("biases and errors of scenes/orbit/calibrate.yaml, times", 1.0, "1", value)
 
 
 def true_sensors(

@@ -11,6 +11,7 @@ from optics.rotation import rotation_matrix
 from twin.laboratory.focus import line_turn, mount_of
 from twin.laboratory.focus_bench import FocusBench
 from twin.validation.check import Check, CheckResult
+from twin.validation.chosen import Chosen
 
 Array = NDArray[np.float64]
 PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
@@ -20,14 +21,19 @@ LIMITS = np.array([10.0 * ARCSEC, 10.0 * ARCSEC, 10.0 * ARCSEC, 7e-6, 7e-6, 5e-6
 """What counts as a change: the theodolite's 10 arcsec, a panchromatic pixel, a step of the shims."""
 
 
-def effects(bench: FocusBench) -> Array:
+def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
     """Change of each parameter (6) by each adjustment (6), as far as the assembly is mis-set: radians and metres.
 
     Δα, Δβ and Δz are those of the plane through the traced defocus of all sites; Δγ is the line's turn, Δx and Δy where
     its middle goes.
+
+    Args:
+        bench: with the mount.
+        inclined: factor on the inclination of the mounting surface.
     """
     test = bench.setup.test
-    mount = mount_of(test)
+    surface = test.mount.model_copy(update={"tilt": inclined * test.mount.tilt})
+    mount = mount_of(test.model_copy(update={"mount": surface}))
     up, centre = mount.normal, mount.holes.mean(axis=0)
     x = np.array([1.0, 0.0, 0.0]) - up[0] * up
     x /= np.linalg.norm(x)
@@ -57,7 +63,6 @@ def judge_coupling(check: Check, bench: FocusBench) -> CheckResult:
     """How many parameters no adjustment of the mount changes alone."""
     change = effects(bench)
     seen = np.abs(change) > LIMITS
-    together = np.any(seen & (seen.sum(axis=1) > 1)[:, None], axis=0)
     text = "; ".join(
         f"{name} changes {', '.join(p for p, s in zip(PARAMETERS, row, strict=True) if s)}"
         for name, row in zip(ADJUSTMENTS, seen, strict=True)
@@ -70,4 +75,14 @@ def judge_coupling(check: Check, bench: FocusBench) -> CheckResult:
         f"surface, {np.degrees(bench.setup.test.mount.tilt):g}°, and its distance from the focal plane are assumed, "
         "for the paper prints neither. About one axis it couples two families of three, not all six with each other."
     )
-    return check.judge(float(np.sum(together)), None, how)
+    inclination = Chosen(
+        "inclination of the mounting surface", float(np.degrees(bench.setup.test.mount.tilt)), "deg",
+        lambda factor: _coupled(effects(bench, factor)),
+    )  # fmt: skip
+    return check.judge(_coupled(change), None, how, inputs=[inclination])
+
+
+def _coupled(change: Array) -> float:
+    """How many parameters change together with another one."""
+    seen = np.abs(change) > LIMITS
+    return float(np.sum(np.any(seen & (seen.sum(axis=1) > 1)[:, None], axis=0)))

@@ -31,16 +31,21 @@ _ROUNDING = "rounding of float64, 2e-16 f, over tan W of the edge, 0.02, and ten
 
 CHECKS = (
     Check("004.eq2.solution", "eq. (2)", "f and p of (2) make the sum of D² least: largest difference from a "
-          "least-squares solution", "µm", None, 1e-6, _ROUNDING),
+          "least-squares solution", "µm", None, 1e-6, _ROUNDING,
+          tells=1.0, against="half of the accuracy that the paper claims"),
     Check("004.eq3.solution", "eq. (3)", "With p = 0, f of (3) makes the sum of D² least: difference from a "
-          "least-squares solution", "µm", None, 1e-6, _ROUNDING),
+          "least-squares solution", "µm", None, 1e-6, _ROUNDING,
+          tells=1.0, against="half of the accuracy that the paper claims"),
     Check("004.eq4.solution", "eq. (4)", "With f known, p of (4) makes the sum of D² least: difference from a "
-          "least-squares solution", "µm", None, 1e-6, _ROUNDING),
+          "least-squares solution", "µm", None, 1e-6, _ROUNDING,
+          tells=1.0, against="half of the accuracy that the paper claims"),
     Check("004.eq3.ignored", "section 3.1, eq. (3)", "A principal point one pixel from the middle of the line can be "
           "ignored: largest change of D by (3)", "µm", DISTORTION_ACCURACY_UM, 0.05,
-          "half of the last printed digit", "at most"),
+          "half of the last printed digit", "at most",
+          tells=2.3, against="twice the accuracy that the paper claims"),
     Check("004.turntable.range", "section 3.2", "The test turns the camera by no more than 5°: angle between the "
-          "directions that are imaged to the ends of the line", "deg", 5.0, 0.0, "the bound itself", "at most"),
+          "directions that are imaged to the ends of the line", "deg", 5.0, 0.0, "the bound itself", "at most",
+          tells=5.0, against="twice the bound"),
 )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from analysis.focal_plane.plane_fit import fit_focal_plane
 from analysis.focal_plane.rigid_motion import RigidMotion
 from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
+from analysis.monitoring import ARCSEC
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
@@ -26,6 +27,7 @@ from twin.laboratory.focus_json import ARCMIN
 from twin.laboratory.focus_scan import NYQUIST
 from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.validation.check import NOT_CHECKABLE, Check, CheckResult
+from twin.validation.chosen import Chosen
 from twin.validation.group import CheckGroup, Context
 from twin.validation.paper_004.coupling import judge_coupling
 from twin.validation.paper_004.figure import alignment_svg
@@ -46,33 +48,42 @@ _REASONS = {
 CHECKS = (
     *(
         Check(f"004.table1.{band}", "Table 1", f"MTF of the camera at the Nyquist frequency of {band}", "1", value,
-              0.1 * value, _REASONS[band[0]])
+              0.1 * value, _REASONS[band[0]], tells=0.3 * value, against="a third more or less", basis="chosen")
         for band, value in MTF_NYQUIST.items()
     ),
     Check("004.table1.frequency", "Table 1", "The values are those at the Nyquist frequency, which the table does not "
           "print: frequency at which the rendered edges have them, over Nyquist", "1", None, 0.1,
-          "10 % of an MTF, the tolerance of the values, is 5 to 10 % of the frequency"),
+          "10 % of an MTF, the tolerance of the values, is 5 to 10 % of the frequency",
+          tells=0.5, against="half the Nyquist frequency", basis="chosen"),
     Check("004.table1.average", "Table 1", "The values are averages", "1", None, 0.0, "nothing is compared",
           expected=NOT_CHECKABLE),
     Check("004.alignment.coupling", "section 1.2", "All six parameters of the assembly are coupled when it is "
           "adjusted: number of those that an adjustment changes together with another one", "1", 6.0, 0.0,
-          "they are counted"),
+          "they are counted",
+          tells=1.0, against="five, one that is adjusted by itself", basis="chosen"),
     Check("004.alignment.defocus", "section 2.1", "MTF through focus gives the defocus of every CCD in every field and "
-          "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached"),
+          "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached",
+          tells=40.0, against="a defocus as large as what is to be reached"),
     Check("004.alignment.plane", "section 2.2", "A turn about X' and Y' and a shift along Z' make up for the defocus: "
           "largest true distance from best focus after exactly the motion found", "mm", 1e-3 * CONFOCAL_UM, 0.0,
-          "the bound itself", "at most"),
+          "the bound itself", "at most",
+          tells=0.04, against="twice the bound", basis="chosen"),
     Check("004.alignment.constraint", "section 2.2", "The motion found keeps the line level: true turn of the line "
-          "after it", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most"),
+          "after it", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
+          tells=1.0, against="twice the bound", basis="chosen"),
     Check("004.alignment.shims", "section 2.2", "The motion gives the shims' changes at the holes: RMS difference from "
-          "those that the traced defocus asks for", "µm", None, 5.0, "the steps to which the shims are ground"),
+          "those that the traced defocus asks for", "µm", None, 5.0, "the steps to which the shims are ground",
+          tells=50.0, against="a shim that is turned or swapped with another"),
     Check("004.alignment.confocal", "section 2.3", "One round of shims brings every CCD to within 0.04 mm of best "
           "focus: largest true distance of any alignment", "mm", 1e-3 * CONFOCAL_UM, 0.0, "the bound itself",
-          "at most"),
+          "at most",
+          tells=0.04, against="twice the bound", basis="chosen"),
     Check("004.alignment.level", "section 2.3", "One round of shims leaves the line level to 1 arcmin: largest true "
-          "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most"),
+          "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
+          tells=1.0, against="twice the bound", basis="chosen"),
     Check("004.alignment.rounds", "section 2.3", "One round of shims is enough: rounds until both bounds are kept, "
-          "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most"),
+          "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most",
+          tells=1.0, against="two rounds", basis="chosen"),
 )  # fmt: skip
 
 
@@ -195,6 +206,27 @@ def _true_mtf(alignment: Alignment, band: str) -> float:
     )
 
 
+_ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or line periods, times"
+
+
+def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
+    """An MTF's inputs that the paper does not print: the log of each factor goes as the square of its size, as that of
+    small wavefront errors (Maréchal), of diffusion and of small motions does.
+    """
+    every = float(np.prod(list(factors.values())))
+    wavefront = factors["wavefront"]
+    return [
+        Chosen("wavefront error as built, times", 1.0, "1", lambda factor: value * wavefront ** (factor**2 - 1.0)),
+        Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * every ** (factor**2 - 1.0)),
+    ]
+
+
+def _slope(edges: Sequence[EdgeMtf]) -> float:
+    """Change of the logarithm of the frequency that has an MTF, per change of the MTF's logarithm; at Nyquist."""
+    low, high = (float(np.mean([edge.at(share * NYQUIST)[0] for edge in edges])) for share in (0.9, 1.1))
+    return float(np.log(1.1 / 0.9) / np.log(low / high))
+
+
 def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckResult]:
     if not context.wants(*(f"004.table1.{name}" for name in (*MTF_NYQUIST, "frequency"))):
         return
@@ -202,7 +234,7 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
     true = {band: float(np.mean([_true_mtf(a, band) for a in alignments])) for band in MTF_NYQUIST}
     budget = {line.band: line.factors for line in alignment.bench.budget() if line.edge == TRACK}
     rows: list[list[Cell]] = []
-    ratios = []
+    ratios, logs = [], []
     for band, printed in MTF_NYQUIST.items():
         edges = [edge for a in alignments for edge in _edges(a, band)]
         values, sigmas = np.array([edge.at(NYQUIST) for edge in edges]).T
@@ -219,7 +251,8 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
             f"after {_alignments(len(alignments)).lower()}; traced truth there {true[band]:.4f}. A perfect camera with "
             f"these pixels has {perfect:.3f}; what the scene file assumes beyond the paper takes the rest ({lost})."
         )
-        yield context.check(f"004.table1.{band}").judge(value, sigma, how)
+        yield context.check(f"004.table1.{band}").judge(value, sigma, how, inputs=_losses(rest, value))
+        logs.append((_slope(edges), float(np.prod(list(rest.values())))))
     each = np.array(ratios)
     by_band = ", ".join(f"{band} {value:.3f}" for band, value in zip(MTF_NYQUIST, each.mean(axis=1), strict=True))
     how = (
@@ -227,7 +260,9 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
         "higher, at twice as much there is hardly any contrast left."
     )
     value, sigma = mean_of(each.mean(axis=1))
-    yield context.check("004.table1.frequency").judge(value, sigma, how, 1.0)
+    slope, lost = np.mean(logs, axis=0)
+    chosen = Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * lost ** ((factor**2 - 1.0) * slope))
+    yield context.check("004.table1.frequency").judge(value, sigma, how, 1.0, inputs=[chosen])
     context.add(
         Table(
             "table1",
@@ -262,11 +297,14 @@ def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[Che
         f"{_alignments(count)}: plane through the measured defocus of the {sites} sites, the assembly moved by exactly "
         f"that: {_list(left, 4)} mm. What stays is how the chips were glued, and curvature of field."
     )
-    yield context.check("004.alignment.plane").judge(float(np.max(left)), None, how)
+    moved = [(a, p.moved, a.states[0].standing.heights) for a, p in zip(alignments, plans, strict=True)]
+    value = float(np.max(left))
+    yield context.check("004.alignment.plane").judge(value, None, how, inputs=[_chips(moved)])
     turns = np.array([abs(line_turn(p.moved)) / ARCMIN for p in plans])
     begin = np.array([abs(a.states[0].true_level) / ARCMIN for a in alignments])
     how = f"{_alignments(count)}: before {_list(begin, 2)}′, after {_list(turns, 2)}′; the theodolite errs by 10″."
-    yield context.check("004.alignment.constraint").judge(float(np.max(turns)), None, how)
+    value = float(np.max(turns))
+    yield context.check("004.alignment.constraint").judge(value, None, how, inputs=[_theodolite(alignments, value)])
     asked = np.array([p.asked for p in plans])
     changes = np.array([p.shims.change for p in plans])
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])
@@ -279,6 +317,26 @@ def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[Che
     yield context.check("004.alignment.shims").judge(value, None, how, 0.0)
 
 
+def _chips(placed: Sequence[tuple[Alignment, Pose, Mapping[str, float]]]) -> Chosen:
+    """How the line CCDs were glued, on which the largest distance from best focus hangs, millimetres."""
+    flat, as_glued = (
+        np.array([[s.defocus(pose, share * heights[s.band]) for s in a.bench.sites] for a, pose, heights in placed])
+        for share in (0.0, 1.0)
+    )
+    spread = placed[0][0].bench.setup.test.misset.chips
+    return Chosen(
+        "scatter of the glued chips", UM * spread, "µm",
+        lambda factor: float(MM * np.max(np.abs(flat + factor * (as_glued - flat)))),
+    )  # fmt: skip
+
+
+def _theodolite(alignments: Sequence[Alignment], value: float) -> Chosen:
+    """What the line's turn is measured and set with, and is proportional to."""
+    return Chosen.power(
+        "error of the theodolite and of the setting", alignments[0].bench.setup.test.level / ARCSEC, "arcsec", value
+    )
+
+
 def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckResult]:
     """What the loop of measuring, shimming and measuring reaches."""
     if not context.wants(*(f"004.alignment.{n}" for n in ("confocal", "level", "rounds"))):
@@ -289,12 +347,14 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
     sites = f"{_alignments(count)} of {len(alignments[0].bench.sites)} fields and bands, by the traced pupils"
     how = f"{sites}: before {_list(far[:, 0], 2)} mm, after {_list(far[:, -1], 4)} mm."
-    yield context.check("004.alignment.confocal").judge(float(np.max(far[:, -1])), None, how)
+    after = [(a, a.states[-1].standing.pose, a.states[-1].standing.heights) for a in alignments]
+    yield context.check("004.alignment.confocal").judge(float(np.max(far[:, -1])), None, how, inputs=[_chips(after)])
     how = (
         f"{_alignments(count)}: before {_list(turns[:, 0], 2)}′, after {_list(turns[:, -1], 2)}′; theodolite and "
         f"setting have {plan.level / ARCMIN:.2f}′ each."
     )
-    yield context.check("004.alignment.level").judge(float(np.max(turns[:, -1])), None, how)
+    value = float(np.max(turns[:, -1]))
+    yield context.check("004.alignment.level").judge(value, None, how, inputs=[_theodolite(alignments, value)])
     kept = (far <= 1e-3 * CONFOCAL_UM) & (turns <= LINE_LEVEL_ARCMIN)
     rounds = np.where(kept.any(axis=1), np.argmax(kept, axis=1), far.shape[1])
     more = [_second_round(a) for a in alignments]
@@ -303,7 +363,10 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
         f"second round would change a shim by {UM * max(more):.1f} µm at most; shims are ground in steps of "
         f"{UM * plan.mount.step:g} µm."
     )
-    yield context.check("004.alignment.rounds").judge(float(np.max(rounds)), None, how)
+    value = float(np.max(rounds))
+    share = max(float(np.max(far[:, -1])) / (1e-3 * CONFOCAL_UM), float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
+    chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: value if k * share <= 1.0 else value + 1.0)
+    yield context.check("004.alignment.rounds").judge(value, None, how, inputs=[chosen])
     context.add(
         SvgFigure(
             "alignments",

@@ -25,6 +25,7 @@ from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, RE
 from twin.laboratory.turntable import run_turntable
 from twin.laboratory.turntable_figure import FIT_NAMES
 from twin.validation.check import CORRECTED, NOT_CHECKABLE, REFUTED, Check, CheckResult, Explanation
+from twin.validation.chosen import Chosen
 from twin.validation.group import CheckGroup, Context
 from twin.validation.scatter import median_of
 
@@ -45,24 +46,32 @@ _ONE_TABLE = (
 
 CHECKS = (
     Check("004.turntable.repeat", "section 3.3", "Ten repeats of the dividing error: largest RMS of 41 angles",
-          "arcsec", REPEAT_RMS_ARCSEC, 0.2 * REPEAT_RMS_ARCSEC, _ONE_TABLE),
+          "arcsec", REPEAT_RMS_ARCSEC, 0.2 * REPEAT_RMS_ARCSEC, _ONE_TABLE,
+          tells=0.04, against="half as much or half as much again", basis="chosen"),
     Check("004.turntable.criterion", "section 3.3", "Chauvenet's criterion rejects a reading where so large a "
           "deviation is expected fewer than half a time: deviation at which it begins, of ten readings, over their RMS",
-          "1", None, 0.01, "textbooks tabulate it to two decimals"),
+          "1", None, 0.01, "textbooks tabulate it to two decimals",
+          tells=0.3, against="one tail for two", basis="theory",
+          theory="Chauvenet's criterion, the root of 10 P(|z| > x) = 1/2"),
     Check("004.turntable.chauvenet", "section 3.3", "After Chauvenet's criterion, largest RMS of 41 angles: of the "
-          "single readings that are kept", "arcsec", CHAUVENET_RMS_ARCSEC, 0.2 * CHAUVENET_RMS_ARCSEC, _ONE_TABLE),
+          "single readings that are kept", "arcsec", CHAUVENET_RMS_ARCSEC, 0.2 * CHAUVENET_RMS_ARCSEC, _ONE_TABLE,
+          tells=0.0185, against="half as much or half as much again", basis="chosen"),
     Check("004.turntable.chauvenet_mean", "section 3.3, Fig. 8", "The same number, as an RMS of the averages: of the "
           "mean of ten readings, nothing rejected", "arcsec", CHAUVENET_RMS_ARCSEC,
-          0.2 * REPEAT_RMS_ARCSEC / REPEATS**0.5, _ONE_TABLE, expected=CORRECTED),
+          0.2 * REPEAT_RMS_ARCSEC / REPEATS**0.5, _ONE_TABLE, expected=CORRECTED,
+          tells=0.011, against="averaging alone"),
     Check("004.turntable.interpolation", "section 3.2", "Interpolated between calibrated angles, the dividing error is "
           "better than 2 arcsec: straight lines, largest RMS at held-out angles of any table", "arcsec", 2.0, 0.0,
-          "the bound itself", "at most"),
+          "the bound itself", "at most",
+          tells=2.0, against="twice the bound", basis="chosen"),
     Check("004.turntable.fit", "section 3.3", "The fitted dividing error is better than 0.2 arcsec: largest RMS at "
-          "held-out angles of any table", "arcsec", FIT_RMS_ARCSEC, 0.0, "the bound itself", "at most"),
+          "held-out angles of any table", "arcsec", FIT_RMS_ARCSEC, 0.0, "the bound itself", "at most",
+          tells=0.2, against="twice the bound", basis="chosen"),
     Check("004.turntable.network", "section 3.3", "The BP network fits the dividing error more precisely than other "
           "fits, by a tenth or more: its RMS at held-out angles over that of the one cross-validation takes, median",
           "1", None, 0.02, "by so much the ratio hangs on which of two equal fits cross-validation prefers", "at most",
-          REFUTED),
+          REFUTED,
+          tells=0.1, against="no advantage"),
     Check("004.turntable.architecture", "section 3.3", "A BP network fits the dividing error", "1", None, 0.0,
           "nothing is compared", expected=NOT_CHECKABLE),
     Check("004.turntable.time", "section 3.3", "The prediction of the dividing error halves the time of the test", "%",
@@ -104,7 +113,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         series = [TurntableModel(spec, int(seed)).calibrate() for seed in first.generate_state(count)]
         if "004.turntable.criterion" in context.selected:
             yield _criterion(context.check("004.turntable.criterion"), series)
-        yield from _repeats(context, series)
+        yield from _repeats(context, series, spec)
     judges = {"interpolation": _interpolation, "fit": _bound, "network": _network}
     if not context.wants(*(f"004.turntable.{name}" for name in judges)):
         return
@@ -148,7 +157,7 @@ def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     return FittedTable(done.choice.chosen, {name: found.get(name, float("inf")) for name in FITS})
 
 
-def _repeats(context: Context, series: Sequence[CalibrationSeries]) -> Iterator[CheckResult]:
+def _repeats(context: Context, series: Sequence[CalibrationSeries], spec: TurntableTestSpec) -> Iterator[CheckResult]:
     values = {
         "004.turntable.repeat": np.array([np.max(s.rms_before) for s in series]) / ARCSEC,
         "004.turntable.chauvenet": np.array([np.max(s.rms_after) for s in series]) / ARCSEC,
@@ -177,13 +186,38 @@ def _repeats(context: Context, series: Sequence[CalibrationSeries]) -> Iterator[
                 f"Median of {len(found)} simulated tables; half of them lie between {low:.4f}″ and {high:.4f}″. "
                 f"{more[identifier]}"
             )
-            yield context.check(identifier).judge(*median_of(found), how, None, reasons.get(identifier, ()))
+            check, (value, sigma) = context.check(identifier), median_of(found)
+            inputs = _readings(spec, identifier, value) if check.basis == "chosen" else []
+            yield check.judge(value, sigma, how, None, reasons.get(identifier, ()), inputs)
+
+
+def _readings(spec: TurntableTestSpec, identifier: str, value: float) -> list[Chosen]:
+    """What the repeats hang on: the scatter of a reading, and before the criterion one gross error among the ten."""
+    scatter = float(np.hypot(spec.dividing_error.repeatability, spec.reference.noise)) / ARCSEC
+    gross = spec.reference.gross_error / ARCSEC
+    both = 0.0 if identifier.endswith("chauvenet") else min(gross**2 / REPEATS, value**2)
+
+    def by_scatter(factor: float) -> float:
+        return float(np.sqrt(both + factor**2 * (value**2 - both)))
+
+    inputs = [Chosen("scatter of a reading", scatter, "arcsec", by_scatter)]
+    if both:
+        inputs.append(
+            Chosen("gross error", gross, "arcsec", lambda k: float(np.sqrt(value**2 + (k**2 - 1.0) * both)))
+        )
+    return inputs
+
+
+def dividing(value: float, power: float = 1.0) -> Chosen:
+    """The dividing error, to which what fits leave of it is proportional, and what that does to the distortion."""
+    return Chosen.power("dividing error of scenes/lab/turntable.yaml, times", 1.0, "1", value, power)
 
 
 def _interpolation(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
     lines = np.array([table.held_out["piecewise_linear"] for table in tables]) / ARCSEC
     how = f"{len(tables)} simulated tables, straight lines between 41 means: median {np.median(lines):.3f}″."
-    return check.judge(float(np.max(lines)), None, how)
+    value = float(np.max(lines))
+    return check.judge(value, None, how, inputs=[dividing(value)])
 
 
 def _bound(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
@@ -196,7 +230,8 @@ def _bound(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
         f"the network ({names}). At the held-out readings: median {np.median(chosen):.3f}″, largest "
         f"{np.max(chosen):.3f}″; the network: {np.median(network):.3f}″ and {np.max(network):.3f}″."
     )
-    return check.judge(float(np.max(chosen)), None, how)
+    value = float(np.max(chosen))
+    return check.judge(value, None, how, inputs=[dividing(value)])
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
