@@ -273,8 +273,8 @@ EDGES = {f"004.table1.{name}" for name in ("P", "B1", "B2", "B3", "B4", "frequen
 BOTH1 = {"004.eq1.constant", "004.eq1.zero"}
 P2 = {"004.eq2.solution", "004.eq2.p", "004.eq2.uneven"}
 F2 = {"004.eq2.solution", "004.eq2.f"}
-F3 = {"004.eq3.solution", "004.eq3.f"}
-P4 = {"004.eq4.solution", "004.eq4.p", "004.eq4.uneven"}
+F3 = {"004.eq3.solution", "004.eq2.f"}
+P4 = {"004.eq4.solution", "004.eq2.p", "004.eq4.uneven"}
 MOVED = {"004.alignment.plane", "004.alignment.shims"}
 COLUMNS = set(TABLE2.split(","))
 
@@ -303,7 +303,7 @@ MUTATIONS = {
     ("(3)", "sign"): (eq3(lambda lt, t2: -lt / t2), SPOTS, F3),
     ("(3)", "twice"): (eq3(lambda lt, t2: 2 * lt / t2), SPOTS, F3),
     ("(3)", "numerator and denominator swapped"): (eq3(lambda lt, t2: t2 / lt), SPOTS, F3),
-    ("(4)", "sign"): (eq4(lambda f, w, t4: (w - f) / t4), SPOTS, P4 - {"004.eq4.p"}),
+    ("(4)", "sign"): (eq4(lambda f, w, t4: (w - f) / t4), SPOTS, P4 - {"004.eq2.p"}),
     ("(4)", "twice"): (eq4(lambda f, w, t4: 2 * (f - w) / t4), SPOTS, P4),
     ("(4)", "sign of the second sum"): (eq4(lambda f, w, t4: (f + w) / t4), SPOTS, {"004.eq4.solution",
                                                                                      "004.eq4.uneven"}),

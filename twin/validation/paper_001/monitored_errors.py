@@ -58,7 +58,7 @@ CHECKS = (
           "nothing is printed to compare with", expected=NOT_CHECKABLE),
     Check("001.table5.d_f.field", "section 3.2.3",
           "Δf is less accurate than from a calibration field: its 3σ is at least the 0.01 mm of paper 003", "mm", None,
-          0.002, "a fifth of paper 003's 0.01 mm", "at least",
+          0.0, "the bound itself", "at least",
           tells=0.009, against="a monitor ten times as good as a field", basis="chosen"),
 )  # fmt: skip
 

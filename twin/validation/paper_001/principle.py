@@ -220,4 +220,4 @@ def _rows(table: PrincipleTable) -> list[list[Cell]]:
     return [[round(float(value) / ARCSEC, 4) for value in row] for row in zip(*columns, strict=True)]
 
 
-GROUP = CheckGroup("001.table2", "Principle experiment (section 3.1)", 18.0, CHECKS, run, fast_seconds=5.0)
+GROUP = CheckGroup("001.table2", "Principle experiment (section 3.1)", 18.0, CHECKS, run, fast_seconds=8.0)

@@ -24,7 +24,7 @@ from twin.validation.scatter import mean_of, median_of
 Array = NDArray[np.float64]
 TEST = "distortion"
 UM = 1e6
-TESTS, FAST_TESTS = 60, 10
+TESTS, FAST_TESTS = 60, 14
 """Simulated tests: another turntable, calibration, zero, axis, detector and noise in each."""
 
 _DIGIT = "a unit of the last printed digit"
@@ -265,5 +265,5 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
 
 
 GROUP = CheckGroup(
-    "004.distortion", "Interior orientation and distortion: rendered tests (sections 3.1, 3.3)", 85.0, CHECKS, run, 15.0
+    "004.distortion", "Interior orientation and distortion: rendered tests (sections 3.1, 3.3)", 85.0, CHECKS, run, 21.0
 )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import erfc
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from analysis.monitoring import ARCSEC
 from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
@@ -192,20 +192,24 @@ def _repeats(context: Context, series: Sequence[CalibrationSeries], spec: Turnta
 
 
 def _readings(spec: TurntableTestSpec, identifier: str, value: float) -> list[Chosen]:
-    """What the repeats hang on: the scatter of a reading, and before the criterion one gross error among the ten."""
+    """What the largest RMS of the repeats hangs on: the scatter of a reading, and before the criterion one gross error
+    among ten, at an angle whose other readings scatter as all do.
+    """
     scatter = float(np.hypot(spec.dividing_error.repeatability, spec.reference.noise)) / ARCSEC
+    if identifier.endswith("chauvenet"):
+        return [Chosen.power("scatter of a reading", scatter, "arcsec", value)]
     gross = spec.reference.gross_error / ARCSEC
-    both = 0.0 if identifier.endswith("chauvenet") else min(gross**2 / REPEATS, value**2)
+    # largest of the angles without a gross error, in its median
+    largest = scatter * float(np.sqrt(chi2.ppf(0.5 ** (1.0 / spec.calibration.count), REPEATS - 1) / (REPEATS - 1)))
 
-    def by_scatter(factor: float) -> float:
-        return float(np.sqrt(both + factor**2 * (value**2 - both)))
+    def response(scattered: float, wrong: float) -> float:
+        beside = value**2 + (scattered**2 - 1.0) * scatter**2 + (wrong**2 - 1.0) * gross**2 / REPEATS
+        return max(float(np.sqrt(max(beside, 0.0))), scattered * largest)
 
-    inputs = [Chosen("scatter of a reading", scatter, "arcsec", by_scatter)]
-    if both:
-        inputs.append(
-            Chosen("gross error", gross, "arcsec", lambda k: float(np.sqrt(value**2 + (k**2 - 1.0) * both)))
-        )
-    return inputs
+    return [
+        Chosen("scatter of a reading", scatter, "arcsec", lambda factor: response(factor, 1.0)),
+        Chosen("gross error", gross, "arcsec", lambda factor: response(1.0, factor)),
+    ]
 
 
 def dividing(value: float, power: float = 1.0) -> Chosen:
