@@ -29,7 +29,7 @@ from twin.validation.runner import run_checks
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix in ("003.model", "003.fields"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}
-CAMPAIGNS = 3
+CAMPAIGNS = 6
 SEED = np.random.SeedSequence(11)
 
 

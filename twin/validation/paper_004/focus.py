@@ -223,8 +223,8 @@ def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
 
 def _slope(edges: Sequence[EdgeMtf]) -> float:
     """Change of the logarithm of the frequency that has an MTF, per change of the MTF's logarithm; at Nyquist."""
-    low, high = (float(np.mean([edge.at(share * NYQUIST)[0] for edge in edges])) for share in (0.9, 1.1))
-    return float(np.log(1.1 / 0.9) / np.log(low / high))
+    below, there = (float(np.mean([edge.at(share * NYQUIST)[0] for edge in edges])) for share in (0.9, 1.0))
+    return float(np.log(1.0 / 0.9) / np.log(below / there))
 
 
 def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckResult]:

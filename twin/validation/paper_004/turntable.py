@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import erfc
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from analysis.monitoring import ARCSEC
 from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 TEST = "turntable"
 TABLES, FAST_TABLES = 1000, 200
 """Turntables that are calibrated; quick."""
+FURTHER = 1.6
+"""Factor on an input at which tables are calibrated again, to see what hangs on it."""
 FITTED, FAST_FITTED = 60, 12
 """Turntables whose calibration is fitted."""
 NETWORK = "network"
@@ -110,10 +112,11 @@ def run(context: Context) -> Iterator[CheckResult]:
     if context.wants(*_REPEATED):
         count = context.count(TABLES, FAST_TABLES)
         context.progress(0.0, f"calibrate {count} tables")
-        series = [TurntableModel(spec, int(seed)).calibrate() for seed in first.generate_state(count)]
+        seeds = first.generate_state(count)
+        series = [TurntableModel(spec, int(seed)).calibrate() for seed in seeds]
         if "004.turntable.criterion" in context.selected:
             yield _criterion(context.check("004.turntable.criterion"), series)
-        yield from _repeats(context, series, spec)
+        yield from _repeats(context, series, spec, seeds)
     judges = {"interpolation": _interpolation, "fit": _bound, "network": _network}
     if not context.wants(*(f"004.turntable.{name}" for name in judges)):
         return
@@ -157,7 +160,9 @@ def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     return FittedTable(done.choice.chosen, {name: found.get(name, float("inf")) for name in FITS})
 
 
-def _repeats(context: Context, series: Sequence[CalibrationSeries], spec: TurntableTestSpec) -> Iterator[CheckResult]:
+def _repeats(
+    context: Context, series: Sequence[CalibrationSeries], spec: TurntableTestSpec, seeds: NDArray[np.integer]
+) -> Iterator[CheckResult]:
     values = {
         "004.turntable.repeat": np.array([np.max(s.rms_before) for s in series]) / ARCSEC,
         "004.turntable.chauvenet": np.array([np.max(s.rms_after) for s in series]) / ARCSEC,
@@ -187,29 +192,40 @@ def _repeats(context: Context, series: Sequence[CalibrationSeries], spec: Turnta
                 f"{more[identifier]}"
             )
             check, (value, sigma) = context.check(identifier), median_of(found)
-            inputs = _readings(spec, identifier, value) if check.basis == "chosen" else []
+            inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if check.basis == "chosen" else []
             yield check.judge(value, sigma, how, None, reasons.get(identifier, ()), inputs)
 
 
-def _readings(spec: TurntableTestSpec, identifier: str, value: float) -> list[Chosen]:
-    """What the largest RMS of the repeats hangs on: the scatter of a reading, and before the criterion one gross error
-    among ten, at an angle whose other readings scatter as all do.
-    """
+def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
+    """What the largest RMS of the repeats hangs on: the scatter of a reading, and before the criterion gross errors."""
     scatter = float(np.hypot(spec.dividing_error.repeatability, spec.reference.noise)) / ARCSEC
     if identifier.endswith("chauvenet"):
         return [Chosen.power("scatter of a reading", scatter, "arcsec", value)]
-    gross = spec.reference.gross_error / ARCSEC
-    # largest of the angles without a gross error, in its median
-    largest = scatter * float(np.sqrt(chi2.ppf(0.5 ** (1.0 / spec.calibration.count), REPEATS - 1) / (REPEATS - 1)))
+    out = []
+    for name, size, changed in (
+        ("scatter of a reading", scatter, _with_errors(spec, FURTHER, 1.0)),
+        ("gross error", spec.reference.gross_error / ARCSEC, _with_errors(spec, 1.0, FURTHER)),
+    ):
+        found = [np.max(TurntableModel(changed, int(seed)).calibrate().rms_before) / ARCSEC for seed in seeds]
+        # both errors go into the RMS in square
+        growth = (float(np.median(found)) ** 2 - value**2) / (FURTHER**2 - 1.0)
 
-    def response(scattered: float, wrong: float) -> float:
-        beside = value**2 + (scattered**2 - 1.0) * scatter**2 + (wrong**2 - 1.0) * gross**2 / REPEATS
-        return max(float(np.sqrt(max(beside, 0.0))), scattered * largest)
+        def response(factor: float, growth: float = growth) -> float:
+            return float(np.sqrt(max(value**2 + (factor**2 - 1.0) * growth, 0.0)))
 
-    return [
-        Chosen("scatter of a reading", scatter, "arcsec", lambda factor: response(factor, 1.0)),
-        Chosen("gross error", gross, "arcsec", lambda factor: response(1.0, factor)),
-    ]
+        out.append(Chosen(name, size, "arcsec", response))
+    return out
+
+
+def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> TurntableTestSpec:
+    """The test with the scatter of its readings and its gross errors times factors."""
+    table, reference = spec.dividing_error, spec.reference
+    noise = {"noise": scatter * reference.noise, "gross_error": gross * reference.gross_error}
+    update = {
+        "dividing_error": table.model_copy(update={"repeatability": scatter * table.repeatability}),
+        "reference": reference.model_copy(update=noise),
+    }
+    return spec.model_copy(update=update)
 
 
 def dividing(value: float, power: float = 1.0) -> Chosen:
