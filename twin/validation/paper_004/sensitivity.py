@@ -30,7 +30,7 @@ CHECKS = (
           tells=0.8, against="an error that falls to a fifth"),
     Check("004.sensitivity.distance", "section 3.1", "The error of the principal distance grows as the field shrinks: "
           "inner half over the whole field, angles as read", "1", None, 0.0, "growth is a ratio above one", "at least",
-          tells=0.23, against="an error that falls as much"),
+          tells=0.5, against="an error that falls to half"),
     Check("004.sensitivity.points", "section 3.1", "More points make f and D more precise: error of f with every fifth "
           "point over that with all", "1", None, 0.0, "a gain is a ratio above one", "at least",
           tells=0.17, against="a loss as large as the gain"),
