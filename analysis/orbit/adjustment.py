@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,16 @@ from analysis.orbit.calibration_parameters import (
     index,
 )
 from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.null_space import Combination, Gauge, combinations, free_basis, null_vectors, solved
-from analysis.orbit.residual_weights import Robust, extrapolated, robust_weights, standardised
+from analysis.orbit.null_space import Combination, Freedom, Gauge, combinations, free_basis, solved, weak_vectors
+from analysis.orbit.residual_weights import (
+    HUBER,
+    Robust,
+    bounded,
+    extrapolated,
+    median_factor,
+    robust_weights,
+    standardised,
+)
 from analysis.orbit.residual_weights import variance_components as components
 from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import DRIFT, LineModel
@@ -48,10 +57,12 @@ class Adjustment:
     """Solution of a calibration.
 
     Attributes:
-        names: of the unknowns. values: (P,) metres and radians. covariance: (P, P) in the stated gauge, from the sigmas
-            as given times `factors`; zero rows for held unknowns.
+        names: of the unknowns. values: (P,) metres and radians. covariance: (P, P) from the sigmas as given times
+            `factors`, and of what minimum norm leaves at the start values from `Gauge.start`. Held unknowns count as
+            exact: zero rows.
         gauge: what was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were
             solved for all the same.
+        follow: (P, H) change of the values with the start values of the H held unknowns.
         cameras: with the adjusted interior, in the reference state.
         ground: field -> (m, 3) adjusted points; NaN for those that robust weights gave up. ground_covariance:
             field -> (m, 3, 3), likewise.
@@ -68,6 +79,7 @@ class Adjustment:
     gauge: Gauge
     open: tuple[Combination, ...]
     weak: tuple[Combination, ...]
+    follow: Array
     cameras: Mapping[str, LineModel]
     ground: Mapping[str, Array]
     ground_covariance: Mapping[str, Array]
@@ -83,6 +95,17 @@ class Adjustment:
     def sigma(self) -> dict[str, float]:
         """Standard deviation of each unknown; 0 where held."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def sigma_with(self, start: Mapping[str, float]) -> dict[str, float]:
+        """Standard deviation of each unknown where held unknowns are not exact: name -> sigma of its start value.
+
+        Raises CalibrationError for a name that is not held.
+        """
+        given = np.zeros(len(self.gauge.held))
+        for name, sigma in start.items():
+            given[index(self.gauge.held, name)] = sigma
+        hidden = np.sum((self.follow * given) ** 2, axis=1)
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance) + hidden).tolist(), strict=True))
 
     @property
     def correlation(self) -> Array:
@@ -141,7 +164,9 @@ def adjust(
         robust: "huber" takes weight from image points with large residuals, "igg" leaves the worst out, and with them
             points without coordinates that fewer than two rays are left of.
         variance_components: estimate a factor on the variances of "image", "control", each group of priors and, where
-            image points share them, "attitude", "slow attitude" and "station".
+            image points share them, "attitude", "slow attitude" and "station", within a hundredth and a hundred. With
+            robust weights they come from image points within the limit of "igg", all of full weight, which are found
+            with the noise of the image by the median of its residuals; the robust weights then use these factors.
         iterations: most Gauss-Newton steps of one round.
 
     Raises:
@@ -158,44 +183,91 @@ def adjust(
     problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations, none)
     groups = ("image", "control", *shared.groups, *dict.fromkeys(p.group for p in priors))
     count = sum(len(r.point) for f in fields for r in f.rays.values())
-    start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
-    state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
     if 2 * count < len(parameters.names) - len(gauge.held) - len(priors):
         raise CalibrationError(
             f"calibration: {count} image points are too few for {len(parameters.names) - len(gauge.held)} unknowns"
         )
+    start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
+    state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
+    if robust and variance_components:
+        found = _settled(problem, state, _SCREENING)
+        found = _settled(found.problem, found.state, _ACCEPTED)
+        state = replace(
+            state, weights=replace(state.weights, factor=found.state.weights.factor), steps=found.state.steps
+        )
+    elif variance_components:
+        return _settled(problem, state, _COMPONENTS).result()
+    return _settled(problem, state, _Rule(robust)).result(robust)
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """How weights follow from residuals: of the image points, and factors of the groups.
+
+    tolerance: largest change of a weight, or relative one of a factor, that is left.
+    """
+
+    image: Robust | Literal["accept"] | None = None
+    factor: Literal["median", "components"] | None = None
+    tolerance: float = _SETTLED
+
+    @property
+    def least(self) -> int:
+        """Rounds that it takes at least."""
+        return _HUBER_ROUNDS if self.image == "igg" else 0
+
+
+# Gross errors are found against the scatter of the others first. Variance components then need good points of full
+# weight: weights that fall with the residual would pass for smaller noise.
+_SCREENING = _Rule("huber", "median", 0.05)
+_ACCEPTED = _Rule("accept", "components")
+_COMPONENTS = _Rule(None, "components")
+
+
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """Where the weights came to rest: without points that were given up, with the equations there."""
+
+    problem: _Problem
+    state: _Iteration
+    equations: Equations
+    covariance: Array
+
+    def result(self, robust: Robust | None = None) -> Adjustment:
+        return self.problem.result(self.state, self.equations, self.covariance, robust)
+
+
+def _settled(problem: _Problem, state: _Iteration, rule: _Rule) -> _Settled:
+    """Solve until weights and factors rest."""
     factors: list[Mapping[str, float]] = []
+    change = np.inf
     for turn in range(_ROUNDS):
         state, equations, covariance = problem.solve(state)
-        old = state.weights
-        if not robust and not variance_components:
-            break
+        old, before = state.weights, problem
+        if rule.image is None and rule.factor is None:
+            return _Settled(problem, state, equations, covariance)
         cofactors = equations.image_cofactors(covariance)
-        before = problem
-        if robust:
-            kind: Robust = "huber" if turn < _HUBER_ROUNDS else robust
-            image = robust_weights(standardised(equations, cofactors, old), kind)
-            if robust == "igg" and turn >= _FREE_ROUNDS:
-                image = np.minimum(image, old.image)
-            problem, state = problem.without_lost(replace(state, weights=replace(old, image=image)))
-        if variance_components:
-            factor, _ = components(equations, covariance, cofactors, old, priors)
+        standard = standardised(equations, cofactors, old)
+        factor = dict(old.factor)
+        if rule.factor == "median":
+            factor["image"] = bounded(factor["image"] * median_factor(standard))
+        elif rule.factor == "components":
+            factor, _ = components(equations, covariance, cofactors, old, problem.priors)
             factors.append(factor)
-            state = replace(state, weights=replace(state.weights, factor=factor))
+        image = old.image
+        if rule.image is not None:
+            image = robust_weights(standard, "huber" if turn < rule.least else rule.image)
+            if rule.image != "huber" and turn >= _FREE_ROUNDS:
+                image = np.minimum(image, old.image)
+        problem, state = problem.without_lost(replace(state, weights=Weights(image, factor)))
         change = float(np.abs(state.weights.image - old.image).max())
-        change = max(change, *(abs(state.weights.factor[g] / old.factor[g] - 1.0) for g in groups))
-        settled = change < _SETTLED and problem is before
-        if settled and not (robust == "igg" and turn < _HUBER_ROUNDS):
-            state = replace(state, weights=old)
-            break
+        change = max(change, *(abs(factor[g] / old.factor[g] - 1.0) for g in factor))
+        if change < rule.tolerance and problem is before and turn >= rule.least:
+            return _Settled(problem, replace(state, weights=old), equations, covariance)
         if len(factors) == 3:
             state = replace(state, weights=replace(state.weights, factor=extrapolated(factors)))
             factors = []
-    else:
-        raise CalibrationError(
-            f"calibration: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}"
-        )
-    return problem.result(state, equations, covariance)
+    raise CalibrationError(f"calibration: weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +334,7 @@ class _Problem:
         """Gauss-Newton with the weights of the state: state, equations there and covariance (P, P)."""
         scale = self.parameters.scale
         equations = self.equations(state)
-        basis, _ = free_basis(equations.reduced, equations.length, scale, self.parameters.names, self.gauge)
+        basis = self.freedom(state, equations).basis
         last = np.inf
         for _ in range(self.iterations):
             normal = basis.T @ (scale[:, None] * equations.reduced * scale) @ basis
@@ -281,16 +353,34 @@ class _Problem:
         spread = scale[:, None] * (basis @ solved(normal, np.eye(len(normal))) @ basis.T) * scale
         return state, equations, 0.5 * (spread + spread.T)
 
-    def result(self, state: _Iteration, equations: Equations, covariance: Array) -> Adjustment:
+    def freedom(self, state: _Iteration, equations: Equations) -> Freedom:
+        """What may be solved for: by the robust weights, but the sigmas as they were given.
+
+        Misfit of the measurements would else open what they determine, and then cannot shrink any more.
+        """
+        if any(v != 1.0 for v in state.weights.factor.values()):
+            given = replace(state.weights, factor=dict.fromkeys(state.weights.factor, 1.0))
+            equations = self.equations(replace(state, weights=given))
+        return free_basis(equations.reduced, equations.length, self.parameters.scale, self.parameters.names, self.gauge)
+
+    def followed(self, equations: Equations, freedom: Freedom, closed: Array) -> Array:
+        """(P, k) change of the values with start values along `closed` (P, k), in units of `scale`."""
+        scale = self.parameters.scale
+        normal = scale[:, None] * equations.reduced * scale
+        inner = freedom.basis.T @ normal
+        return scale[:, None] * (closed - freedom.basis @ solved(inner @ freedom.basis, inner @ closed))
+
+    def result(self, state: _Iteration, equations: Equations, covariance: Array, robust: Robust | None) -> Adjustment:
         names, scale = self.parameters.names, self.parameters.scale
-        basis, opened = free_basis(equations.reduced, equations.length, scale, names, self.gauge)
-        kept = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in self.gauge.held]).tolist()
-        within = equations.reduced[np.ix_(kept, kept)]
-        vectors = null_vectors(within, equations.length[kept], scale[kept], weak=True)
-        weak = combinations([names[i] for i in kept], scale[kept], vectors, within, equations.length[kept])
+        freedom = self.freedom(state, equations)
+        vectors = weak_vectors(equations.reduced, equations.length, scale, freedom.basis)
         cofactors = equations.image_cofactors(covariance)
-        _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
         standard = standardised(equations, cofactors, state.weights)
+        _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
+        held = np.eye(len(names))[:, [index(names, n) for n in self.gauge.held]]
+        closed = self.followed(equations, freedom, freedom.closed)
+        if robust == "huber":
+            covariance = covariance + covariance @ _scores(equations, standard, state.weights) @ covariance
         cuts = np.cumsum([len(f.ground) for f in self.fields])[:-1]
         spread = equations.point_covariance(covariance)
         spread[self.lost] = np.nan
@@ -309,10 +399,11 @@ class _Problem:
         return Adjustment(
             names=names,
             values=state.state.values,
-            covariance=covariance,
+            covariance=covariance + self.gauge.start**2 * closed @ closed.T,
             gauge=self.gauge,
-            open=opened,
-            weak=weak,
+            open=freedom.opened,
+            weak=combinations(names, scale, vectors, equations.reduced, equations.length),
+            follow=self.followed(equations, freedom, held / scale[:, None]),
             cameras={
                 k: c.with_interior(parts(state.state.values, f.name, k, c)[0].interior)
                 for f in self.fields
@@ -327,7 +418,7 @@ class _Problem:
             residual=self._by_line(standard),
             weight=self._by_line(state.weights.image),
             chi_square=square,
-            degrees_of_freedom=known - 3 * int(equations.movable.sum()) - basis.shape[1],
+            degrees_of_freedom=known - 3 * int(equations.movable.sum()) - freedom.basis.shape[1],
             factors=state.weights.factor,
             redundancy=redundancy,
             iterations=state.steps,
@@ -337,3 +428,15 @@ class _Problem:
         sizes = [len(r.point) for f in self.fields for r in f.rays.values()]
         pieces = iter(np.split(rows, np.cumsum(sizes)[:-1]))
         return {f.name: {line: next(pieces) for line in f.rays} for f in self.fields}
+
+
+def _scores(equations: Equations, standard: Array, weights: Weights) -> Array:
+    """(P, P) what the normal matrix lacks of the variance of the right side with Huber's weights.
+
+    An image point of weight w counts with the variance w in the normal matrix, as if it were as uncertain as that. What
+    a gross error really does is the square of the limit, whatever its size (Huber 1981, asymptotic covariance).
+    """
+    size = np.linalg.norm(standard, axis=1)
+    pull = 0.5 * np.minimum(size, HUBER) ** 2 - weights.image
+    rows = equations.through_points()
+    return np.asarray(rows.T @ (np.repeat(pull / weights.factor["image"], 2)[:, None] * rows))

@@ -12,7 +12,18 @@ from scipy.stats import chi2
 from analysis.orbit.calibration_parameters import Prior
 from analysis.orbit.normal_equations import Equations, Weights
 
-__all__ = ["HUBER", "REJECT", "Robust", "extrapolated", "robust_weights", "standardised", "variance_components"]
+__all__ = [
+    "HUBER",
+    "LARGEST_FACTOR",
+    "REJECT",
+    "Robust",
+    "bounded",
+    "extrapolated",
+    "median_factor",
+    "robust_weights",
+    "standardised",
+    "variance_components",
+]
 
 Array = NDArray[np.float64]
 Robust = Literal["huber", "igg"]
@@ -25,6 +36,8 @@ _LEAST_REDUNDANCY = 10.0
 # A part of an image point that no other observation checks has no residual to standardise.
 _UNCHECKED = 1e-6
 _LARGEST_RATIO = 0.9
+LARGEST_FACTOR = 1e2
+"""Of a variance; its inverse is the smallest. Sigmas that are ten times wrong are no matter of weights any more."""
 
 
 def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Array:
@@ -46,9 +59,14 @@ def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Ar
     return np.einsum("nij,nj->ni", axes, along)
 
 
-def robust_weights(standard: Array, kind: Robust) -> Array:
-    """(M,) weights of image points from their standardised residuals (M, 2): Huber's, or IGG III that ends in zero."""
+def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
+    """(M,) weights of image points from their standardised residuals (M, 2).
+
+    Huber's, IGG III that ends in zero, or "accept": 1 up to that end and zero beyond.
+    """
     size = np.linalg.norm(standard, axis=1)
+    if kind == "accept":
+        return np.asarray(size <= REJECT, np.float64)
     weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
     if kind == "huber":
         return np.asarray(weight)
@@ -56,13 +74,24 @@ def robust_weights(standard: Array, kind: Robust) -> Array:
     return np.asarray(np.where(size <= HUBER, 1.0, weight * fall**2))
 
 
+def median_factor(standard: Array) -> float:
+    """Square of the scale of standardised residuals (M, 2) by their median: half of them may be wrong."""
+    # median of chi-square with two degrees of freedom is 2 ln 2
+    return float(np.median(np.sum(standard**2, axis=1)) / (2.0 * np.log(2.0)))
+
+
+def bounded(factor: float) -> float:
+    """A variance factor within its bounds."""
+    return float(np.clip(factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR))
+
+
 def variance_components(
     equations: Equations, covariance: Array, cofactors: Array, weights: Weights, priors: Sequence[Prior]
 ) -> tuple[dict[str, float], dict[str, float]]:
     """One step of Foerstner's estimate: group -> new factor on its variances, group -> redundancy.
 
-    factor' = factor v'Pv / r with r the redundancy of the group. With robust weights the factor of the image comes out
-    some per cent low, because the tails of good points are cut, too.
+    factor' = factor v'Pv / r with r the redundancy of the group, within 1 / `LARGEST_FACTOR` and `LARGEST_FACTOR`. It
+    is unbiased for image points of weight 1 and 0; a weight that falls with the residual makes it too small.
     """
     residuals, factor = equations.residuals, weights.factor
     adjusted = np.trace(cofactors, axis1=1, axis2=2) / factor["image"]
@@ -84,7 +113,7 @@ def variance_components(
     square |= {g: v / factor[g] for g, v in residuals.shared.items()}
     redundancy |= equations.shared_redundancy(covariance)
     new = {
-        g: float(factor[g] * square[g] / redundancy[g]) if redundancy[g] >= _LEAST_REDUNDANCY else float(factor[g])
+        g: bounded(factor[g] * square[g] / redundancy[g]) if redundancy[g] >= _LEAST_REDUNDANCY else float(factor[g])
         for g in square
     }
     return new, redundancy
@@ -100,5 +129,5 @@ def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
         first, middle, last = (float(np.log(max(f[group], 1e-300))) for f in factors)
         ratio = (last - middle) / (middle - first) if middle != first else 0.0
         ratio = min(max(ratio, 0.0), _LARGEST_RATIO)
-        found[group] = float(np.exp(last + (last - middle) * ratio / (1.0 - ratio)))
+        found[group] = bounded(float(np.exp(last + (last - middle) * ratio / (1.0 - ratio))))
     return found

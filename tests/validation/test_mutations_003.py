@@ -166,7 +166,6 @@ def few_rounds(monkeypatch):
 
 
 def overlooked(monkeypatch):
-    monkeypatch.setattr(null_space, "OPEN", 0.0)
     monkeypatch.setattr(null_space, "WORST", np.inf)
 
 
