@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import xarray as xr
 from twin.course import CourseRun
 from twin.data_file import netcdf
 from twin.image_file import SPOT_STRETCH, preview_png, tiff
+from twin.reference_frames import described, frames_text
 from twin.report import write_report
 from twin.results import RenderRun, quality_dict, stated
 from twin.run_folder import MANIFEST, RunFolder
@@ -35,9 +36,10 @@ def write_run(
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
     folder.write_text("config.yaml", run.resolved.to_yaml())
-    folder.write_json("truth.json", run.truth_dict())
-    folder.write_json("recovered.json", stated(run.recovered_dict()))
-    folder.write_json("crosstalk.json", {name: table.to_dict() for name, table in run.crosstalk.items()})
+    crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
+    recovered = stated(run.recovered_dict())
+    for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
+        _write_numbers(folder, kind, data)
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             stem = f"images/{channel.camera}_{channel.side}_{when}"
@@ -45,13 +47,13 @@ def write_run(
             folder.write_bytes(f"{stem}.png", preview_png(frames))
     folder.write_bytes("irradiance.nc", netcdf(_irradiance(run)))
     if run.stray is not None:
-        folder.write_json("stray.json", run.stray.to_dict())
+        _write_numbers(folder, "stray", run.stray.to_dict())
     if run.course is not None:
         _write_course(run, run.course, folder)
     if run.targets is not None:
         _write_targets(run.targets, folder)
     if run.quality is not None:
-        folder.write_json("quality.json", quality_dict(run.quality))
+        _write_numbers(folder, "quality", quality_dict(run.quality))
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
@@ -70,9 +72,14 @@ def write_run(
     folder.write_json(MANIFEST, manifest)
 
 
+def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:
+    """``KIND.json`` with its schema and frames."""
+    folder.write_json(f"{kind}.json", described(kind, data))
+
+
 def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
     """Numbers, expected images, and of each channel the first frame of every time as one page."""
-    folder.write_json("course.json", course.to_dict())
+    _write_numbers(folder, "course", course.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
         folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", tiff(course.frames[:, i]))
     time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
@@ -81,7 +88,7 @@ def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
 
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
     """MTF and frames; the faint rings of a pinhole are stretched in its preview, levels of the others are not."""
-    folder.write_json("mtf.json", targets.to_dict())
+    _write_numbers(folder, "mtf", targets.to_dict())
     for stem, name, frames in targets.images():
         folder.write_bytes(f"images/{stem}.tiff", tiff(frames))
         folder.write_bytes(f"images/{stem}.png", preview_png(frames, SPOT_STRETCH if name == "pinhole" else None))
@@ -114,5 +121,9 @@ def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np
             "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x"}),
             "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y"}),
         },
-        attrs={"wavelength_m": path.wavelength, "pitch_m": path.pitch},
+        attrs={
+            "wavelength_m": path.wavelength,
+            "pitch_m": path.pitch,
+            "reference_frames": frames_text("course" if first == "time" else "irradiance"),
+        },
     )

@@ -33,6 +33,7 @@ from twin.edge_images import DIRECTIONS
 from twin.output import write_run
 from twin.picture import write_pictures
 from twin.picture_light import PictureError
+from twin.reference_frames import described
 from twin.render_job import STAGES, render_job
 from twin.results import RenderRun, stated
 from twin.run_folder import RunFolder, chosen
@@ -129,9 +130,12 @@ def main(
         run, problem = _run(folder, resolved, backend, frames, seed, picture, silent=as_json or quiet, errors=errors)
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if as_json:
-            course = {"course": run.course.to_dict()} if run.course is not None else {}
-            mtf = {"mtf": run.targets.to_dict()} if run.targets is not None else {}
-            print_json({"truth": run.truth_dict(), "recovered": stated(run.recovered_dict()), **course, **mtf})
+            parts = {"truth": run.truth_dict(), "recovered": stated(run.recovered_dict())}
+            if run.course is not None:
+                parts["course"] = run.course.to_dict()
+            if run.targets is not None:
+                parts["mtf"] = run.targets.to_dict()
+            print_json({kind: described(kind, data) for kind, data in parts.items()})
         elif not quiet:
             _print_result(run, folder.target)
     if problem:

@@ -4,21 +4,24 @@ Names of the unknowns: "forward f", "forward x", "forward y" and so on for each 
 pitch", "Beijing yaw" for each field, or "roll", "pitch", "yaw" where all fields share one bias; "Beijing offset along",
 "... across", "... down" for a constant error of the orbit during one field, in the field's mean body axes; "Beijing
 forward d_alpha", "... d_beta", "... d_gamma", "... d_f" for the drift of a camera during one field from its reference
-state, which interior orientation and mounting describe.
+state, which interior orientation and mounting describe; "roll rate", "pitch rate", "yaw rate" for a drift of the bias
+during every field, rad/s, zero at the mean time of the field's rays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Rays
 
 __all__ = [
+    "RATE",
     "CalibrationError",
     "CalibrationField",
     "Noise",
@@ -31,6 +34,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 OFFSET = ("along", "across", "down")
+RATE = tuple(f"{n} rate" for n in BIAS)
 _SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.314245])  # WGS84
 _SHORTEST = 1e-3  # of f: half a line that is taken to be at least that long
 _FARTHEST = 12e3  # metres: no land is higher, and geodetic coordinates or kilometres are far beyond
@@ -195,12 +199,15 @@ class Unknowns:
         offset: constant error of the orbit of each field, or none.
         drift: change of every camera during each field against its reference state, or none. It is open against bias
             and interior unless priors, for example of an on-board monitor, tell it.
+        rate: drift of the bias during the fields, the same in all, or none. It is weak against x and y of the outer
+            lines, which see a field before and after the nadir line, unless priors tell it.
     """
 
     interior: bool = True
     bias: Literal["field", "common", "none"] = "field"
     offset: Literal["field", "none"] = "none"
     drift: Literal["field", "none"] = "none"
+    rate: Literal["common", "none"] = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,13 +249,15 @@ class Parameters:
         start: (P,) start values, metres and radians.
         scale: (P,) the change of each that moves the image by about one metre: 1 for the interior, 1/f rad, range/f m.
         columns: (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), (of d_alpha,
-            d_beta, d_gamma, d_f), -1 if fixed.
+            d_beta, d_gamma, d_f), (of the rates of roll, pitch, yaw), -1 if fixed.
+        middles: field -> mean time of its rays, seconds, where the bias drifts.
     """
 
     names: tuple[str, ...]
     start: Array
     scale: Array
-    columns: Mapping[tuple[str, str], tuple[Array, Array, Array, Array]] = field(repr=False)
+    columns: Mapping[tuple[str, str], tuple[Array, Array, Array, Array, Array]] = field(repr=False)
+    middles: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -262,7 +271,7 @@ class Parameters:
 
         Raises:
             CalibrationError: no fields, two of one name, a line without a camera, an unknown name in start, nothing to
-                solve for.
+                solve for, rates without the times of the rays.
         """
         if not fields:
             raise CalibrationError("calibration: no fields")
@@ -290,6 +299,11 @@ class Parameters:
                     ends = max(float(np.abs(rays.image[:, 1]).max(initial=0.0)), _SHORTEST * focal)
                     sizes = (1.0 / focal, 1.0 / focal, 1.0 / ends, 1.0)
                     entries |= {f"{one.name} {line} {n}": (0.0, s) for n, s in zip(DRIFT, sizes, strict=True)}
+        middles = {}
+        if unknowns.rate == "common":
+            middles = {one.name: _middle(one) for one in fields}
+            spans = [np.ptp(np.concatenate([r.time for r in f.rays.values() if r.time is not None])) for f in fields]
+            entries |= dict.fromkeys(RATE, (0.0, 2.0 / (focal * max(float(np.max(spans)), _SHORTEST))))
         if not entries:
             raise CalibrationError("calibration: nothing to solve for")
         names = tuple(entries)
@@ -307,17 +321,39 @@ class Parameters:
                     [n if unknowns.bias == "common" else f"{one.name} {n}" for n in BIAS],
                     [f"{one.name} offset {n}" for n in OFFSET],
                     [f"{one.name} {line} {n}" for n in DRIFT],
+                    RATE,
                 )
-                inner, turn, shift, drift = (np.array([where.get(n, -1) for n in g]) for g in groups)
-                columns[one.name, line] = (inner, turn, shift, drift)
-        return cls(names, values, np.array([entries[n][1] for n in names]), columns)
+                inner, turn, shift, drift, rate = (np.array([where.get(n, -1) for n in g]) for g in groups)
+                columns[one.name, line] = (inner, turn, shift, drift, rate)
+        return cls(names, values, np.array([entries[n][1] for n in names]), columns, middles)
+
+    def since_middle(self, name: str, rays: Rays) -> Array:
+        """(n,) seconds from the middle of a field to its rays; zero where the bias does not drift."""
+        if name not in self.middles or rays.time is None:
+            return np.zeros(len(rays.point))
+        return np.asarray(rays.time - self.middles[name])
+
+    def turned(self, values: Array, name: str, line: str, rays: Rays) -> Rays:
+        """Rays with the drift of the bias since the middle of the field taken into their attitude."""
+        columns = self.columns[name, line][4]
+        if columns[0] < 0 or not len(rays.point):
+            return rays
+        turn = self.since_middle(name, rays)[:, None] * values[columns]
+        return replace(rays, attitude=rays.attitude @ Rotation.from_rotvec(turn).as_matrix())
 
     def parts(self, values: Array, name: str, line: str, camera: LineModel) -> tuple[LineModel, Array, Array]:
         """Camera with interior and drift, bias (3,) and offset (3,) (field axes) of one line of one field."""
-        inner, turn, shift, drift = self.columns[name, line]
+        inner, turn, shift, drift, _ = self.columns[name, line]
         bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
         camera = camera.with_interior(values[inner]) if inner[0] >= 0 else camera
         return (camera.drifted(values[drift]) if drift[0] >= 0 else camera), bias, offset
+
+
+def _middle(one: CalibrationField) -> float:
+    times = [r.time for r in one.rays.values() if r.point.size]
+    if any(t is None for t in times):
+        raise CalibrationError(f"field {one.name!r}: a drift of the bias needs the times of all rays")
+    return float(np.mean(np.concatenate([t for t in times if t is not None])))
 
 
 def index(names: Sequence[str], name: str) -> int:

@@ -202,12 +202,14 @@ def assemble(
         axes, begin = one.axes, row
         for line, measured in one.rays.items():
             rays = shared.corrected(one.name, line, measured, state.shared)
+            rays = parameters.turned(state.values, one.name, line, rays)
             camera, bias, offset = parameters.parts(state.values, one.name, line, cameras[line])
             shown, moved = ground[rays.point], axes @ offset
             by = partials(camera, rays, shown, bias, moved)
             white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, rays, by, shared=False)))
             block = np.zeros((len(rays.point), 2, count))
-            parts = (by.interior, by.bias, -by.ground @ axes, by.drift)
+            since = parameters.since_middle(one.name, rays)[:, None, None]
+            parts = (by.interior, by.bias, -by.ground @ axes, by.drift, by.attitude * since)
             for where, part in zip(parameters.columns[one.name, line], parts, strict=True):
                 if where[0] >= 0:
                     block[:, :, where] = part

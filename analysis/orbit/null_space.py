@@ -18,6 +18,8 @@ below `WEAK` is reported. What opens in a three-line camera:
   of sight, so weak or correlated, not open.
 - Drift of the cameras in each field, unless a monitor tells it: d_alpha, d_beta and d_f of one line in all fields
   against its x, y and f; d_alpha, d_beta and d_gamma of all lines in one field against the bias of that field.
+- A drift of the bias during the fields against x and y of the outer lines, which see a field earlier and later: weak,
+  for within a line a field of 50 km passes in 7 s.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ Array = NDArray[np.float64]
 WORST = 1e-4
 WEAK = 3e-2
 _SHOWN = 1e-2
-_ANGLES = (*BIAS, *DRIFT[:3])
+_ANGLES = (*BIAS, *DRIFT[:3], "rate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,5 +224,6 @@ def _shown(name: str, change: float) -> str:
     if "offset" in name:
         return f"{name} {change:+.4g} m"
     if name.split()[-1] in _ANGLES:
-        return f"{name} {np.degrees(change) * 3600:+.4g} arcsec"
+        per = "/s" if name.endswith("rate") else ""
+        return f"{name} {np.degrees(change) * 3600:+.4g} arcsec{per}"
     return f"{name} {change * 1e3:+.4g} mm"

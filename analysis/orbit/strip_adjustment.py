@@ -204,7 +204,8 @@ def _solved(
     """Readings and points, with robust weights iterated around, and which points (m,) lost their rays by that."""
     place = np.concatenate([r.point for r in one.rays.values()])
     lost = np.zeros(len(one.ground), bool)
-    held = (np.array([-1]),) * 4
+    nothing = np.array([-1])
+    held = (nothing, nothing, nothing, nothing, nothing)
     parameters = Parameters((), np.zeros(0), np.zeros(0), {(_NAME, k): held for k in one.rays})
     state = State(np.zeros(0), (one.ground,), np.zeros(shared.size))
     factor = dict.fromkeys(("image", "control", *shared.groups), 1.0)

@@ -1,11 +1,14 @@
 """Cameras that drift from field to field, with and without a monitor's readings (the bridge from paper 001 to 003)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from analysis.orbit.adjustment import adjust
-from analysis.orbit.calibration_parameters import CalibrationError, Noise, Unknowns, monitor_priors
+from analysis.orbit.calibration_parameters import CalibrationError, Noise, Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.null_space import RankError
 from analysis.orbit.three_line_model import DRIFT
@@ -146,6 +149,43 @@ def test_sigmas_with_a_monitor_are_right():
         fit += (found.chi_square, found.degrees_of_freedom)
     assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
     assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
+
+
+def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():
+    """Rates of some mas/s over the 67 s between the outer lines: 0.65 m times 33 s times 3 mas/s are 0.3 um of x."""
+    rates = np.array([-4.0, 3.0, 6.0]) * 1e-3 * ARCSEC
+    still = measured(observe(field_points(np.random.default_rng(8), 60, 2.4), 2.4, cameras(), BIAS))
+    every = np.concatenate([r.time for r in still.rays.values()])
+    rays = {}
+    for line, r in still.rays.items():
+        # measured is true without the turn of the bias since the middle
+        turn = Rotation.from_rotvec((r.time - every.mean())[:, None] * rates).inv().as_matrix()
+        rays[line] = replace(r, attitude=r.attitude @ turn)
+    field = replace(still, rays=rays)
+    unaware = adjust([field], LABORATORY, NOISE, gauge=HOLD_X)
+    moved = [unaware.value(f"{line} x") - TRUTH[f"{line} x"] for line in ("forward", "aft")]
+    # the forward line comes first: the attitude that is taken as true lacks the turn by -rate * 33 s
+    expected = 0.65 / np.cos(np.radians(25)) ** 2 * 33.3 * rates[1] * np.cos(np.radians(25)) ** 2
+    assert moved[1] - moved[0] == pytest.approx(2 * expected, rel=0.1)
+    names = ("roll rate", "pitch rate", "yaw rate")
+    told = [Prior({n: 1.0}, v, 0.02e-3 * ARCSEC, "bias rate") for n, v in zip(names, rates, strict=True)]
+    found = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"), priors=told)
+    for name, value in zip(found.names, found.values, strict=True):
+        truth = dict(zip(names, rates, strict=True)).get(name, known([])[name] if name in TRUTH else None)
+        if truth is not None:
+            assert value == pytest.approx(truth, rel=1e-6), name
+    # nothing else tells the rate of pitch: what is not known of it is not known of x
+    vague = [replace(p, sigma=10e-3 * ARCSEC) for p in told]
+    loose = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"), priors=vague)
+    assert loose.sigma["aft x"] ** 2 - found.sigma["aft x"] ** 2 == pytest.approx(
+        (0.65 * 33.3 * 10e-3 * ARCSEC) ** 2, rel=0.1
+    )
+    # within a line the field passes in seconds, and the noise of its points is all that tells
+    blind = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"))
+    assert blind.sigma["aft x"] > 5 * found.sigma["aft x"]
+    timeless = replace(field, rays={k: replace(r, time=None) for k, r in field.rays.items()})
+    with pytest.raises(CalibrationError, match="times of all rays"):
+        adjust([timeless], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"), priors=told)
 
 
 def test_bad_readings_are_told():

@@ -60,6 +60,25 @@ def test_covariances_weigh_and_scatter_is_what_they_lack():
     assert (~honest.accepted & ~bad).sum() < 0.02 * (~bad).sum()
 
 
+def test_correlated_covariances_are_counted_with_their_sign():
+    """Errors of 0.3 px along one diagonal and 0.03 px along the other: the distance is Mahalanobis's, of which right
+    matches beyond the limit are lost at the stated rate. With the other sign they would lie ten times too far out."""
+    rng = np.random.default_rng(8)
+    place, exact, _, _, _ = scene(8, 1000, 0.0, 0.0)
+    turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)
+    spread = turn @ np.diag([0.3**2, 0.03**2]) @ turn.T
+    assert spread[0, 1] > 0.04
+    found = exact + rng.standard_normal((1000, 2)) @ np.linalg.cholesky(spread).T
+    result = consensus(place, found, covariance=np.tile(spread, (1000, 1, 1)))
+    assert (~result.accepted).sum() <= stats.binom.ppf(1 - 1e-5, 1000, 1.5e-3)
+    rest = found - place - result.field(place)
+    whole = spread + result.scatter**2 * np.eye(2)
+    # the last fit moves after the last distances by less than it would take to change who is accepted
+    by_hand = np.sqrt(np.einsum("ni,ij,nj->n", rest, np.linalg.inv(whole), rest))
+    assert result.distance == pytest.approx(by_hand, rel=1e-6, abs=1e-6)
+    assert result.scatter < 0.02
+
+
 def test_height_takes_parallax():
     place, found, level, bad, _ = scene(3, 300, 0.3, height=True)
     with_height = consensus(place, found, height=level)

@@ -180,7 +180,8 @@ def test_held_unknowns_hide_what_follows_them():
     """nadir x off by 0.1 mm: pitch and the other x follow, and `sigma_with` says so."""
     field = measured(middle(60), np.random.default_rng(7))
     found = adjust([field], LABORATORY, NOISE, gauge=HOLD_SIX)
-    shifted = {**LABORATORY, "nadir": LABORATORY["nadir"].with_interior(LABORATORY["nadir"].interior + [0, 1e-4, 0])}
+    nadir = LABORATORY["nadir"]
+    shifted = {**LABORATORY, "nadir": nadir.with_interior(nadir.interior + np.array([0, 1e-4, 0]))}
     moved = adjust([field], shifted, NOISE, gauge=HOLD_SIX)
     change = found.follow @ [1e-4, 0, 0, 0, 0, 0]
     for k, name in enumerate(found.names):

@@ -219,6 +219,27 @@ def test_sigma_by_hand():
     assert both.covariance[0, 1] == pytest.approx((forward - down) @ (down - aft), rel=0.05)
 
 
+def test_alpha_and_beta_share_the_error_of_the_station():
+    """The station moved by each of its sigmas and fitted anew changes both angles together; the covariance is the sum
+    of these products beside that of the points. 1.5 m at 500 km are 3e-6 rad: the second order is as small."""
+    strips, spread = SCENE.strips(1.5), np.diag([1.0, 4.0, 9.0]) + 0.5
+
+    def planes(place):
+        return [fit_plane(Station.of(place, spread), s) for s in strips]
+
+    change = []
+    for step in np.linalg.cholesky(spread).T:
+        ahead, back = (intersection_angles(*planes(SCENE.station + way * step)).values for way in (1.0, -1.0))
+        change.append(0.5 * (ahead - back))
+    fitted = planes(SCENE.station)
+    found = intersection_angles(*fitted)
+    points = np.array([plane.point_covariance for plane in fitted])
+    own = np.einsum("mki,kij,lkj->ml", found.gradient, points, found.gradient)
+    shared = np.array(change).T @ np.array(change)
+    assert found.covariance - own == pytest.approx(shared, rel=1e-3)
+    assert abs(shared[0, 1]) > 0.3 * np.sqrt(shared[0, 0] * shared[1, 1])
+
+
 def test_full_covariances():
     """Errors ten times larger in height than in plan, and different from point to point. 300 draws match the sigmas,
     and the normal minimises the weighted distances, whose weights turn with it (gradient by differences).

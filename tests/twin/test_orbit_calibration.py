@@ -14,6 +14,7 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.three_line_model import misclosure
+from optics.frozen_map import FrozenMap
 from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_angle import LINES, EffectsSpec
 from scenes.orbit_setup import CalibrationSetup, resolve_calibration
@@ -22,10 +23,11 @@ from tests.twin.commands import files, invoke, refused
 from twin.orbit.calibration.campaign import fly_fields
 from twin.orbit.calibration.influences import INNER, simultaneous, surprises
 from twin.orbit.calibration.latitude import fitted
-from twin.orbit.calibration.points import ImagePoints, image_sigma
+from twin.orbit.calibration.light import light_shift
+from twin.orbit.calibration.points import ImagePoints, PassData, image_sigma
 from twin.orbit.calibration.procedure import run_calibration_passes, true_values
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, schemes_tested, values_of
-from twin.orbit.light_effects import NO_EFFECTS
+from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.trial.result import silent
 
 run = partial(invoke, command.app)
@@ -203,6 +205,60 @@ def test_a_camera_100_m_wrong_takes_the_light_out_to_a_hundredth_of_a_pixel() ->
     no_light_time = campaign.without_effects(replace(campaign.effects, light_time=False))
     at = 7.292e-5 * 6371e3 * np.cos(SETUP.test.fields["Beijing"].latitude) * 550e3 / 299792458.0 / 500e3 * 0.65
     assert left(no_light_time.passes[0], given=True) == pytest.approx(at / SETUP.camera.pitch, rel=0.15)
+
+
+def one_field(position: tuple[float, float, float]) -> PassData:
+    """What is known of a pass over Beijing, all lines' cameras at a place in the body."""
+    test = SETUP.test.model_copy(update={"fields": FrozenMap({"Beijing": SETUP.test.fields["Beijing"]})})
+    lines = {k: v.model_copy(update={"position": position}) for k, v in SETUP.camera.lines.items()}
+    camera = SETUP.camera.model_copy(update={"lines": FrozenMap(lines)})
+    setup = SETUP.model_copy(update={"test": test, "camera": camera})
+    return fly_fields(setup, np.random.SeedSequence(3)).passes[0].data
+
+
+def test_light_is_taken_out_of_cameras_anywhere_in_the_body() -> None:
+    """Light time, aberration and refraction move an image point by up to 3 px wherever the camera sits: metres do not
+    matter at 500 km. A lever arm that is forgotten would count as 3 m of 500 km, 0.6 px."""
+    line, pixel, height = np.full(5, 40_000.0), np.linspace(500.0, 11_500.0, 5), np.full(5, 400.0)
+    effects = LightEffects(True, True, True, 650e-9)
+    for name in LINES:
+        shifts = []
+        for position in ((0.0, 0.0, 0.0), (3.0, -2.0, 1.0)):
+            data = one_field(position)
+            assert data.models[name].position == pytest.approx(position)
+            sensor = replace(data.sensors[name], effects=effects)
+            shifts.append(light_shift(sensor, data.models[name], line, pixel, height))
+        assert np.linalg.norm(shifts[0], axis=1).min() > 0.5 * SETUP.camera.pitch
+        # the same line number is seen from elsewhere by 3 m: 1e-5 of the effects
+        assert np.abs(shifts[1] - shifts[0]).max() < 1e-3 * SETUP.camera.pitch
+
+
+def test_covariances_of_line_and_pixel_keep_their_sign_in_the_focal_plane() -> None:
+    """What an error of a line and of a pixel does to the misclosures of a point is found by exposing it a line later
+    and by moving it a pixel. The covariance in the focal plane is that of these, but for the spacing of lines: it is
+    taken for flat ground ahead, 3% too large where the Earth bends away. A later line acts as a smaller x: the
+    correlation changes its sign."""
+    data = one_field((0.0, 0.0, 0.0))
+    still = np.zeros(3)
+    for name in LINES:
+        spread = np.array([[0.04, 0.03], [0.03, 0.09]])
+        line, pixel = 42_857.0, 6000.0
+        row = ImagePoints.of([0], [line], [pixel], spread)
+        ground = data.sensors[name].ground(np.array([line]), np.array([pixel]), np.array([400.0]))
+        slopes = []
+        for step in np.eye(2):
+            sides = []
+            for way in (1.0, -1.0):
+                moved = ImagePoints.of([0], [line + way * step[0]], [pixel + way * step[1]], spread)
+                rays = data.rays({name: moved})[name]
+                sides.append(misclosure(data.models[name], rays, ground, still, still)[0])
+            slopes.append(0.5 * (sides[0] - sides[1]))
+        by = np.array(slopes).T
+        given = replace(data, unit=1e-6).rays({name: row})[name].spread
+        assert given is not None
+        expected = by @ spread @ by.T / 1e-12
+        assert given[0] == pytest.approx(expected, rel=0.08)
+        assert expected[0, 1] < 0.0
 
 
 def test_light_that_is_left_in_goes_into_the_parameters(full) -> None:

@@ -46,6 +46,23 @@ def read(path: Path):
     return json.loads(path.read_text("utf-8"))
 
 
+def test_trajectory_says_which_velocity_it_has(folder: Path) -> None:
+    """The velocity is the derivative of the position in the turning frame; against the stars the Earth's rotation comes
+    to it, 0.4 km/s at 40 deg, which taken for the other would turn an aberration of 5 arcsec by 0.27 arcsec."""
+    path = read(folder / "artefacts" / "trajectory.json")
+    assert path["schema"] == "trajectory 2"
+    assert "turning Earth" in path["reference_frames"]["velocity_m_per_s"]
+    assert "stars" in path["reference_frames"]["inertial_velocity_m_per_s"]
+    time, place, fixed, inertial = (
+        np.array(path[k]) for k in ("orbit_s", "position_m", "velocity_m_per_s", "inertial_velocity_m_per_s")
+    )
+    slope = CubicSpline(time, place)(time, 1)[5:-5]
+    # measured positions of 0.05 m every second; rotation about the pole, good to its motion and nutation
+    assert np.abs(slope - fixed[5:-5]).max() < 0.5
+    assert np.abs(inertial - fixed - np.cross([0.0, 0.0, 7.292115e-5], place)).max() < 0.1
+    assert np.linalg.norm(inertial - fixed, axis=1).min() > 300.0
+
+
 def test_files(folder: Path) -> None:
     data = read(folder / "simulate.json")
     images = {f"images/{n}.{k}" for n in (*LINES, "orthophoto", "dem") for k in ("tiff", "png")}

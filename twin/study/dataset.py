@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from twin.data_file import csv_table
+from twin.reference_frames import frames_text
 from twin.study.block_result import BlockResult
 from twin.study.plan import Plan
 
@@ -57,6 +58,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         "fingerprint": plan.setup.fingerprint,
         "design": study.design.kind,
         "seed": study.design.seed,
+        "reference_frames": frames_text("study"),
     }
     return xr.Dataset(data, coords={RUN: (RUN, np.arange(plan.runs), {"units": ""})}, attrs=attributes)
 

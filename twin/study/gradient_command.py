@@ -11,6 +11,7 @@ from typing import Any
 from optics.backend import load_backend
 from twin.artefact import Artefact, SvgFigure
 from twin.cli import InputErrorText, check_backend
+from twin.reference_frames import described
 from twin.run_folder import MANIFEST, RunFolder, chosen
 from twin.study.command import StudyOptions, broken_by_signals
 from twin.study.folder import PROGRAM
@@ -64,7 +65,7 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
         advance("writing the report")
         from twin.study.gradient_table import plain_data, whole_table
 
-        numbers = plain_data(found)
+        numbers = described("gradient", plain_data(found))
         folder.write_text("config.yaml", setup.to_yaml())
         folder.write_json("gradient.json", numbers)
         folder.write_bytes("gradient.csv", whole_table(found).content())

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from twin.data_file import netcdf
+from twin.reference_frames import described
 from twin.run_folder import MANIFEST
 from twin.study.block_result import BlockResult
 from twin.study.dataset import make_dataset, parquet, summary, table
@@ -43,13 +44,16 @@ def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: Stud
         Contents of study.json.
     """
     data = make_dataset(plan, result)
-    numbers = {
-        **summary(data, plan),
-        "seconds": facts.seconds,
-        "runs_computed": facts.computed,
-        "states_per_second": facts.computed / facts.seconds if facts.computed else None,
-        "worker_seconds": result.seconds,
-    }
+    numbers = described(
+        "study",
+        {
+            **summary(data, plan),
+            "seconds": facts.seconds,
+            "runs_computed": facts.computed,
+            "states_per_second": facts.computed / facts.seconds if facts.computed else None,
+            "worker_seconds": result.seconds,
+        },
+    )
     (folder.path / MANIFEST).unlink(missing_ok=True)
     folder.write("config.yaml", plan.setup.to_yaml().encode())
     folder.write("study.nc", netcdf(data))

@@ -149,7 +149,7 @@ def run_test(
             write_lab(result, facts, folder)
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if options.as_json:
-            print_json(dict(result.data))
+            print_json(result.document)
         elif not options.quiet:
             _print_result(result, folder.target)
 

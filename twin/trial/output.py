@@ -71,7 +71,7 @@ def render_report(result: LabResult, facts: RunFacts) -> str:
 def write_lab(result: LabResult, facts: RunFacts, folder: RunFolder) -> None:
     """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest."""
     folder.write_text("config.yaml", facts.config)
-    folder.write_json(f"{result.kind}.json", dict(result.data))
+    folder.write_json(f"{result.kind}.json", result.document)
     for artefact in (result.summary, *(a for section in result.sections for a in section.artefacts)):
         folder.write_bytes(place(artefact), artefact.content())
     for name, frames in result.images.items():

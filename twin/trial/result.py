@@ -10,6 +10,7 @@ import numpy as np
 
 from optics.frozen_map import FrozenMap
 from twin.artefact import Table
+from twin.reference_frames import described
 from twin.trial.section import Section
 
 Advance = Callable[[str, int, int], None]
@@ -25,7 +26,7 @@ class LabResult:
     """A finished test.
 
     Attributes:
-        kind: ``focus``, ``distortion`` or ``turntable``; its numbers go to KIND.json.
+        kind: of `twin.reference_frames.FRAMES`, for example ``focus``; its numbers go to KIND.json.
         title: of the report.
         lead: what was found, a sentence or a few.
         facts: what was set up, (label, text).
@@ -53,3 +54,8 @@ class LabResult:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"more than one artefact is called {', '.join(twice)}")
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Contents of KIND.json: the numbers with their frames."""
+        return described(self.kind, self.data)

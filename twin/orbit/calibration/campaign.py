@@ -100,6 +100,14 @@ class FieldPass:
     tie_images: Mapping[str, ImagePoints] = FrozenMap({})
     ties: Mapping[str, Rays] = FrozenMap({})
 
+    def bias_at(self, time: float) -> np.ndarray:
+        """(3,) true roll, pitch, yaw at a time, seconds from the field's middle, radians, without slow errors."""
+        errors = self.measured.errors
+        assert errors is not None
+        latitude = self.trajectory.orbit.earth.geodetic(self.trajectory.position(time))[1]
+        turn = errors.bias + np.sin(latitude - errors.reference) * errors.thermal
+        return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+
     def shifted(self, datum: tuple[float, float, float]) -> FieldPass:
         """With control points given farther east, north and up, metres; rays stay as they are."""
         lon, lat, _ = self.data.earth.geodetic(self.control_ground.mean(axis=0))

@@ -103,7 +103,11 @@ class Surprise:
 
 
 def simultaneous(
-    campaign: Campaign, priors: tuple[Prior, ...] = (), robust: Robust | None = None, drift: bool = False
+    campaign: Campaign,
+    priors: tuple[Prior, ...] = (),
+    robust: Robust | None = None,
+    drift: bool = False,
+    rate: bool = False,
 ) -> Adjustment:
     """All fields at once: one interior, a bias and, where the orbit drifts, an offset with its prior for each field.
 
@@ -112,6 +116,7 @@ def simultaneous(
         priors: what else is known of the unknowns, for example by an on-board monitor in each pass.
         robust: weights of the image points.
         drift: whether the cameras' changes in each pass are unknowns, too; priors must tell them.
+        rate: whether a drift of the bias during the passes is; priors must tell it.
 
     Raises:
         CalibrationError: it cannot be solved.
@@ -127,7 +132,11 @@ def simultaneous(
         [p.control for p in campaign.passes],
         campaign.laboratory,
         campaign.noise,
-        unknowns=Unknowns(offset="field" if offsets else "none", drift="field" if drift else "none"),
+        unknowns=Unknowns(
+            offset="field" if offsets else "none",
+            drift="field" if drift else "none",
+            rate="common" if rate else "none",
+        ),
         priors=(*(drifts if offsets else ()), *priors),
         gauge=GAUGE,
         robust=robust,

@@ -19,12 +19,13 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from analysis.orbit.adjustment import Adjustment
-from analysis.orbit.calibration_parameters import index
+from analysis.orbit.calibration_parameters import Prior, index
 from analysis.orbit.three_line_model import BIAS
-from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.campaign import Campaign, FieldPass
 
 LEAST_FIELDS = 4
 """Two are spent on the fit; one degree of freedom is no estimate of what remains."""
+_LEAST_FREEDOM = 3
 _ONE_LATITUDE = np.radians(1.0)
 
 
@@ -76,6 +77,30 @@ def latitude_fits(campaign: Campaign, together: Adjustment) -> tuple[LatitudeFit
         where = [index(together.names, f"{p.name} {axis}") for p in campaign.passes]
         found.append(fitted(axis, latitude, together.values[where], together.covariance[np.ix_(where, where)]))
     return tuple(found)
+
+
+def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prior, ...]:
+    """How fast the biases drift during the passes, as they do from field to field: amplitude times the change of the
+    sine of latitude in a second, mean of the passes. Empty for fits of fewer than `_LEAST_FREEDOM` degrees of freedom.
+
+    The outer lines see a field half a minute before and after the nadir line, so that their x and y take up the drift.
+    """
+    if not fits or fits[0].degrees_of_freedom < _LEAST_FREEDOM:
+        return ()
+    # a sigma from f degrees of freedom: the error over it is Student's, of variance f / (f - 2)
+    student = float(np.sqrt(fits[0].degrees_of_freedom / (fits[0].degrees_of_freedom - 2.0)))
+    speed = float(np.mean([_sine_rate(p, fits[0].reference) for p in campaign.passes]))
+    spread = student * abs(speed)
+    return tuple(
+        Prior({f"{f.axis} rate": 1.0}, f.amplitude * speed, f.amplitude_sigma * spread, "bias rate") for f in fits
+    )
+
+
+def _sine_rate(one: FieldPass, reference: float) -> float:
+    """Change of sin(latitude - reference) at a pass's middle by the measured orbit, 1/s."""
+    ends = one.measured.position(np.array([-1.0, 1.0]))
+    latitude = one.measured.orbit.earth.geodetic(ends)[1]
+    return float(np.diff(np.sin(latitude - reference))[0] / 2.0)
 
 
 def fitted(axis: str, latitude: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> LatitudeFit:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.orbit.adjustment import Adjustment
+from analysis.orbit.calibration_parameters import RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import RankError
 from analysis.orbit.stepwise import Stepwise, stepwise
@@ -29,7 +30,7 @@ from twin.orbit.calibration.influences import (
     simultaneous,
     surprises,
 )
-from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits
+from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
 from twin.orbit.calibration.monitor import Monitoring, monitored
 from twin.orbit.calibration.schemes import (
     GAUGE,
@@ -73,7 +74,8 @@ class CalibrationRun:
 
     Attributes:
         campaign: truth and measurements.
-        together: simultaneous adjustment of all fields, with the orbit's offsets.
+        together: simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it,
+            the drift of the biases during the passes.
         truth: (P,) true values of its unknowns.
         fields: name -> that field by itself.
         paper_way: the first scheme's first field by the paper's stepwise solution.
@@ -130,7 +132,9 @@ def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance
     if campaign.images is not None:
         campaign = screened(campaign)
     advance("calibration", 1, parts)
-    together = simultaneous(campaign)
+    latitude = latitude_fits(campaign, simultaneous(campaign))
+    rates = rate_priors(campaign, latitude)
+    together = simultaneous(campaign, rates, rate=bool(rates))
     advance("calibration", 2, parts)
     fields = {}
     for k, one in enumerate(campaign.passes):
@@ -155,7 +159,7 @@ def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance
         tested_before(campaign),
         schemes,
         Finding.of(schemes),
-        latitude_fits(campaign, together),
+        latitude,
         light,
         datum,
         surprises(campaign, together),
@@ -166,7 +170,9 @@ def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance
 
 
 def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
-    """True values of unknowns (P,) by name, metres and radians; of biases and offsets, those at the field's middle."""
+    """True values of unknowns (P,) by name, metres and radians; of biases and offsets, those at the field's middle, of
+    rates the mean of the fields.
+    """
     known = {
         f"{line} {name}": value
         for line, camera in campaign.truth.items()
@@ -175,6 +181,8 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
     for one in campaign.passes:
         known |= {f"{one.name} {name}": v for name, v in zip(BIAS, one.bias, strict=True)}
         known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.offset, strict=True)}
+    rates = [(one.bias_at(1.0) - one.bias_at(-1.0)) / 2.0 for one in campaign.passes]
+    known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
     return np.array([known[name] for name in names])
 
 

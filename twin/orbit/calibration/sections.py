@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.monitoring import ARCSEC
+from analysis.orbit.calibration_parameters import RATE
 from scenes.orbit_angle import LINES
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.calibration.field_sections import biases_section, fields_section
@@ -185,18 +186,24 @@ def _parameters(run: CalibrationRun) -> Section:
         rows.append((name, float(change), None if held else 1e6 * sigma[name], float(true), z))
     others: list[tuple[Cell, ...]] = []
     for name in (n for n in found.names if n not in INNER):
-        scale, shown = (ARCSEC, "arcsec") if unit(name) == "rad" else (1.0, "m")
+        scale, shown = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}[unit(name)]
         value, true, s = found.value(name) / scale, truth[name] / scale, sigma[name] / scale
         others.append((name, shown, float(value), float(s), float(true), float((value - true) / s)))
-    drift = np.abs(run.campaign.spec.errors.star_tracker.thermal.amplitude).max()
     text = [
         "All fields at once, one interior orientation for all: changes from the laboratory's values. z is the error in "
         "sigmas of this adjustment.",
     ]
-    if drift > 0.0 and run.campaign.spec.errors.switched_on:
+    if any(name in RATE for name in found.names):
         text.append(
-            "The bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
-            "before and after the nadir line. The outer lines' principal points take this up, and no sigma contains it."
+            "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
+            "before and after the nadir line. The fit of the biases against latitude tells the drift, with its sigma, "
+            "and the outer lines' principal points share that sigma."
+        )
+    else:
+        text.append(
+            "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
+            "before and after the nadir line. With so few fields nothing tells the drift: the outer lines' principal "
+            "points take it up, and no sigma contains it."
         )
     tables = (
         Table(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.orbit.calibration_parameters import RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
@@ -24,13 +25,29 @@ def to_dict(run: CalibrationRun, seed: int) -> dict[str, Any]:
     """The numbers of a calibration as plain data; what is not defined is None."""
     found, spec = run.together, run.campaign.spec
     sigma = found.sigma
+    whole = found.sigma_with(dict.fromkeys(found.gauge.held, spec.launch.interior))
+    rates = [n for n in found.names if n in RATE]
     free = [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
     limits = spec.limits
     return {
         "seed": seed,
         "parameters": {
-            name: {"value": float(value), "sigma": sigma[name], "truth": float(true), "unit": unit(name)}
+            name: {
+                "value": float(value),
+                "sigma": sigma[name],
+                "sigma_with_gauge": whole[name],
+                "held": name in found.gauge.held,
+                "truth": float(true),
+                "unit": unit(name),
+            }
             for name, value, true in zip(found.names, found.values, run.truth, strict=True)
+        },
+        "sigmas": {
+            "sigma": "with the gauge's held unknowns exact"
+            + (", and with the drift of the biases during the passes as the latitude fit tells it" if rates else ""),
+            "sigma_with_gauge": "with what launch leaves to expect of the held unknowns, and all that follows them",
+            "held_start_sigma_m": spec.launch.interior,
+            "fields": "of each field by itself: without the drift of the biases during the pass",
         },
         "correlations": {
             "names": [found.names[k] for k in free],
@@ -85,6 +102,8 @@ def to_dict(run: CalibrationRun, seed: int) -> dict[str, Any]:
 
 def unit(name: str) -> str:
     """SI unit of an unknown."""
+    if name in RATE:
+        return "rad/s"
     return "rad" if name.split()[-1] in BIAS else "m"
 
 

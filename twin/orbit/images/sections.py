@@ -7,6 +7,7 @@ from twin.orbit.images.figure import control_png, images_png, transfer_svg
 from twin.orbit.images.flight import Simulation
 from twin.orbit.images.point_sections import points_section
 from twin.orbit.images.to_json import camera_data, georeference, trajectory_data, truth_data
+from twin.reference_frames import described
 from twin.trial.section import Section
 
 
@@ -76,11 +77,14 @@ def _data(run: Simulation) -> Section:
     errors, control = run.spec.errors, run.patch.control
     gps, star = errors.gps.interval, errors.star_tracker.interval
     rasters = {"orthophoto": georeference(control.orthophoto), "dem": georeference(control.dem)}
+    camera = described("camera", camera_data(run.laboratory))
+    path = described("trajectory", trajectory_data(run.measured, gps, star))
+    truth = described("simulate-truth", truth_data(run))
     parts = (
-        Data("camera", "Camera", "As the laboratory measured it.", camera_data(run.laboratory)),
-        Data("trajectory", "Orbit and attitude", "As measured.", trajectory_data(run.measured, gps, star)),
-        Data("georeference", "Georeference", "Of orthophoto and elevation model.", rasters),
-        Data("truth", "Truth", "Camera, orbit, attitude, ground points; not for an analysis.", truth_data(run)),
+        Data("camera", "Camera", "As the laboratory measured it.", camera),
+        Data("trajectory", "Orbit and attitude", "As measured.", path),
+        Data("georeference", "Georeference", "Of orthophoto and elevation model.", described("georeference", rasters)),
+        Data("truth", "Truth", "Camera, orbit, attitude, ground points; not for an analysis.", truth),
     )
     text = (
         "For other software: the images as TIFF, orthophoto (10 000 for a reflectance of 1) and elevation model "

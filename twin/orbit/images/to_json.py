@@ -15,6 +15,7 @@ from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_data import points_data, points_truth
 from twin.orbit.measurement_errors import readings
 from twin.orbit.trajectory import Trajectory
+from twin.reference_frames import described
 
 _TRUE_POINTS = 21
 """Along each side of the grid of true ground points."""
@@ -87,10 +88,10 @@ def trajectory_data(trajectory: Trajectory, gps: float, star: float) -> dict[str
     turn[1:] *= flip[:, None]
     return {
         "epoch_utc": str(trajectory.orbit.epoch),
-        "frame": "ITRS; quaternions (x, y, z, w) turn body axes into it: x_itrs = R x_body",
         "orbit_s": fixes.tolist(),
         "position_m": trajectory.position(fixes).tolist(),
         "velocity_m_per_s": trajectory.velocity(fixes).tolist(),
+        "inertial_velocity_m_per_s": trajectory.inertial_velocity(fixes).tolist(),
         "attitude_s": looks.tolist(),
         "quaternion": turn.tolist(),
     }
@@ -143,8 +144,10 @@ def truth_data(run: Simulation) -> dict[str, Any]:
     east, north = control.error(*raster.east_north(row, column))
     return {
         "points": points_truth(patch, run.points) if run.points is not None else None,
-        "camera": camera_data(run.truth),
-        "trajectory": trajectory_data(run.trajectory, errors.gps.interval, errors.star_tracker.interval),
+        "camera": described("camera", camera_data(run.truth)),
+        "trajectory": described(
+            "trajectory", trajectory_data(run.trajectory, errors.gps.interval, errors.star_tracker.interval)
+        ),
         "ground_points": points,
         "control_error": {
             "row": row.tolist(),

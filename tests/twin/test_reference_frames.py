@@ -1,0 +1,95 @@
+"""Every file with numbers says in which frames they are, and says it right."""
+
+import ast
+import json
+from pathlib import Path
+
+import pytest
+
+import twin
+from twin.artefact import Table
+from twin.reference_frames import FRAMES, SCHEMA, described, frames_text
+from twin.run_folder import MANIFEST
+from twin.trial.result import LabResult
+
+SOURCES = sorted(Path(twin.__file__).parent.rglob("*.py"))
+# what it was run with and which checks passed: no positions, directions or times of an experiment
+WITHOUT = {MANIFEST, "validation.json"}
+
+
+def calls(name):
+    """All calls of a function or method of that name in the package, with their file."""
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            called = getattr(node, "func", None)
+            if isinstance(node, ast.Call) and name == getattr(called, "attr", getattr(called, "id", None)):
+                yield path, node
+
+
+def source(node):
+    return ast.unparse(node)
+
+
+def test_every_writer_of_json_states_frames():
+    """A file's content is `described(...)`, a result's `document`, or a name that is assigned from one of these."""
+    count = 0
+    for path, call in calls("write_json"):
+        name, data = (source(a) for a in call.args)
+        if name == "MANIFEST" or name.strip("'\"") in WITHOUT:
+            continue
+        count += 1
+        tree = ast.parse(path.read_text("utf-8"))
+        assigned = [
+            source(n.value) for n in ast.walk(tree) if isinstance(n, ast.Assign) and source(n.targets[0]) == data
+        ]
+        said = [data, *assigned]
+        assert any(s.startswith("described(") or s.endswith(".document") for s in said), f"{path.name}: {name}"
+    assert count >= 4
+
+
+def test_every_kind_of_result_has_frames():
+    kinds = set()
+    for path, call in calls("LabResult"):
+        first = call.args[0] if call.args else next(k.value for k in call.keywords if k.arg == "kind")
+        assert isinstance(first, ast.Constant), path
+        kinds.add(first.value)
+    assert len(kinds) >= 8
+    assert kinds <= set(FRAMES)
+    table = Table("t", "T", "", (), ())
+    with pytest.raises(KeyError):
+        _ = LabResult("unheard-of", "", (), (), {}, table, ()).document
+
+
+def test_every_data_file_beside_the_report_has_frames():
+    found = 0
+    for path, call in calls("Data"):
+        if "validation" in path.parts or path.name == "artefact.py":
+            continue
+        data = source(call.args[3])
+        tree = ast.parse(path.read_text("utf-8"))
+        assigned = [
+            source(n.value) for n in ast.walk(tree) if isinstance(n, ast.Assign) and source(n.targets[0]) == data
+        ]
+        assert any(s.startswith("described(") for s in (data, *assigned)), f"{path.name}: {data}"
+        found += 1
+    assert found >= 4
+
+
+def test_every_netcdf_file_has_frames():
+    """Data sets are made in few places, and each of them names the frames among its attributes."""
+    makers = {path for path, _ in calls("Dataset") if "validation" not in path.parts}
+    assert makers
+    for path in makers:
+        assert '"reference_frames": frames_text(' in path.read_text("utf-8"), path
+
+
+def test_statements_are_whole():
+    for kind, statement in FRAMES.items():
+        found = described(kind, {"seed": 1})
+        assert list(found) == ["schema", "reference_frames", "seed"]
+        assert found["schema"] == f"{kind} {SCHEMA}"
+        assert statement
+        for quantity, frame in statement.items():
+            assert len(frame) > 10, (kind, quantity)
+            assert frame in frames_text(kind)
+        json.dumps(found, allow_nan=False)
