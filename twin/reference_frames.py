@@ -61,9 +61,7 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "axis_tilt_arcsec": "of the turntable's axis against square to camera axes X and Z",
         },
         "turntable": {"angles": "readings of the turntable's circle about its axis; errors: reading minus true angle"},
-        "design": {
-            "prescription": "vertex of M1; light enters toward +z, y in the symmetry plane, x along the line"
-        },
+        "design": {"prescription": "vertex of M1; light enters toward +z, y in the symmetry plane, x along the line"},
         "angle": {
             "planes, look, along_track, truth": _LOOK,
             "frames": "axes in which the planes are fitted: each row names its own",

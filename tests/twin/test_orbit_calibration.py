@@ -22,11 +22,12 @@ from scenes.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.calibration.campaign import fly_fields
 from twin.orbit.calibration.influences import INNER, simultaneous, surprises
-from twin.orbit.calibration.latitude import fitted
+from twin.orbit.calibration.latitude import fitted, latitude_fits, rate_priors
 from twin.orbit.calibration.light import light_shift
 from twin.orbit.calibration.points import ImagePoints, PassData, image_sigma
 from twin.orbit.calibration.procedure import run_calibration_passes, true_values
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, schemes_tested, values_of
+from twin.orbit.calibration.to_json import to_dict
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
 from twin.trial.result import silent
 
@@ -102,6 +103,47 @@ def test_errors_are_as_large_as_their_sigmas() -> None:
     assert 1e-6 < chi2.sf(total, count) < 1.0 - 1e-6
     # the adjustment knows that readings are shared and how a spline joins them
     assert 1e-6 < chi2.sf(fit, freedom) < 1.0 - 1e-6
+
+
+def test_numbers_say_what_their_sigmas_hold(full) -> None:
+    """With the drift of the biases during a pass as the fields tell it, and with what launch leaves of the gauge.
+    Errors of the outer lines' x beyond 4 sigmas are a false alarm of 1e-3 with Student's five degrees of freedom."""
+    data = to_dict(full, 1)
+    found, plain = data["parameters"], simultaneous(full.campaign).sigma
+    expected = SETUP.test.launch.interior
+    for name in ("forward x", "aft x"):
+        one = found[name]
+        assert abs(one["value"] - one["truth"]) < 4.0 * one["sigma"]
+        assert one["sigma"] > 1.2 * plain[name]
+        # a shift of nadir x turns the whole camera
+        assert one["sigma_with_gauge"] == pytest.approx(np.hypot(one["sigma"], expected), rel=0.01)
+    assert found["nadir x"]["held"]
+    assert found["nadir x"]["sigma"] == 0.0
+    assert found["nadir x"]["sigma_with_gauge"] == pytest.approx(expected, rel=1e-12)
+    assert not found["forward x"]["held"]
+    assert found["pitch rate"]["unit"] == "rad/s"
+    # descending at 0.06 deg/s, 4 arcsec times the change of the sine of latitude; measured to true is the way back
+    rate = -SETUP.test.errors.star_tracker.thermal.amplitude[1] * np.radians(-0.063)
+    assert found["pitch rate"]["truth"] == pytest.approx(rate, rel=0.05)
+    assert "drift of the biases" in data["sigmas"]["sigma"]
+    assert data["sigmas"]["held_start_sigma_m"] == expected
+
+
+@pytest.mark.slow
+def test_errors_of_the_outer_lines_are_as_large_as_their_sigmas() -> None:
+    """24 campaigns with the drift during the passes: the mean of z within 4 of its sigmas, the root mean square within
+    a half, three of its own (1/sqrt 48, and as much again for Student's tails). Without the drift's part the means were
+    -2.0 and +2.2."""
+    z = []
+    for seed in range(24):
+        campaign = fly_fields(setup_with(), np.random.SeedSequence(500 + seed))
+        rates = rate_priors(campaign, latitude_fits(campaign, simultaneous(campaign)))
+        found = simultaneous(campaign, rates, rate=True)
+        true = dict(zip(found.names, true_values(campaign, found.names), strict=True))
+        z.append([(found.value(n) - true[n]) / found.sigma[n] for n in ("forward x", "aft x", "pitch rate")])
+    assert np.abs(np.mean(z, axis=0)).max() < 4.0 / np.sqrt(24)
+    size = np.sqrt(np.mean(np.square(z), axis=0))
+    assert np.all((size > 0.5) & (size < 1.5))
 
 
 def test_sigmas_are_those_of_the_paper(full) -> None:
