@@ -181,7 +181,8 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
     assert files >= FILES | {"recovered.json", "report.html", "manifest.json"}
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest["sha256"]) >= FILES
-    assert set(found) == {"times_s", "detail", "temperatures", "cameras", "intersection_angle"}
+    about = {"schema", "reference_frames"}
+    assert set(found) == about | {"times_s", "detail", "temperatures", "cameras", "intersection_angle"}
     assert (found["times_s"], found["detail"]) == ([0.0, 720.0, 1800.0], 1)
     assert found["temperatures"][LEFT]["change_K"] == pytest.approx([0.5, 0.6, 0.7])
     assert found["temperatures"][LEFT]["gradient_K_per_m"][2] == pytest.approx([0.0, 0.02, 0.0])

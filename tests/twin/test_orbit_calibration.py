@@ -312,7 +312,8 @@ def test_light_that_is_left_in_goes_into_the_parameters(full) -> None:
     assert np.abs(aberration.shift["Beijing pitch"]) == pytest.approx(7612.0 / 299792458.0, rel=0.03)
     # refraction tilts the outer lines' rays alike: heights before calibration, 1.5 m over tan 25 deg
     assert alone[2].before[1] - clean.before[1] == pytest.approx(1.5 / np.tan(np.radians(25.0)), rel=0.25)
-    assert abs(everything.most(INNER)[1]) > 8.0
+    # of the sigma of x, 0.33 um with what is not known of the drift of the bias
+    assert abs(everything.most(INNER)[1]) > 5.0
     for row in full.light:
         assert row.after == pytest.approx(clean.after, rel=0.01)
 

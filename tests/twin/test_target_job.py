@@ -16,6 +16,7 @@ from scenes.resolved import resolve, resolve_job
 from tests.twin.commands import files, invoke
 from twin.edge_images import DIRECTIONS
 from twin.experiment import MonitorExperiment
+from twin.reference_frames import described
 from twin.target_images import PLACES
 from twin.target_measurement import render_targets
 
@@ -147,7 +148,7 @@ def test_config_repeats_the_run(folder, mtf, backend):
         np.testing.assert_array_equal(
             images[name.removeprefix("images/")], tifffile.imread(folder / "run" / f"{name}.tiff")
         )
-    assert repeated.to_dict() == mtf
+    assert described("mtf", repeated.to_dict()) == mtf
 
 
 def test_jobs_without_targets_are_as_before(gf7_pair):
