@@ -159,7 +159,18 @@ def imaging_field(
         AimError: the beam does not reach the stop.
         BeamMissedError: no ray reaches the detector.
     """
-    rays = imaging_rays(backend, systems, to_stop, direction, launch, stop, nodes, first)
+    return pupil_field(
+        imaging_rays(backend, systems, to_stop, direction, launch, stop, nodes, first), wavelength, origin, incoming
+    )
+
+
+def pupil_field(
+    rays: ImagingRays,
+    wavelength: float,
+    origin: np.ndarray | None = None,
+    incoming: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> PupilField:
+    """Plane waves of traced beams; arguments as ``imaging_field``."""
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]
     leaving = rays.direction
     phase = eikonal(rays.position, leaving, rays.path, centre)

@@ -2,7 +2,8 @@
 
 A traced ``PupilField`` is a set of nodes that serves one quadrature. A transfer function needs the pupil between the
 nodes and exactly up to its edge, so the field is fitted. In coordinates p, (u, v) = centre + axes @ p, the edge is the
-unit circle but for small harmonics (``optics.pupil_edge``), and eikonal and amplitude are polynomials in products of
+unit circle but for small harmonics (``optics.pupil_edge``), shadows of bodies that stand in the beam are polygons
+(``optics.pupil_shadow``), and eikonal and amplitude are polynomials in products of
 Chebyshev's. Through mirrors the eikonal in metres does not depend on the wavelength, so one fit serves a whole band.
 """
 
@@ -16,6 +17,7 @@ from numpy.polynomial import chebyshev
 
 from optics.diffraction import PupilField
 from optics.pupil_edge import PupilEdge
+from optics.pupil_shadow import PupilShadow
 from optics.quadrature import PupilNodes
 from optics.threads import one_blas_thread
 
@@ -26,6 +28,9 @@ every Zernike term to seventh order on each mirror it leaves 2e-5."""
 WORST_RESIDUAL = 1e-3
 """Rms eikonal that a fit may leave, wavelengths of the field; it changes the transfer function by about (2 pi)^2 of
 its square, 4e-5, where the overlap averages over it."""
+
+SHADOW_NODES = 8
+"""Along each side of a shadow's box, for the light that it takes: the amplitude is nearly even."""
 
 _EDGE_SAMPLES = 64
 
@@ -42,6 +47,7 @@ class PupilFunction:
         amplitude_terms: likewise of the amplitude density (unit power: its square integrates to 1 over du dv).
         eikonal_residual: rms eikonal that the fit leaves, metres.
         amplitude_residual: rms of what the fit leaves of the amplitude, share of its mean.
+        shadow: what bodies in the beam take of the pupil (one pupil's), None if nothing stands there.
     """
 
     centre: np.ndarray
@@ -51,6 +57,7 @@ class PupilFunction:
     amplitude_terms: np.ndarray
     eikonal_residual: float = 0.0
     amplitude_residual: float = 0.0
+    shadow: PupilShadow | None = None
 
     def normalised(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Normalised shift, complex, of shifts (x, y) of the direction cosines, any equal shapes."""
@@ -79,7 +86,21 @@ class PupilFunction:
 
     @cached_property
     def power(self) -> float:
-        """Integral of the amplitude's square over du dv: 1 but for the fit."""
+        """Integral of the amplitude's square over du dv: 1 but for the fit, and for what the shadow takes."""
+        if self.shadow is None:
+            return self.clear_power
+        # as the transfer function has it at frequency zero
+        points, weight = self.shadow.overlap(np.zeros(1, int), np.zeros(1, complex), SHADOW_NODES)
+        return self.clear_power + float(np.sum(self.values(points)[1] ** 2 * weight) * abs(np.linalg.det(self.axes)))
+
+    @property
+    def light(self) -> float:
+        """Share of the clear pupil's light that the shadow leaves."""
+        return self.power / self.clear_power
+
+    @cached_property
+    def clear_power(self) -> float:
+        """``power`` of the pupil without its shadow."""
         rule = np.polynomial.legendre.leggauss(32)
         shift = np.zeros(1, complex)
         right, left, _ = self.edge.corners(shift)
@@ -87,13 +108,16 @@ class PupilFunction:
         return float(np.sum(self.values(points)[1] ** 2 * weight) * abs(np.linalg.det(self.axes)))
 
 
-def fit_pupils(field: PupilField, nodes: PupilNodes, degree: int = DEGREE) -> tuple[PupilFunction, ...]:
+def fit_pupils(
+    field: PupilField, nodes: PupilNodes, degree: int = DEGREE, shadows: np.ndarray | None = None
+) -> tuple[PupilFunction, ...]:
     """Smooth pupils of B images.
 
     Args:
         field: traced at ``nodes`` of the stop.
         nodes: quadrature over the stop's unit disk, without a hole.
         degree: of the polynomials for the map from the stop, the eikonal and the amplitude.
+        shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for a free beam.
 
     Returns:
         B pupils.
@@ -111,10 +135,10 @@ def fit_pupils(field: PupilField, nodes: PupilNodes, degree: int = DEGREE) -> tu
             "cuts has no smooth pupil; enlarge that aperture or move the field point inward"
         )
     with one_blas_thread():
-        return _fit(field, nodes, degree)
+        return _fit(field, nodes, degree, shadows)
 
 
-def _fit(field: PupilField, nodes: PupilNodes, degree: int) -> tuple[PupilFunction, ...]:
+def _fit(field: PupilField, nodes: PupilNodes, degree: int, shadows: np.ndarray | None) -> tuple[PupilFunction, ...]:
     root = np.sqrt(nodes.weight)
     stop = _design(nodes.x, nodes.y, degree) * root[:, None]
     if nodes.count < stop.shape[1] or np.linalg.matrix_rank(stop) < stop.shape[1]:
@@ -140,7 +164,13 @@ def _fit(field: PupilField, nodes: PupilNodes, degree: int) -> tuple[PupilFuncti
             )
         eikonal, amplitude = (_terms(column, degree) for column in solution.T)
         residuals = float(rest[0]), float(rest[1] / np.mean(density))
-        out.append(PupilFunction(centre, axes, edge, eikonal, amplitude, *residuals))
+        shadow = None
+        if shadows is not None and shadows.shape[1]:
+            x, y = shadows[i].reshape(-1, 2).T
+            u, v = (_design(x, y, degree) @ _column(terms, degree) for terms in maps)
+            corners = np.linalg.solve(axes, np.stack([u, v]) - centre[:, None]).T.reshape(1, *shadows.shape[1:])
+            shadow = PupilShadow.within(corners, edge.harmonics[:, None])
+        out.append(PupilFunction(centre, axes, edge, eikonal, amplitude, *residuals, shadow))
     return tuple(out)
 
 

@@ -8,23 +8,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from optics.pupil_edge import PupilEdge
 from optics.pupil_function import DEGREE
+from optics.pupil_shadow import FEW_SIDES, PupilShadow
 from optics.quadrature import PupilNodes
 from optics.threads import one_blas_thread
 from optics.transfer import nodes_for
 
 LEAST_ALONG = 6
 LEAST_ACROSS = 10
-"""Nodes on and across the chords of an overlap for a constant phase. The transfer function is then right to 2e-6."""
+LEAST_SHADOW = 2
+"""Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
+function is then right to 2e-6, and to 5e-5 with shadows."""
 
 _EDGE_SAMPLES = 32
 _AT_ONCE = 2**14
 """Points of overlaps worked on together: some arrays of 1 MB that stay in the cache."""
+_SHADOWS_AT_ONCE = 2**16
+"""The same for shadows, where the way to the points is longer than what is done there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +43,7 @@ class PupilStack:
         eikonal_terms, amplitude_terms: coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and unit power.
         span: how far the eikonal runs over each pupil, a plane taken out, (B,), metres.
         residual: rms eikonal that the fit leaves, (B,), metres.
+        shadow: what bodies in the beams take, None if nothing stands there.
     """
 
     axes: np.ndarray
@@ -45,6 +52,7 @@ class PupilStack:
     amplitude_terms: np.ndarray
     span: np.ndarray
     residual: np.ndarray
+    shadow: PupilShadow | None = None
 
     @classmethod
     def fit(
@@ -55,6 +63,7 @@ class PupilStack:
         amplitude: np.ndarray,
         nodes: PupilNodes,
         degree: int = DEGREE,
+        shadows: np.ndarray | None = None,
     ) -> PupilStack:
         """Fit pupils traced at nodes of the stop, all of which carry light.
 
@@ -65,23 +74,21 @@ class PupilStack:
             amplitude: of the nodes as in ``optics.diffraction.PupilField``, (B, N), positive.
             nodes: N nodes of a quadrature over the stop's unit disk.
             degree: of the polynomials.
+            shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
 
         Raises:
             ValueError: too few nodes for the degree.
         """
         root = np.sqrt(nodes.weight)
         i, j = _orders(degree)
-        stop = _products(nodes.x, nodes.y, degree)
-        if nodes.count < len(i) or np.linalg.matrix_rank(stop * root[:, None]) < len(i):
-            raise ValueError(f"{nodes.count} nodes do not determine polynomials of degree {degree}; trace more")
         with one_blas_thread():
-            solve = np.linalg.pinv(stop * root[:, None]) * root
+            solve = to_terms(nodes, degree)
             terms = np.stack([u, v], axis=1) @ solve.T
             centre, axes, harmonics = _edges(terms, degree)
             (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in _slopes(nodes, degree))
             density = amplitude / (nodes.weight * np.abs(ux * vy - uy * vx))
             place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
-            design = _products(place[:, 0], place[:, 1], degree) * root[:, None]
+            design = products(place[:, 0], place[:, 1], degree) * root[:, None]
             both = np.stack([eikonal, density], axis=-1) * root[:, None]
             turned = np.swapaxes(design, 1, 2)
             solution = np.linalg.solve(turned @ design, turned @ both)
@@ -92,7 +99,12 @@ class PupilStack:
         table = np.zeros((2, len(u), degree + 1, degree + 1))
         table[:, :, i, j] = np.moveaxis(solution, -1, 0)
         residual = np.sqrt(np.sum(rest**2, axis=-1) / np.sum(nodes.weight))
-        return cls(axes, harmonics, table[0], table[1], np.ptp(bent, axis=-1), residual)
+        shadow = None
+        if shadows is not None and shadows.shape[1]:
+            corner = products(shadows[..., 0], shadows[..., 1], degree).reshape(len(u), -1, len(i))
+            place = np.linalg.solve(axes, terms @ corner.swapaxes(1, 2) - centre[..., None])
+            shadow = PupilShadow.within(place.swapaxes(1, 2).reshape(shadows.shape), harmonics, FEW_SIDES)
+        return cls(axes, harmonics, table[0], table[1], np.ptp(bent, axis=-1), residual, shadow)
 
     @property
     def bend(self) -> np.ndarray:
@@ -109,6 +121,7 @@ class PupilStack:
             self.amplitude_terms[which],
             self.span[which],
             self.residual[which],
+            None if self.shadow is None else self.shadow.take(which),
         )
 
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -125,33 +138,55 @@ class PupilStack:
         Raises:
             ValueError: an edge that is far from an ellipse.
         """
-        share = weights / np.sum(weights)
+        with one_blas_thread():
+            total = self._clear(frequency, wavelengths, weights / np.sum(weights))
+            if self.shadow is not None:
+                total = total + self._shadowed(self.shadow, frequency, wavelengths, weights / np.sum(weights))
+            return np.asarray(total / self.power[:, None])
+
+    def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normalised shifts, complex (B, K * M), and the wave numbers of each, (K * M,)."""
         steps = (wavelengths[:, None, None] * frequency).reshape(-1, 2)
         moved = np.linalg.solve(self.axes, np.broadcast_to(steps.T, (len(self.axes), 2, len(steps))))
-        shift = moved[:, 0] + 1j * moved[:, 1]
-        edges = PupilEdge(np.repeat(self.harmonics, len(steps), axis=1))
+        return moved[:, 0] + 1j * moved[:, 1], np.repeat(2.0 * np.pi / wavelengths, len(frequency))
+
+    def _clear(self, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """The integral over the overlaps of the clear pupils, mean over the band, (B, M)."""
+        shift, wave = self._shifts(frequency, wavelengths)
+        steps = shift.shape[1]
+        edges = PupilEdge(np.repeat(self.harmonics, steps, axis=1))
         right, left, inside = edges.corners(shift.ravel())
-        wave = np.repeat(2.0 * np.pi / wavelengths, len(frequency))
         values = np.zeros(shift.shape, complex)
-        with one_blas_thread():
-            for which, across, along in self._pieces(2.0 * np.pi / float(np.min(wavelengths)), len(steps)):
-                flat = (which[:, None] * len(steps) + np.arange(len(steps))).ravel()
-                part = PupilEdge(edges.harmonics[:, flat])
-                rules = (np.polynomial.legendre.leggauss(count) for count in (across, along))
-                points, weight = part.overlap(shift.ravel()[flat], right[:, flat], left[:, flat], *rules)
-                shape = (len(which), len(steps), -1)
-                values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
-        power = self.take(np.arange(len(self.axes)))._power()
-        values *= inside.reshape(shift.shape) / power[:, None]
+        for which, across, along in self._pieces(float(np.max(wave)), steps, _AT_ONCE):
+            flat = (which[:, None] * steps + np.arange(steps)).ravel()
+            part = PupilEdge(edges.harmonics[:, flat])
+            rules = (np.polynomial.legendre.leggauss(count) for count in (across, along))
+            points, weight = part.overlap(shift.ravel()[flat], right[:, flat], left[:, flat], *rules)
+            shape = (len(which), steps, -1)
+            values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
+        values *= inside.reshape(shift.shape)
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
-    def _pieces(self, wave: float, shifts: int) -> Iterator[tuple[np.ndarray, int, int]]:
+    def _shadowed(
+        self, shadow: PupilShadow, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray
+    ) -> np.ndarray:
+        """What the shadows add to ``_clear``."""
+        shift, wave = self._shifts(frequency, wavelengths)
+        values = np.zeros(shift.shape, complex)
+        for which, _, along in self._pieces(float(np.max(wave)), shift.shape[1], _SHADOWS_AT_ONCE):
+            pupils = np.repeat(which, shift.shape[1])
+            points, weight = shadow.overlap(pupils, shift[which].ravel(), LEAST_SHADOW + along - LEAST_ALONG)
+            shape = (len(which), shift.shape[1], -1)
+            values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
+        return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
+
+    def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
         """Pupils that take the same numbers of nodes, in pieces of bounded size."""
         along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
         for count in np.unique(along):
             rows = int(count) + LEAST_ACROSS - LEAST_ALONG
             some = np.flatnonzero(along == count)
-            room = max(1, _AT_ONCE // (shifts * rows * int(count)))
+            room = max(1, points // (shifts * rows * int(count)))
             for start in range(0, len(some), room):
                 yield some[start : start + room], rows, int(count)
 
@@ -174,8 +209,21 @@ class PupilStack:
         )
         return eikonal, amplitude
 
-    def _power(self) -> np.ndarray:
+    @property
+    def light(self) -> np.ndarray:
+        """Share of the clear pupils' light that the shadows leave, (B,)."""
+        return np.asarray(self.power / self._clear_power)
+
+    @cached_property
+    def power(self) -> np.ndarray:
         """Integral of the amplitude's square over each pupil in p, (B,)."""
+        if self.shadow is None:
+            return self._clear_power
+        points, weight = self.shadow.whole(LEAST_SHADOW + 2)
+        return np.asarray(self._clear_power - np.sum(self._values(points[:, None])[1][:, 0] ** 2 * weight, axis=-1))
+
+    @cached_property
+    def _clear_power(self) -> np.ndarray:
         edges = PupilEdge(self.harmonics)
         nothing = np.zeros(len(self.axes), complex)
         right, left, _ = edges.corners(nothing)
@@ -203,14 +251,34 @@ def _series(x: np.ndarray, degree: int) -> np.ndarray:
     return out
 
 
-def _products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
-    """T_i(x) T_j(y) with i + j <= degree at points of any shape, (..., K)."""
-    i, j = _orders(degree)
-    return np.asarray(chebyshev.chebvander(x, degree)[..., i] * chebyshev.chebvander(y, degree)[..., j])
+def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
+    """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K)."""
+    tx, ty = chebyshev.chebvander(x, degree), chebyshev.chebvander(y, degree)
+    out = np.empty((*np.shape(x), (degree + 1) * (degree + 2) // 2))
+    first = 0
+    for i in range(degree + 1):  # in the order of ``_orders``
+        count = degree + 1 - i
+        np.multiply(tx[..., i : i + 1], ty[..., :count], out=out[..., first : first + count])
+        first += count
+    return out
+
+
+@lru_cache(maxsize=8)
+def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
+    """From values at nodes of the stop to coefficients of ``products``, by least squares, (K, N).
+
+    Raises:
+        ValueError: too few nodes for the degree.
+    """
+    root = np.sqrt(nodes.weight)
+    stop = products(nodes.x, nodes.y, degree) * root[:, None]
+    if nodes.count < stop.shape[1] or np.linalg.matrix_rank(stop) < stop.shape[1]:
+        raise ValueError(f"{nodes.count} nodes do not determine polynomials of degree {degree}; trace more")
+    return np.asarray(np.linalg.pinv(stop) * root)
 
 
 def _slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of ``_products`` along x and along y at the nodes, (N, K) each."""
+    """Derivatives of ``products`` along x and along y at the nodes, (N, K) each."""
     i, j = _orders(degree)
     derive = chebyshev.chebder(np.eye(degree + 1), axis=0)
     tx, ty = (chebyshev.chebvander(c, degree) for c in (nodes.x, nodes.y))
@@ -221,7 +289,7 @@ def _slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
 def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the images of the unit circle by maps (B, 2, K)."""
     angle = 2.0 * np.pi * np.arange(_EDGE_SAMPLES) / _EDGE_SAMPLES
-    rim = terms @ _products(np.cos(angle), np.sin(angle), degree).T
+    rim = terms @ products(np.cos(angle), np.sin(angle), degree).T
     harmonic = np.fft.fft(rim, axis=-1) / _EDGE_SAMPLES
     centre = harmonic[..., 0].real
     # u = centre + 2 Re(h e^{ia}): the ellipse of the first harmonic

@@ -134,6 +134,8 @@ class RenderSpec(Spec):
         targets: how the test targets are turned and exposed, None for the defaults.
         stray: whether ghosts and stray light are path-traced and added: true, or the number of paths.
         quality: whether wavefront errors, defocus and MTF on the line CCDs are worked out.
+        obstruction: `traced`: what prisms, baffles and other bodies take of the cameras' beams is missing in image
+            quality and targets; `ignore`: their pupils are free.
         frames: number of frames, None for as many as the instrument's monitor takes.
         seed: of every random number in the job.
     """
@@ -144,6 +146,7 @@ class RenderSpec(Spec):
     targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     quality: Annotated[bool, Field(strict=True)] = False
+    obstruction: Literal["traced", "ignore"] = "traced"
     frames: Frames | None = None
     seed: Seed = 1
 
@@ -155,6 +158,11 @@ class RenderSpec(Spec):
                 "targets are described, but none is rendered", "no target among images", known, within=("images",)
             )
         return self
+
+    @property
+    def obstructed(self) -> bool:
+        """Whether bodies in the cameras' beams count."""
+        return self.obstruction == "traced"
 
     @property
     def target_images(self) -> tuple[str, ...]:

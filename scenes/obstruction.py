@@ -62,9 +62,9 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
         solids[solid.path] = ConvexHull(corners).equations
     found: dict[tuple[str, str], Obstruction] = {}
     for camera in instrument.cameras:
-        for segments in _imaging(instrument, backend, camera):
+        for segments in imaging_segments(instrument, backend, camera):
             for path, planes in solids.items():
-                taken = _taken(segments, planes)
+                taken = rays_taken(segments, planes)
                 if not taken.any():
                     continue
                 used = float(np.mean(taken & _used(instrument, path, segments)))
@@ -74,13 +74,13 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
     for key, segments, inside in _monitor(instrument, backend):
         for path, planes in solids.items():
             outside = segments[:, [medium != path for medium in inside]]
-            taken = _taken(outside, planes)
+            taken = rays_taken(outside, planes)
             if taken.any():
                 found[key, path] = Obstruction(path, key, float(np.mean(taken)))
     return tuple(found[name] for name in sorted(found))
 
 
-def _taken(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
+def rays_taken(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """Which rays, segments (N, K, 2, 3), go through the body ``planes`` . (x, 1) <= 0, (F, 4); (N,)."""
     start, way = segments[:, :, 0], segments[:, :, 1] - segments[:, :, 0]
     height = start @ planes[:, :3].T + planes[:, 3]
@@ -101,7 +101,7 @@ def _disk(radius: float) -> np.ndarray:
     return np.stack([r * np.cos(_GOLDEN * k), r * np.sin(_GOLDEN * k)], axis=-1)
 
 
-def _imaging(instrument: Instrument, backend: Backend, camera: str) -> list[np.ndarray]:
+def imaging_segments(instrument: Instrument, backend: Backend, camera: str) -> list[np.ndarray]:
     """Rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, world."""
     assembly, model, placed = instrument.assembly, instrument.cameras[camera], instrument.assembly.place()
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch

@@ -5,8 +5,10 @@ line: its lens as an imaging system, and its CCD.
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
+from optics.convex_polygon import area, hull, intersect, sides
 from optics.frozen_map import FrozenMap
 from scenes.band import Diffusion, Spectrum, TdiSpec
 from scenes.errors import Problem
@@ -38,6 +40,40 @@ Azimuth = Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="360 deg")]
 Elevation = Annotated[float, Quantity(ANGLE, smallest="5 deg", largest="90 deg")]
 
 
+Corner = tuple[Annotated[Number, Field(ge=-10.0, le=10.0)], Annotated[Number, Field(ge=-10.0, le=10.0)]]
+
+
+def _is_convex(outline: tuple[Corner, ...]) -> tuple[Corner, ...]:
+    corners = np.array(outline, float)
+    if (
+        len(corners) < 3
+        or abs(area(corners)) < _SMALLEST
+        or abs(area(hull(corners[None]))[0]) > abs(area(corners)) * (1.0 + 1e-9)
+    ):
+        allowed = "three corners or more, in order, of a convex polygon; give others as several"
+        raise Problem("not a convex polygon", str([list(corner) for corner in outline]), allowed)
+    return outline
+
+
+Outline = Annotated[tuple[Corner, ...], AfterValidator(_is_convex)]
+_SMALLEST = 1e-9
+
+
+def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...], ...]:
+    """Every polygon by itself, and some of the pupil left."""
+    shapes = [np.array(outline, float)[None] for outline in outlines]
+    shapes = [shape if area(shape)[0] > 0.0 else shape[:, ::-1] for shape in shapes]
+    for k, one in enumerate(shapes):
+        for other in shapes[:k]:
+            if abs(area(intersect(one, *sides(other)))[0]) > _SMALLEST:
+                raise Problem("outlines overlap", "", "polygons that do not overlap")
+    turn = 2.0 * np.pi * np.arange(64) / 64
+    disk = np.stack([np.cos(turn), np.sin(turn)], axis=-1)[None]
+    if sum(float(area(intersect(shape, *sides(disk)))[0]) for shape in shapes) > 0.9 * np.pi:
+        raise Problem("the pupil is covered", "", "outlines that leave a tenth of it")
+    return outlines
+
+
 class LineImageSpec(Spec):
     """How a line forms and records its image.
 
@@ -45,6 +81,8 @@ class LineImageSpec(Spec):
         f_number: of the lens, whose pupil is round and evenly lit.
         transmission: of the lens, mean over the spectrum.
         wavefront: error by even Zernike terms (Noll, unit rms), metres.
+        obstruction: outlines of what stands before the lens, convex polygons that do not overlap, corners (along the
+            line, along the track) in units of the pupil's radius.
         spectrum: first and last wavelength, metres; the light is the Sun's between them.
         detector: data sheet, by name or path.
         diffusion: rms spread of charge between pixels, metres.
@@ -54,6 +92,7 @@ class LineImageSpec(Spec):
     f_number: Annotated[Number, Field(ge=1.0, le=100.0)]
     transmission: Annotated[Number, Field(gt=0.0, le=1.0)] = 0.8
     wavefront: Annotated[dict[EvenTerm, TermSize], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
+    obstruction: Annotated[tuple[Outline, ...], AfterValidator(_apart)] = ()
     spectrum: Spectrum
     detector: Reference
     diffusion: Diffusion = 0.0

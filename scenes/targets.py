@@ -23,7 +23,8 @@ class TargetsSpec(Spec):
     Attributes:
         angle: of the knife edge against the pixel columns or rows, radians.
         region: side of the recorded images, pixels.
-        white: signal of a wide bright area in each frame, as a share of the full well.
+        white: signal of a wide bright area in each frame, as a share of the full well, through a free pupil; what
+            bodies in the beam take is missing.
         frames: number of frames, None for as many as there are of the spots.
     """
 

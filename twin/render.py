@@ -114,7 +114,8 @@ def main(
     them.
 
     With `render: {quality: true}` wavefront errors, defocus and MTF on the line CCDs are worked out before and after;
-    quality.json has them.
+    quality.json has them. What prisms and other bodies take of the cameras' beams is missing in their pupils, here and
+    in the targets' images; `render: {obstruction: ignore}` leaves it out.
 
     With --picture the run folder also gets picture.png (the instrument), picture_prisms.png and
     picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba cannot, the rest of the

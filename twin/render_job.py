@@ -50,6 +50,9 @@ STRAY = "trace ghosts and stray light"
 TARGETS = "render the targets"
 """Another one."""
 
+FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
+"""Said where the job asks for it."""
+
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
 
@@ -131,7 +134,10 @@ def render_job(
     tables = crosstalk(experiment, _covariances(recovery))
     targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
     instrument = experiment.instrument
-    quality = image_quality(instrument, backend, [{}, state]) if resolved.job.render.quality else None
+    render = resolved.job.render
+    quality = None
+    if render.quality:
+        quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -152,6 +158,7 @@ def render_job(
             *(_in_the_way(stray) if stray is not None else ()),
             *(targets.warnings if targets is not None else ()),
             *(quality.warnings if quality is not None else ()),
+            *((FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
         ),
         course=series,
         stray=stray,

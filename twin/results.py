@@ -161,7 +161,12 @@ def quality_dict(quality: ImageQuality) -> dict[str, Any]:
         }
         for name, camera in quality.cameras.items()
     }
-    about = {"wavelength_nm": 1e9 * quality.wavelength, "fields": list(quality.fields), "mtf": light}
+    about = {
+        "obstruction": "traced" if quality.obstruction else "ignore",
+        "wavelength_nm": 1e9 * quality.wavelength,
+        "fields": list(quality.fields),
+        "mtf": light,
+    }
     return {**after, "before": before, **about}
 
 

@@ -13,6 +13,7 @@ from optics.tree import State
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from scenes.resolved import ResolvedJob, target_band
+from scenes.shadow import imaging_shadows
 from scenes.targets import TargetsSpec
 from twin.detector import FixedPattern
 from twin.edge_images import DIRECTIONS
@@ -104,7 +105,7 @@ def render_targets(
         TargetLostError: the perturbation moves the light off.
     """
     settings, images = resolved.targets, resolved.job.render.target_images
-    frames = settings.frames or 1
+    frames, obstructed = settings.frames or 1, resolved.job.render.obstructed
     total = len(instrument.cameras) * len(PLACES) * 2
     cameras, done = {}, 0
     for number, (name, model) in enumerate(instrument.cameras.items()):
@@ -112,7 +113,8 @@ def render_targets(
         band = target_band(resolved.cameras[reference])
         assert resolved.line_detectors is not None
         ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
-        path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend)
+        shadows = imaging_shadows(instrument, name, backend) if obstructed else None
+        path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend, shadows=shadows)
         camera = TargetCamera(path, ccd, settings.region)
         before = camera.views({})
         after = camera.views(state) if state else before
@@ -128,7 +130,7 @@ def render_targets(
             places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
         cameras[name] = CameraTargets(band, ccd.band.pitch, places)
     advance(done, total)
-    return TargetRun(cameras, frames)
+    return TargetRun(cameras, frames, obstructed)
 
 
 class _Shooter:
@@ -150,7 +152,7 @@ class _Shooter:
         bars: dict[str, BarReading] = {}
 
         def expose(name: str, share: np.ndarray) -> np.ndarray:
-            photons = view.ccd.white_photons(self.settings.white) * share
+            photons = view.ccd.white_photons(self.settings.white) * view.pupil.light * share
             frames[name] = view.ccd.expose(photons, view.column, self.pattern, self.count, seed.spawn(1)[0])
             return np.asarray(frames[name].mean(axis=0))
 
@@ -169,7 +171,7 @@ class _Shooter:
             expose("star", view.image(star_target(view.band.pitch, view.region)))
         if "pinhole" in self.images:
             expose("pinhole", view.image(pinhole_target(view.band.pitch)))
-        return TargetShots(frames, view.column, edges, bars)
+        return TargetShots(frames, view.column, edges, bars, 1.0 - view.pupil.light)
 
 
 def read_edge(view: View, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:

@@ -18,14 +18,15 @@ from optics.assembly import Assembly, points_to_world
 from optics.backend import Backend
 from optics.collimator import Collimator
 from optics.diffraction import PupilField
-from optics.imaging import aim_collimated, imaging_field
+from optics.imaging import aim_collimated, imaging_rays, pupil_field
 from optics.line_of_sight import chief_directions
 from optics.pupil_function import PupilFunction, fit_pupils
 from optics.system import SystemBatch, assemble
 from optics.trace import make_rays, require_some, trace
-from optics.tree import State
+from optics.tree import PlacedBodies, State
 from scenes.camera_assembly import line_body
 from scenes.camera_model import LAUNCH_DISTANCE, CameraModel
+from scenes.shadow import ImagingShadows
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
@@ -74,6 +75,7 @@ class TargetPath:
         model: its derived numbers.
         backend: where to trace.
         collimator: what it looks into; None for a far scene.
+        shadows: what stands in its beams; None for a camera alone, or to ignore it.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class TargetPath:
         model: CameraModel,
         backend: Backend,
         collimator: Collimator | None = None,
+        shadows: ImagingShadows | None = None,
     ) -> None:
         self.assembly = assembly
         self.name = name
@@ -91,6 +94,7 @@ class TargetPath:
         self.model = model
         self.backend = backend
         self.collimator = collimator
+        self.shadows = shadows
         stop = assembly.elements[f"{name}/{model.spec.stop}"].aperture
         assert isinstance(stop, Circle)
         self.stop = stop
@@ -154,10 +158,12 @@ class TargetPath:
             BeamMissedError, AimError: the beam does not get through.
             ValueError: it is vignetted.
         """
-        systems, to_stop = self._systems(state, len(directions))
+        placed = self.assembly.place([state])
+        systems, to_stop = self._systems(state, len(directions), placed)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
-        field = imaging_field(
+        # the collimator's own axes: the first along the line, the second along the flight direction
+        rays = imaging_rays(
             self.backend,
             systems,
             to_stop,
@@ -165,14 +171,18 @@ class TargetPath:
             self._launch(directions),
             self.stop,
             self.nodes,
-            self.model.spec.wavelength,
-            origin,
-            None if collimator is None else lambda point: collimator.path(point, target_shift),
-            # the collimator's own axes: the first along the line, the second along the flight direction
             self._axes[:, 1],
         )
+        incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
+        field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        return fit_pupils(turned.in_lengths_of(systems.size), self.nodes)
+        taken = None
+        if self.shadows is not None:
+            owner = np.zeros(len(directions), dtype=int)
+            chain = self.assembly.sequences[f"{self.name}/imaging"]
+            cast = self.shadows.cast(self.assembly, placed, owner, systems, chain, rays, directions, self.nodes)
+            taken = cast.pieces
+        return fit_pupils(turned.in_lengths_of(systems.size), self.nodes, shadows=taken)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
@@ -204,9 +214,9 @@ class TargetPath:
     def _stop_centre(self) -> np.ndarray:
         return np.array(self.stop.centre)[None]
 
-    def _systems(self, state: State, count: int) -> tuple[SystemBatch, SystemBatch]:
+    def _systems(self, state: State, count: int, placed: PlacedBodies | None = None) -> tuple[SystemBatch, SystemBatch]:
         """The way to the line CCD and the way to the stop, once for every direction."""
-        placed = self.assembly.place([state])
+        placed = self.assembly.place([state]) if placed is None else placed
         every = np.zeros(count, dtype=int)
         systems, to_stop = (
             assemble(self.assembly, [f"{self.name}/{way}"], [state], placed=placed).take(every)

@@ -73,12 +73,14 @@ class TargetShots:
         frames: name of the image -> grey values, uint16 (N, H, W).
         column: of the windows' first pixels on the line.
         edges, bars: direction -> reading; empty if not rendered.
+        light_lost: share of the light that bodies in the beam take.
     """
 
     frames: Mapping[str, np.ndarray]
     column: int
     edges: Mapping[str, EdgeReading]
     bars: Mapping[str, BarReading]
+    light_lost: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +126,12 @@ class TargetRun:
     Attributes:
         cameras: by name.
         frames: of each image.
+        obstruction: whether what stands in the beams is missing in the pupils.
     """
 
     cameras: Mapping[str, CameraTargets]
     frames: int
+    obstruction: bool = True
 
     def images(self) -> Iterator[tuple[str, str, np.ndarray]]:
         """Stem of its file, name of the image, and the frames (N, H, W) of every image."""
@@ -170,7 +174,8 @@ class TargetRun:
                 where = {"along_mm": along, "across_mm": across, "columns": columns}
                 places[place] = {**where, **_directions(targets, _measured)}
                 shift = dict(zip(("along", "across"), (1e6 * targets.shift + 0.0).tolist(), strict=True))
-                true_places[place] = {"image_shift_um": shift, **_directions(targets, _true)}
+                lost = {when: shots.light_lost for when, shots in targets.shots.items()}
+                true_places[place] = {"image_shift_um": shift, "light_lost": lost, **_directions(targets, _true)}
             cameras[name] = {
                 "band": camera.band,
                 "pixel_um": 1e6 * camera.pitch,
@@ -178,7 +183,8 @@ class TargetRun:
                 "places": places,
             }
             truth[name] = {"places": true_places}
-        return {"frames": self.frames, "cameras": cameras, "truth": {"cameras": truth}}
+        about = {"frames": self.frames, "obstruction": "traced" if self.obstruction else "ignore"}
+        return {**about, "cameras": cameras, "truth": {"cameras": truth}}
 
 
 def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:

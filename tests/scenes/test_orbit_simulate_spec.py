@@ -89,6 +89,39 @@ def test_an_odd_wavefront_term(tmp_path: Path) -> None:
         resolve_simulate(write(tmp_path, SMALL.replace("th1", "own.yaml")))
 
 
+@pytest.mark.parametrize(
+    ("outlines", "said"),
+    [
+        ("[[[0, 0], [1, 0], [0.2, 0.2], [0, 1]]]", "convex"),
+        ("[[[0, 0], [1, 0]]]", "convex"),
+        ("[[[0, 0], [1, 0], [0, 1]], [[0.1, 0.1], [1, 0.1], [0.1, 1]]]", "overlap"),
+        ("[[[-2, -2], [2, -2], [2, 2], [-2, 2]]]", "covered"),
+    ],
+)
+def test_outlines_before_a_lens(outlines: str, said: str, tmp_path: Path) -> None:
+    text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8")
+    text = text.replace("  f_number: 6\n", f"  f_number: 6\n  obstruction: {outlines}\n")
+    (tmp_path / "own.yaml").write_text(text, "utf-8")
+    with pytest.raises(InputError, match=said):
+        resolve_simulate(write(tmp_path, SMALL.replace("th1", "own.yaml")))
+
+
+def test_an_outline_before_a_lens_comes_through_config_yaml(tmp_path: Path) -> None:
+    text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8")
+    good = "[[[-0.6, 0.6], [-0.2, 0.6], [-0.2, 1.1], [-0.6, 1.1]]]"
+    text = text.replace("  f_number: 6\n", f"  f_number: 6\n  obstruction: {good}\n")
+    (tmp_path / "own.yaml").write_text(text, "utf-8")
+    setup = resolve_simulate(write(tmp_path, SMALL.replace("th1", "own.yaml")))
+    image = setup.camera.image_of("nadir")
+    assert image is not None
+    assert image.obstruction[0][0] == (-0.6, 0.6)
+    config = tmp_path / "config.yaml"
+    config.write_text(setup.to_yaml(), "utf-8")
+    again = resolve_simulate(config).camera.image_of("nadir")
+    assert again is not None
+    assert again.obstruction == image.obstruction
+
+
 def test_a_camera_without_images(tmp_path: Path) -> None:
     text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8")
     first, last = text.index("image:"), text.index("lines:\n")

@@ -1,6 +1,7 @@
 """Image quality of perturbed states in a batch, against single traces, batoid and one pupil's transfer function."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ from scenes.camera_model import LAUNCH_DISTANCE
 from scenes.load import LIBRARY, load_detector
 from scenes.resolved import resolve
 from tests.twin.commands import invoke
-from twin.image_quality import FIELDS, image_quality, quality_dicts
+from twin.image_quality import FIELDS, quality_dicts
+from twin.image_quality import image_quality as quality_of
 from twin.line_ccd import LineCcd, band_wavelengths
 from twin.study.base_job import Run
 from twin.study.render_base import RenderBase
@@ -41,6 +43,8 @@ MOVED = {
 # the whole camera turns: the image of a fixed direction moves by 3 mm, but not that of a pixel
 TURNED = {ROOT: Motion(rotate=(100 * ARCSEC, -50 * ARCSEC, 30 * ARCSEC))}
 STATES = [{}, MOVED, TURNED]
+image_quality = partial(quality_of, obstruction=False)
+"""Of free pupils; tests/twin/test_obstruction.py has those with shadows."""
 LOST = {f"{ROOT}/M2": Motion(rotate=(0.08, 0.0, 0.0))}
 CUT = {f"{ROOT}/M3": Motion(shift=(0.0, 25e-3, 0.0))}
 
@@ -302,7 +306,7 @@ def test_a_job_and_a_study_with_image_quality(folder, backend) -> None:
     after, before = (part["cameras"]["one"] for part in (written, written["before"]))
     assert set(after) == {
         "wfe_rms_waves", "wfe_rms_waves_focus_removed", "wfe_worst_waves", "defocus_um", "mtf_along_line",
-        "mtf_along_track",
+        "mtf_along_track", "light_lost", "obstructed_by",
     }  # fmt: skip
     assert after["wfe_worst_waves"] >= after["wfe_rms_waves"] > 2.0 * before["wfe_rms_waves"]
     assert list(after["defocus_um"]) == ["left", "centre", "right"]

@@ -7,11 +7,12 @@ from scipy.special import erf
 from scipy.stats import chi2
 
 from analysis.mtf.slanted_edge import measure_edge
+from scenes.load import load_detector, load_three_line_camera
 from scenes.orbit_scene import ControlSpec, GroundSpec, TerrainSpec
-from tests.twin.pushbroom_bench import LINES, PLACE, Ground, lines, optics
+from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, optics
 from twin.orbit.ground.frame import GroundFrame
 from twin.orbit.ground.terrain import Terrain
-from twin.orbit.images.line_optics import ImageMotion
+from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.look_map import SteepTerrainError
 from twin.orbit.images.patch import PatchError, fly_patch, window_of
 from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
@@ -182,6 +183,36 @@ def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: s
     expected = one.optics.transfer(f * along, f * across, done.motion) * own
     assert np.abs(edge.mtf - np.abs(expected)).max() < 0.01
     assert edge.mtf[-1] < 0.35
+
+
+def test_what_stands_before_the_lens_takes_light_and_contrast() -> None:
+    """A bar across the middle of the pupil: its area is known, and so is its transfer function along its length."""
+    payload = load_three_line_camera("th1")
+    bar = ((-1.5, -0.1), (1.5, -0.1), (1.5, 0.1), (-1.5, 0.1))
+    image = payload.image_of("nadir").model_copy(update={"obstruction": (bar,)})
+    sheet = load_detector("th1_line")
+    free = optics()["nadir"]
+    cut = LineOptics.from_specs(image, 12000, 6.5e-6, LINE_TIME, sheet)
+    # a strip of half width a of the unit disk: 2 (a sqrt(1 - a^2) + asin a)
+    share = 2.0 * (0.1 * np.sqrt(0.99) + np.arcsin(0.1)) / np.pi
+    assert cut.photons_per_reflectance / free.photons_per_reflectance == pytest.approx(1.0 - share, rel=2e-5)
+    motion = ImageMotion(1.0, 0.0)
+    zero, half = np.zeros(1), np.array([0.5])
+    assert cut.transfer(zero, zero, motion)[0] == pytest.approx(1.0, abs=1e-4)
+    along = np.abs(cut.transfer(half, zero, motion)) / np.abs(free.transfer(half, zero, motion))
+    assert abs(along[0] - 1.0) > 0.005
+    kernel = cut.kernel(2, 12, motion)
+    assert kernel.sum() == pytest.approx(1.0)
+    # an even shadow in an even pupil has an even image, and its centroid lies in the middle
+    np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-5 * kernel.max())
+    # one beside the middle has not, but its centroid still does
+    beside = ((0.3, 0.3), (0.8, 0.3), (0.8, 0.6), (0.3, 0.6))
+    image = image.model_copy(update={"obstruction": (beside,)})
+    low = 1e-3 * np.ones(1)
+    other = LineOptics.from_specs(image, 12000, 6.5e-6, LINE_TIME, sheet)
+    assert np.iscomplexobj(other.transfer(half, zero, motion))
+    for place in ((low, zero), (zero, low)):
+        assert abs(np.angle(other.transfer(*place, motion)[0])) / (2.0 * np.pi * low[0]) < 1e-4  # pixels
 
 
 def test_motion_of_an_oblique_image() -> None:

@@ -55,16 +55,18 @@ def mtf(folder):
     return json.loads((folder / "run" / "mtf.json").read_text())
 
 
-def test_files(folder):
+def test_files(folder, mtf):
     found = files(folder / "run")
     assert {f"{image}.tiff" for image in IMAGES} | {f"{image}.png" for image in IMAGES} | {"mtf.json"} <= found
     assert {"images/one_left_before.tiff", "recovered.json"} <= found  # the spots are always rendered
     pages = tifffile.imread(folder / "run" / "images" / "one_left_knife_edge_track_after.tiff")
     assert pages.dtype == np.uint16
     assert pages.shape == (FRAMES, REGION, REGION)
-    # dark above, white at 60% of the well below: 0.6 x 16000 DN on the black level of 100 DN
+    # dark above, white at 60% of the well below, less what the prisms take: 0.6 x 16000 DN on the black level of 100 DN
+    lost = mtf["truth"]["cameras"]["one"]["places"]["left"]["light_lost"]["after"]
+    assert 0.05 < lost < 0.06
     assert pages[:, :30].max() < 300
-    assert pages[:, -30:].mean() == pytest.approx(9700.0, rel=0.01)
+    assert pages[:, -30:].mean() == pytest.approx(9600.0 * (1.0 - lost) + 100.0, rel=0.002)
 
 
 def test_measured_agrees_with_truth(mtf):
@@ -85,7 +87,8 @@ def test_measured_agrees_with_truth(mtf):
                 assert found["curve"]["frequency_per_mm"] == true["curve"]["frequency_per_mm"]
                 assert found["curve"]["frequency_per_mm"][32] == pytest.approx(1.0 / 14e-3, rel=1e-12)
                 assert found["curve"]["mtf"][32] == pytest.approx(found["mtf_nyquist"], rel=1e-9)
-                assert true["curve"]["mtf"][0] == pytest.approx(1.0, abs=1e-9)
+                # the light in a shadow, by numbers of nodes that are not the same
+                assert true["curve"]["mtf"][0] == pytest.approx(1.0, abs=1e-7)
             drop = [truth["places"][place][direction][when]["mtf_nyquist"] for when in STATES]
             assert drop[1] < 0.95 * drop[0]  # 30 um of M2 defocus the camera
 
@@ -162,7 +165,9 @@ def test_jobs_without_targets_are_as_before(gf7_pair):
 @pytest.mark.slow  # 8 s
 def test_what_cannot_be_measured_is_said(folder, tmp_path):
     """White beyond the well's linear range: no MTF, a warning that says why, and the rest of the run is kept."""
-    text = (folder / "job.yaml").read_text().replace("frames: 4", "frames: 4, white: 100 percent")
+    text = (
+        (folder / "job.yaml").read_text().replace("frames: 4}", "frames: 4, white: 100 percent}, obstruction: ignore")
+    )
     (tmp_path / "single.yaml").write_text((folder / "single.yaml").read_text())
     (tmp_path / "job.yaml").write_text(text)
     done = run(tmp_path / "job.yaml", "--out", tmp_path / "run", "--json")

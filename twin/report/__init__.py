@@ -21,6 +21,7 @@ from twin.report import (
 from twin.report.course_figure import parameters_svg, temperatures_svg
 from twin.report.light_path_figure import footprints_svg, side_view_svg
 from twin.report.numbers import FAR
+from twin.report.pupil_figure import pupils_svg
 from twin.report.residual_figure import residuals_svg
 from twin.report.spots_figure import spots_svg
 from twin.report.target_figure import curves_svg, images_svg
@@ -62,6 +63,8 @@ def render_report(run: RenderRun) -> str:
         figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}
         if run.targets.has_edges:
             figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
+    if run.quality is not None and run.quality.obstruction:
+        figures["pupils"] = Markup(pupils_svg(run.quality))
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
     return template.render(

@@ -11,7 +11,7 @@ from twin.report.numbers import fixed, plain
 from twin.results import RenderRun
 
 WHEN = ("before", "after")
-WAVES, MICROMETRES, MTF = 4, 1, 4
+WAVES, MICROMETRES, MTF, PERCENT = 4, 1, 4, 2
 """Decimals."""
 
 
@@ -25,6 +25,8 @@ def quality_content(run: RenderRun) -> dict[str, Any] | None:
         "wavelength": plain(1e9 * quality.wavelength),
         "fields": len(quality.fields),
         "places": list(where),
+        "obstruction": quality.obstruction,
+        "bodies": {name: ", ".join(camera.bodies) or "nothing" for name, camera in quality.cameras.items()},
         "rows": [_camera(name, camera, where) for name, camera in quality.cameras.items()],
     }
 
@@ -36,6 +38,7 @@ def _camera(name: str, camera: CameraQuality, where: dict[str, int]) -> dict[str
         ("defocus_um", "best focus − line CCD [µm]", camera.defocus, 1e6, MICROMETRES),
         ("mtf_along_line", "MTF at Nyquist along the line", camera.mtf_along_line, 1.0, MTF),
         ("mtf_along_track", "MTF at Nyquist along the track", camera.mtf_along_track, 1.0, MTF),
+        ("light_lost", "light taken by bodies in the beam [%]", camera.light_lost, 1e2, PERCENT),
     ]
     rows = []
     for key, label, values, unit, decimals in lines:

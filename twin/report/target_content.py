@@ -25,6 +25,7 @@ def target_content(run: RenderRun) -> dict[str, Any] | None:
     return {
         "frames": run.targets.frames,
         "white": plain(100.0 * run.resolved.targets.white),
+        "obstruction": run.targets.obstruction,
         "edges": edges,
         "bars": bars,
         "kinds": kinds,

@@ -356,7 +356,7 @@ class _Traced:
         spots, sight = chain.spots(states), chain.sight(states)
         out = [chain.outcome(state, spots[s], sight[s]) for s, state in enumerate(states)]
         if rows is self.quality:
-            found = quality_dicts(chain.experiment.instrument, self.backend, states)
+            found = quality_dicts(chain.experiment.instrument, self.backend, states, jobs[0].job.render.obstructed)
             out = [{**one, "quality": quality} for one, quality in zip(out, found, strict=True)]
         return out
 

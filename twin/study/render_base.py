@@ -93,11 +93,14 @@ class RenderBase:
 
             for (k, _), outcome in zip(members, run_together(experiment, [w for _, w in members], before), strict=True):
                 out[k] = outcome
-            asked = [(k, work.state) for k, work in members if work.resolved.job.render.quality]
-            found = quality_dicts(experiment.instrument, backend, [state for _, state in asked])
-            for (k, _), quality in zip(asked, found, strict=True):
-                done = out[k]
-                out[k] = done if isinstance(done, Failure) else {**(done or {}), "quality": quality}
+            renders = [(k, work.state, work.resolved.job.render) for k, work in members]
+            asked = [(k, state, render.obstructed) for k, state, render in renders if render.quality]
+            for obstructed in (True, False):
+                part = [(k, state) for k, state, own in asked if own == obstructed]
+                found = quality_dicts(experiment.instrument, backend, [state for _, state in part], obstructed)
+                for (k, _), quality in zip(part, found, strict=True):
+                    done = out[k]
+                    out[k] = done if isinstance(done, Failure) else {**(done or {}), "quality": quality}
         return [outcome if outcome is not None else Failure("not done") for outcome in out]
 
     def _maker(self, tree: Tree) -> JobMaker:

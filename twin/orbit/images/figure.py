@@ -65,6 +65,11 @@ def transfer_svg(run: Simulation) -> str:
         return to_svg(_transfer_figure(run))
 
 
+def _modulus(values: np.ndarray) -> np.ndarray:
+    """Of complex values; real ones keep their sign."""
+    return np.abs(values) if np.iscomplexobj(values) else values
+
+
 def _transfer_figure(run: Simulation) -> Figure:
     figure = new_figure(3.4)
     panels = figure.subplots(1, 2, sharey=True)
@@ -75,8 +80,8 @@ def _transfer_figure(run: Simulation) -> Figure:
     for axes, direction, place in zip(panels, ("line", "track"), ((frequency, zero), (zero, frequency)), strict=True):
         for part, values in optics.factors(*place, image.motion).items():
             if np.ptp(values) > 1e-6:
-                axes.plot(frequency, values, color=_PARTS[part], lw=1.0, label=_NAMES[part])
-        axes.plot(frequency, optics.transfer(*place, image.motion), color=INK, lw=1.8, label="all")
+                axes.plot(frequency, _modulus(values), color=_PARTS[part], lw=1.0, label=_NAMES[part])
+        axes.plot(frequency, _modulus(optics.transfer(*place, image.motion)), color=INK, lw=1.8, label="all")
         step = "pixel" if direction == "line" else "line"
         axes.set(title=f"Along the {direction}, {name}", xlabel=f"cycles per {step}", ylim=(0.0, 1.03), xlim=(0.0, 0.5))
         axes.legend(loc="lower left")

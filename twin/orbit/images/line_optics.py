@@ -11,7 +11,7 @@ the track) an image sampled at lines and pixels thus has
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,9 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import constants, fft
 
+from optics.convex_polygon import area
 from optics.pupil_function import PupilFunction, circular_pupil
+from optics.pupil_shadow import PupilShadow, separate
 from optics.transfer import TransferTable
 from optics.zernike import cartesian_terms
 from scenes.band import BandSpec
@@ -111,12 +113,14 @@ class LineOptics:
             tdi=image.tdi.model_copy(update={"line_time": line_time}),
         )
         pupil = circular_pupil(image.f_number, _eikonal({int(k[1:]): v for k, v in image.wavefront.items()}))
+        if image.obstruction:
+            pupil = replace(pupil, shadow=_shadow(image.obstruction, pupil.edge.harmonics))
         return cls(LineCcd.from_specs(band, sheet), pupil, image.f_number, image.transmission)
 
     @property
     def photons_per_reflectance(self) -> float:
         """Photons on a pixel over all stages from ground of apparent reflectance 1: the Sun as a black body at 1 au, a
-        Lambertian ground, and pi/(4 F^2) of its radiance on the pixel.
+        Lambertian ground, and pi/(4 F^2) of its radiance on the pixel, less what stands before the lens.
         """
         first, last = self.ccd.band.spectrum
         wavelength, weight = band_wavelengths(self.ccd.band)
@@ -124,11 +128,13 @@ class LineOptics:
         band = float(weight @ radiance) * (last - first)
         tdi, pitch = self.ccd.band.tdi, self.ccd.band.pitch
         seconds = tdi.stages * tdi.open_share * tdi.line_time
-        return band * np.pi / (4.0 * self.f_number**2) * self.transmission * pitch**2 * seconds
+        solid_angle = np.pi / (4.0 * self.f_number**2) * self.pupil.light
+        return band * solid_angle * self.transmission * pitch**2 * seconds
 
     def transfer(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> np.ndarray:
-        """Real transfer function at frequencies along the line, cycles/pixel, and along the track, cycles/line; shapes
-        that broadcast. The pupil is even, so that there is no phase.
+        """Transfer function at frequencies along the line, cycles/pixel, and along the track, cycles/line; shapes that
+        broadcast. It is real, since the pupil is even, but for what stands before the lens; a point is imaged where the
+        centroid of its image lies.
         """
         out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(pixel), np.shape(line)))
         for factor in self.factors(pixel, line, motion).values():
@@ -147,7 +153,7 @@ class LineOptics:
         tdi = band.tdi
         slip = (line + (1.0 + tdi.rate_error) * band.pitch * fy) / tdi.phases
         return {
-            "lens": np.asarray(self._table(fx, fy).real),
+            "lens": self._lens(fx, fy),
             "pixel": from_ccd["pixel"],
             "diffusion": from_ccd["diffusion"],
             "step": np.sinc(tdi.open_share / tdi.phases * line),
@@ -173,10 +179,24 @@ class LineOptics:
         spread = values[cut, cut] * fade[:, None] * fade
         return np.asarray(spread / spread.sum())
 
+    def _lens(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+        values = self._table(fx, fy)
+        if self.pupil.shadow is None:
+            return np.asarray(values.real)
+        x, y = self._table.centroid
+        return np.asarray(values * np.exp(2j * np.pi * (fx * x + fy * y)))
+
     @cached_property
     def _table(self) -> TransferTable:
         wavelength, weight = band_wavelengths(self.ccd.band)
         return TransferTable.build(self.pupil, wavelength, weight * _black_body_photons(wavelength))
+
+
+def _shadow(outlines: tuple[tuple[tuple[float, float], ...], ...], harmonics: np.ndarray) -> PupilShadow:
+    """Shadow of outlines, in units of the pupil's radius, on one pupil."""
+    shapes = [np.array(outline, float)[None] for outline in outlines]
+    pieces, _ = separate([s if area(s)[0] > 0.0 else s[:, ::-1] for s in shapes])
+    return PupilShadow.within(pieces, harmonics[:, None])
 
 
 def _eikonal(terms: dict[int, float]) -> np.ndarray | None:

@@ -269,7 +269,7 @@ def _recorded(
     points = one.sensor.ground(line + np.array([-0.5, 0.5, 0.0, 0.0]), pixel + np.array([0.0, 0.0, -0.5, 0.5]), height)
     sample = float(np.linalg.norm(points[3] - points[2])), float(np.linalg.norm(points[1] - points[0]))
     half = np.array([0.5, 0.0])
-    along, across = one.optics.transfer(half, half[::-1], done.motion)
+    along, across = np.abs(one.optics.transfer(half, half[::-1], done.motion))
     return LineImage(
         frame,
         window,

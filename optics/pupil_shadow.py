@@ -1,0 +1,342 @@
+"""Shadows of bodies in exit pupils: which parts of the overlap of a pupil with itself they take.
+
+A shadow is some convex polygons in the normalised pupil plane. With P the clear pupil and S the shadow, the overlap of
+the cut pupil P - S with itself, shifted by -s/2 and +s/2, is that of P less S - s/2 and S + s/2; what both take counts
+once. All of these are intersections of convex regions, and the integrand is smooth in each of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from optics.convex_polygon import (
+    area,
+    clip,
+    compact,
+    difference,
+    from_boundary,
+    gauss,
+    intersect,
+    quadrature,
+    sides,
+    widened,
+)
+from optics.pupil_edge import PupilEdge
+
+RIM_SIDES = 256
+"""Of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of it
+takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
+
+FEW_SIDES = 64
+"""The same for many pupils at once: 16 times the errors."""
+
+LARGEST = 0.5
+"""Size of a piece, in radii of the pupil: a wavefront is continued from a piece to its box, the corners of which may
+lie outside of the pupil."""
+
+_ITERATIONS = 3
+"""For crossings with an edge that is nearly a circle: each step leaves an error smaller by the edge's harmonics."""
+
+_TURNED = 1e-12
+"""Angle of an arc, radians, below which it is none but for rounding."""
+
+SMALLEST = 1e-9
+"""Area of a piece, of a pupil of radius 1, below which it is nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PupilShadow:
+    """Shadows in B pupils.
+
+    Attributes:
+        pieces: convex polygons that do not overlap, in the pupil, (B, K, V, 2), counterclockwise; some are empty.
+        radius: of the pupils' edges as Fourier terms over the angle about p = 0, complex, (B, H).
+    """
+
+    pieces: np.ndarray
+    radius: np.ndarray
+
+    @classmethod
+    def within(cls, polygons: np.ndarray, harmonics: np.ndarray, rim_sides: int = RIM_SIDES) -> PupilShadow:
+        """What polygons (B, K, V, 2), which do not overlap, take of pupils with edges of ``harmonics`` (2H + 1, B)."""
+        radius = _radius_terms(harmonics)
+        count, number = polygons.shape[:2]
+        flat = polygons.reshape(count * number, *polygons.shape[2:])
+        flat = np.where((area(flat) < 0.0)[:, None, None], flat[:, ::-1], flat)
+        flat = compact(_cut(flat, np.repeat(radius, number, axis=0), rim_sides))
+        return cls(_tiled(flat.reshape(count, number, *flat.shape[1:])), radius)
+
+    @property
+    def area(self) -> np.ndarray:
+        """Of each pupil's shadow, (B,), in p."""
+        return np.asarray(np.sum(area(self.pieces), axis=-1))
+
+    @cached_property
+    def least_nodes(self) -> int:
+        """Nodes on each side of a region's box for the wavefronts of cameras near their focus; in corners of the box a
+        wavefront is continued beyond the pupil. With those that the phase needs (``optics.transfer.nodes_for``) the
+        transfer function is right to 1e-5, with 0.06 waves of spherical aberration and astigmatism too.
+        """
+        return 1 + int(np.ceil(8.0 * float(np.max(np.ptp(self.pieces, axis=-2), initial=0.0))))
+
+    def take(self, which: np.ndarray) -> PupilShadow:
+        """Those of the given pupils."""
+        return PupilShadow(self.pieces[which], self.radius[which])
+
+    def whole(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Quadrature over the shadows: points (B, Q), complex, and weights of the area."""
+        pupils = len(self.pieces)
+        points, weights = quadrature(self.pieces.reshape(-1, *self.pieces.shape[2:]), count)
+        return points.reshape(pupils, -1), weights.reshape(pupils, -1)
+
+    def overlap(self, which: np.ndarray, shift: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Quadrature over what the shadows take of the overlap of pupils shifted by -s/2 and +s/2.
+
+        Args:
+            which: pupils, (S,).
+            shift: s of each, complex, (S,).
+            count: nodes along each side of a region's bounding box.
+
+        Returns:
+            Points c, complex, (S, Q), and weights of the area, negative where light is taken once and positive where
+            two shadows have taken it twice: to be added to ``PupilEdge.overlap``.
+        """
+        rows, number = len(which), self.pieces.shape[1]
+        moves = np.stack([shift.real, shift.imag], axis=-1)
+        row, slot = (i.ravel() for i in np.indices((rows, number)))
+        full = (area(self.pieces) > SMALLEST)[which[row], slot]
+        row, slot = row[full], slot[full]
+        own = self.pieces[which[row], slot]
+        whole = quadrature(self.pieces.reshape(-1, *self.pieces.shape[2:]), count)
+        whole = tuple(part.reshape(*self.pieces.shape[:2], -1)[which[row], slot] for part in whole)
+        points, weights, owners = [], [], []
+        for sign in (1.0, -1.0):
+            # c + sign s/2 lies in the shadow and c - sign s/2 in the pupil: the shadow within the pupil moved by sign s
+            move = sign * moves[row]
+            found, at, weight = _within(own - move[:, None], self.radius[which[row]], whole, move)
+            points.append(at - 0.5 * sign * shift[row[found], None])
+            weights.append(-weight)
+            owners.append(row[found])
+        for other in range(number):
+            found, at, weight = _shared(own, self.pieces[which[row], other] + moves[row, None], count)
+            points.append(at - 0.5 * shift[row[found], None])
+            weights.append(weight)
+            owners.append(row[found])
+        return _in_rows(np.concatenate(owners), np.concatenate(points), np.concatenate(weights), rows)
+
+
+def separate(polygons: list[np.ndarray]) -> tuple[np.ndarray, list[int]]:
+    """Pieces that do not overlap.
+
+    Args:
+        polygons: convex, counterclockwise, (B, V, 2) each.
+
+    Returns:
+        Pieces (B, K, W, 2), and of which polygon each is; what several share belongs to the first.
+    """
+    done: list[np.ndarray] = []
+    owners: list[int] = []
+    for number, polygon in enumerate(polygons):
+        parts = [polygon]
+        for before in done:
+            parts = [rest for part in parts for rest in _without(part, before)]
+        done += parts
+        owners += [number] * len(parts)
+    width = max((part.shape[1] for part in done), default=3)
+    pieces = np.stack([widened(part, width) for part in done], axis=1) if done else np.zeros((0, 0, 3, 2))
+    return pieces, owners
+
+
+def _without(part: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
+    """Pieces of ``part`` outside of ``before``; itself if they do not meet in any of the pupils."""
+    empty = area(before) < SMALLEST
+    if np.all(empty | (area(intersect(part, *sides(before))) < SMALLEST)):
+        return [part]
+    whole = np.where(empty[:, None, None], part, part[:, :1])  # an empty polygon has no sides that could bound it
+    return [piece for piece in (whole, *difference(part, before)) if np.any(area(piece) > SMALLEST)]
+
+
+def _tiled(pieces: np.ndarray) -> np.ndarray:
+    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y."""
+    for axis in (0, 1):
+        done = []
+        for piece in np.moveaxis(pieces, 1, 0):
+            low = piece[..., axis].min(axis=1)
+            size = piece[..., axis].max(axis=1) - low
+            parts = max(int(np.ceil(np.max(size, initial=0.0) / LARGEST)), 1)
+            normal = np.zeros((len(piece), 2))
+            normal[:, axis] = 1.0
+            for k in range(1, parts):
+                limit = low + size * (k / parts)
+                done.append(clip(piece, normal, limit))
+                piece = clip(piece, -normal, -limit)
+            done.append(piece)
+        width = max((part.shape[1] for part in done), default=pieces.shape[2])
+        if done:
+            pieces = np.stack([widened(part, width) for part in done], axis=1)
+    return pieces
+
+
+def _radius_terms(harmonics: np.ndarray) -> np.ndarray:
+    """Fourier terms c of the radius Re sum c_k exp(ik angle) of edges with ``harmonics`` (2H + 1, B), (B, K)."""
+    count = 4 * len(harmonics)
+    angle = np.broadcast_to(2.0 * np.pi * np.arange(count) / count, (harmonics.shape[1], count))
+    edge, at = PupilEdge(harmonics), angle
+    for _ in range(2 * _ITERATIONS):
+        point = edge.boundary(at)[0]
+        at = at - np.angle(point * np.exp(-1j * angle))
+    terms = np.fft.rfft(np.abs(edge.boundary(at)[0]), axis=-1)[:, : len(harmonics)] / count
+    terms[:, 1:] *= 2.0
+    some = np.flatnonzero(np.max(np.abs(terms), axis=0) > _TURNED)
+    return np.asarray(terms[:, : some[-1] + 1])
+
+
+def _radius(terms: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Radius (N, ...) of edges with ``terms`` (N, K) in directions exp(i angle), (N, ...)."""
+    over = (slice(None),) + (None,) * (turn.ndim - 1)
+    total = np.zeros_like(turn)
+    for k in range(terms.shape[1] - 1, 0, -1):
+        total = (total + terms[:, k][over]) * turn
+    return np.asarray(total.real + terms[:, 0].real[over])
+
+
+def _cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
+    """The part of each polygon (N, V, 2) inside of an edge, for which a polygon of the same area stands."""
+    beyond = np.flatnonzero(np.any(np.hypot(polygons[..., 0], polygons[..., 1]) > _least(radius)[:, None], axis=-1))
+    if not len(beyond):
+        return polygons
+    step = 2.0 * np.pi / rim_sides
+    turn = np.broadcast_to(np.exp(1j * step * np.arange(rim_sides)), (len(beyond), rim_sides))
+    rim = turn * _radius(radius[beyond], turn) * np.sqrt(step / np.sin(step))
+    cut = intersect(polygons[beyond], *sides(np.stack([rim.real, rim.imag], axis=-1)))
+    out = widened(polygons, cut.shape[1]).copy()
+    out[beyond] = widened(cut, out.shape[1])
+    return out
+
+
+def _least(radius: np.ndarray) -> np.ndarray:
+    """A bound below each edge's radius, (N,)."""
+    return np.asarray(np.abs(radius[:, 0]) - np.sum(np.abs(radius[:, 1:]), axis=-1))
+
+
+def _within(
+    polygons: np.ndarray, radius: np.ndarray, whole: tuple[np.ndarray, np.ndarray], move: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Quadrature over the part of each polygon (N, V, 2) inside of an edge with Fourier terms ``radius`` (N, K).
+
+    Args:
+        polygons: as seen from the edge's middle.
+        radius: of the edges.
+        whole: quadrature over the polygons where they stand, points and weights, (N, Q) each.
+        move: of the edge's middle from there, (N, 2).
+
+    Returns:
+        Which polygons have such a part, (F,), points where they stand (F, Q) and weights (F, Q).
+    """
+    least = _least(radius)
+    reach = 2.0 * np.abs(radius[:, 0]) - least
+    centre = np.mean(polygons, axis=1)
+    size = np.sqrt(np.max(np.sum((polygons - centre[:, None]) ** 2, axis=-1), axis=-1))
+    inside = np.max(np.sum(polygons**2, axis=-1), axis=-1) < least**2
+    crossed = ~inside & (np.hypot(*centre.T) - size < reach)
+    full, part = np.flatnonzero(inside), np.flatnonzero(crossed)
+    points, weights = (array[full] for array in whole)
+    if not len(part):
+        return full, points, weights
+    count = int(np.sqrt(whole[0].shape[1]))
+    more, other = _drawn_in(polygons[part], radius[part], count)
+    more = more + (move[part, 0] + 1j * move[part, 1])[:, None]
+    return np.concatenate([full, part]), np.concatenate([points, more]), np.concatenate([weights, other])
+
+
+def _drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrature over the intersection of polygons with the inside of edges.
+
+    Whatever of a polygon's boundary lies outside of the edge is drawn in along the radius. That changes no winding
+    number of a point inside of the edge, so that the new boundary goes once around the intersection and around nothing
+    else. Each side becomes an arc, a straight piece and an arc; most of them are of no length.
+    """
+    start = polygons[..., 0] + 1j * polygons[..., 1]
+    after = np.roll(start, -1, axis=1)
+    way = after - start
+    length = np.abs(way)
+    unit = way / np.where(length > 0.0, length, 1.0)
+    nearest = -(start * np.conj(unit)).real  # of the whole line, as a distance from the start
+    foot = start + nearest * unit
+    off = np.abs(foot) ** 2
+    ends = []
+    for sign in (-1.0, 1.0):
+        size = radius[:, :1].real
+        for _ in range(_ITERATIONS):
+            half = np.sqrt(np.maximum(size**2 - off, 0.0))
+            size = _radius(radius, _direction(foot + sign * half * unit))
+        ends.append(np.clip(nearest + sign * np.sqrt(np.maximum(size**2 - off, 0.0)), 0.0, length))
+    enter, leave = (start + end * unit for end in ends)
+    node, weight = gauss(count + 1)
+    share = 0.5 * (node + 1.0)
+    first, last = _some(np.stack([enter, leave]), ends[1] - ends[0] > _TURNED)
+    place = first[..., None] + (last - first)[..., None] * share
+    rise = 0.5 * weight * (last - first).imag[..., None]
+    high = np.maximum(first.real, last.real) + 1j * np.maximum(first.imag, last.imag)
+    low = np.minimum(first.real, last.real) + 1j * np.minimum(first.imag, last.imag)
+    outside = np.concatenate([ends[0] > _TURNED, length - ends[1] > _TURNED], axis=1)
+    pairs = np.stack([np.concatenate([start, leave], axis=1), np.concatenate([enter, after], axis=1)])
+    begin, end = _some(pairs, outside)
+    angle = np.angle(end * np.conj(begin))
+    turn = _direction(begin)[..., None] * np.exp(1j * angle[..., None] * share)
+    size, slope = _radius_and_slope(radius, turn)
+    arc = turn * size
+    arc_rise = 0.5 * weight * angle[..., None] * (turn * (slope + 1j * size)).imag
+    rows = len(polygons)
+    every = np.concatenate([place.reshape(rows, -1), arc.reshape(rows, -1)], axis=1)
+    rises = np.concatenate([rise.reshape(rows, -1), arc_rise.reshape(rows, -1)], axis=1)
+    used = np.where(rises != 0.0, every, first[:, :1])
+    corners = np.concatenate([used, low, high], axis=1)
+    low, high = (np.stack([f(corners.real, axis=1), f(corners.imag, axis=1)], axis=-1) for f in (np.min, np.max))
+    return from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+
+
+def _some(pairs: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Those of pairs of points (2, N, V) that are kept, (N, V), as (2, N, W); others begin and end at one place."""
+    many = np.sum(kept, axis=1)
+    width = max(int(np.max(many, initial=0)), 1)
+    order = np.argsort(~kept, axis=1, kind="stable")[:, :width]
+    first, last = (np.take_along_axis(points, order, axis=1) for points in pairs)
+    return np.stack([first, np.where(np.arange(width) < many[:, None], last, first)])
+
+
+def _direction(point: np.ndarray) -> np.ndarray:
+    size = np.abs(point)
+    return np.asarray(np.where(size > 0.0, point, 1.0) / np.where(size > 0.0, size, 1.0))
+
+
+def _radius_and_slope(terms: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Radius and its derivative by the angle, as ``_radius``."""
+    over = (slice(None),) + (None,) * (turn.ndim - 1)
+    total, slope = np.zeros_like(turn), np.zeros_like(turn)
+    for k in range(terms.shape[1] - 1, 0, -1):
+        slope = slope * turn + (1j * k) * terms[:, k][over]
+        total = (total + terms[:, k][over]) * turn
+    return total.real + terms[:, 0].real[over], (slope * turn).real
+
+
+def _shared(polygons: np.ndarray, others: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Quadrature over the intersections of pairs of polygons (N, V, 2); returns as ``_within``."""
+    apart = (polygons.max(axis=1) <= others.min(axis=1)) | (others.max(axis=1) <= polygons.min(axis=1))
+    found = np.flatnonzero(~np.any(apart, axis=-1) & (area(others) > SMALLEST))
+    return found, *quadrature(intersect(polygons[found], *sides(others[found])), count)
+
+
+def _in_rows(owner: np.ndarray, points: np.ndarray, weights: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """The nodes (F, Q) of every row (F,), in rows of equal length."""
+    order = np.argsort(owner, kind="stable")
+    owner, count = owner[order], points.shape[1]
+    many = np.bincount(owner, minlength=rows)
+    place = np.arange(len(owner)) - np.repeat(np.cumsum(many) - many, many)
+    most = int(np.max(many, initial=0))
+    all_points, all_weights = np.zeros((rows, most, count), complex), np.zeros((rows, most, count))
+    all_points[owner, place], all_weights[owner, place] = points[order], weights[order]
+    return all_points.reshape(rows, -1), all_weights.reshape(rows, -1)

@@ -1,0 +1,355 @@
+"""Shadows that bodies of an instrument throw into the pupils of its cameras: prisms, baffles, parts of other cameras.
+
+A convex body takes from a beam the rays that go through it; over the stop these fill the convex outline of its corners,
+each of them at the ray that passes through it, with straight sides (on the stop they bend by the aberrations of the
+pupil, some 1e-4 of its radius). The bodies stand where the state puts them, with the shape they have as designed. A
+camera's own mirrors and board throw no shadow into its beam, as its prescription gives them no substrates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from optics.aim import transverse_axes
+from optics.aperture import Circle
+from optics.assembly import Assembly
+from optics.backend import Backend
+from optics.convex_polygon import area, hull, intersect
+from optics.imaging import ImagingRays
+from optics.pupil_shadow import FEW_SIDES, SMALLEST, PupilShadow, separate
+from optics.pupil_stack import products, to_terms
+from optics.quadrature import PupilNodes
+from optics.system import SystemBatch
+from optics.trace import make_rays, trace
+from optics.tree import PlacedBodies
+from scenes.baffle import Plate
+from scenes.channel import BASE
+from scenes.clearance import convex_bodies
+from scenes.obstruction import imaging_segments, rays_taken
+
+if TYPE_CHECKING:
+    from scenes.instrument_model import Instrument
+
+RING_SIDES = 48
+"""Flat pieces of round plates."""
+
+DEGREE = 6
+"""Of the polynomials for the rays over the stop: mirrors' rays follow them to nanometres."""
+
+_ROOM = 5e-3
+"""How near a body has to come to the light between the mirrors, as designed, to be looked at in every state, metres."""
+
+_LAST = 0.999
+"""Share of the way to the image up to which bodies count: at its end all rays meet."""
+
+_WINDOW, _WINDOW_SIDES = 1.05, 8
+"""Polygon about the stop's disk to which outlines are cut before they are followed to their rays exactly."""
+
+_STEPS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Caster:
+    """A convex body that may stand in a beam.
+
+    Attributes:
+        name: of the prism, mirror or board (its path) or of the baffle.
+        body: path of the body that carries it.
+        corners: in that body's frame, (C, 3), metres.
+    """
+
+    name: str
+    body: str
+    corners: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Shadows:
+    """Shadows in the pupils of B images, on the stop's unit disk.
+
+    Attributes:
+        pieces: convex polygons that do not overlap, (B, K, V, 2); K may be 0. They reach a little beyond the disk.
+        owners: the body that throws each piece; of several the one that was found first.
+        on_disk: the same within the disk.
+        areas: of each within the disk, (B, K).
+    """
+
+    pieces: np.ndarray
+    owners: tuple[str, ...]
+    on_disk: PupilShadow
+    areas: np.ndarray
+
+    @classmethod
+    def of(cls, outlines: list[tuple[str, np.ndarray]], count: int) -> Shadows:
+        """Shadows of bodies with their outlines (B, V, 2) on ``count`` stops."""
+        lit = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
+        pieces, numbers = separate([outline for _, outline in lit])
+        pieces = pieces if lit else np.zeros((count, 0, 3, 2))
+        circle = np.zeros((3, count), complex)
+        circle[2] = 1.0
+        areas = np.zeros(pieces.shape[:2])
+        for k in range(pieces.shape[1]):
+            areas[:, k] = PupilShadow.within(pieces[:, k : k + 1], circle, FEW_SIDES).area
+        return cls(pieces, tuple(lit[k][0] for k in numbers), PupilShadow.within(pieces, circle, FEW_SIDES), areas)
+
+    def shares(self) -> dict[str, np.ndarray]:
+        """Share of the stop's area that each body takes, (B,)."""
+        out: dict[str, np.ndarray] = {}
+        for k, name in enumerate(self.owners):
+            out[name] = out.get(name, np.zeros(len(self.pieces))) + self.areas[:, k] / np.pi
+        return out
+
+
+def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
+    """All bodies that may stand in a camera's beam."""
+    placed = instrument.assembly.place()
+    root = f"{BASE}/{camera}"
+    own = {f"{root}/focal_plane", *(f"{root}/{mirror}" for mirror in instrument.cameras[camera].mirrors)}
+    out = [
+        Caster(path, path, placed.pose(path).inverse().apply(corners))
+        for path, corners in convex_bodies(instrument, placed).items()
+        if path not in own
+    ]
+    return (*out, *(caster for plate in instrument.baffles for caster in _plate(plate)))
+
+
+def _plate(plate: Plate) -> list[Caster]:
+    """A plate as one convex polygon, or a ring as several."""
+    if isinstance(plate.outline, Circle):
+        angle = 2.0 * np.pi * np.arange(RING_SIDES + 1) / RING_SIDES
+        turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        outer, inner = (np.array(plate.outline.centre) + r * turn for r in (plate.outline.radius, plate.outline.inner))
+        parts = [outer[:-1]]
+        if plate.outline.inner:
+            parts = [np.concatenate([outer[k : k + 2], inner[k : k + 2]]) for k in range(RING_SIDES)]
+    else:
+        x0, x1, y0, y1 = plate.outline.bounds
+        parts = [np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])]
+    flat = [np.column_stack([part, np.zeros(len(part))]) for part in parts]
+    return [Caster(plate.name, plate.body, plate.pose.apply(part)) for part in flat]
+
+
+class ImagingShadows:
+    """What throws shadows into the imaging beams of one camera.
+
+    Args:
+        instrument: with the camera.
+        camera: its name.
+        backend: where to trace.
+    """
+
+    def __init__(self, instrument: Instrument, camera: str, backend: Backend) -> None:
+        self.camera, self.backend = camera, backend
+        self.casters = casters(instrument, camera)
+        model = instrument.cameras[camera]
+        self._first = f"{BASE}/{camera}/{model.mirrors[0]}"
+        self._centre = instrument.assembly.tree[self._first].pivots["centre"]
+        self._inner = _between_mirrors(self.casters, instrument, backend, camera)
+
+    def cast(
+        self,
+        assembly: Assembly,
+        placed: PlacedBodies,
+        owner: np.ndarray,
+        systems: SystemBatch,
+        chain: Sequence[str],
+        rays: ImagingRays,
+        heading: np.ndarray,
+        nodes: PupilNodes,
+    ) -> Shadows:
+        """Shadows in B pupils.
+
+        Args:
+            assembly: whose elements ``chain`` names.
+            placed: bodies in all states.
+            owner: which state each image belongs to, (B,).
+            systems: on the way to the image, B.
+            chain: names of their elements.
+            rays: of the images, as traced.
+            heading: of their light, world, (B, 3).
+            nodes: at which the rays meet the stop.
+        """
+        found: list[tuple[str, np.ndarray]] = []
+        heading = np.broadcast_to(heading, (len(owner), 3))
+        bundle = _Bundle.parallel(rays.launched, heading, self._end(placed, owner, rays.launched, heading), nodes)
+        for caster in self.casters:
+            place = _corners(caster, placed, owner)
+            if bundle.may_meet(place):
+                found.append((caster.name, bundle.outline(place)))
+        if self._inner:
+            places = self._hits(assembly, placed, owner, systems, chain, rays.launched, heading)
+            for k, (start, end) in enumerate(pairwise(places)):
+                bundle = _Bundle.between(start, end, nodes)
+                for caster in self._inner.get(k, ()):
+                    found.append((caster.name, bundle.outline(_corners(caster, placed, owner))))
+        return Shadows.of(found, len(owner))
+
+    def _end(self, placed: PlacedBodies, owner: np.ndarray, launched: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        """How far it is from the launch points to the first mirror's middle, (B,)."""
+        k = placed.index[self._first]
+        middle = placed.translation[:, k].real + placed.rotation[:, k].real @ np.array(self._centre)
+        return np.asarray(np.sum((middle[owner] - launched.mean(axis=1)) * heading, axis=-1))
+
+    def _hits(
+        self,
+        assembly: Assembly,
+        placed: PlacedBodies,
+        owner: np.ndarray,
+        systems: SystemBatch,
+        chain: Sequence[str],
+        launched: np.ndarray,
+        heading: np.ndarray,
+    ) -> list[np.ndarray]:
+        """Where the rays meet every element, world, (B, N, 3) each."""
+        way = np.broadcast_to(heading[:, None], launched.shape)
+        traced = trace(self.backend, systems, make_rays(self.backend, launched, way), keep=range(len(chain)))
+        out = []
+        for k, name in enumerate(chain):
+            body = placed.index[assembly.elements[name].body]
+            turn, shift = placed.rotation[owner, body].real, placed.translation[owner, body].real
+            out.append(traced.hit(k) @ np.swapaxes(turn, 1, 2) + shift[:, None])
+        return out
+
+
+@lru_cache(maxsize=8)
+def imaging_shadows(instrument: Instrument, camera: str, backend: Backend) -> ImagingShadows:
+    """``ImagingShadows``, which takes some 0.1 s to find the bodies, kept for instruments used last."""
+    return ImagingShadows(instrument, camera, backend)
+
+
+def _between_mirrors(
+    every: Sequence[Caster], instrument: Instrument, backend: Backend, camera: str
+) -> dict[int, list[Caster]]:
+    """Bodies near the light between mirrors (0: from the first to the second) or before the image, as designed."""
+    placed = instrument.assembly.place()
+    backward = np.concatenate(imaging_segments(instrument, backend, camera))
+    inner = backward[:, :-1][:, ::-1]  # without the way from the scene, in the order of the light
+    cube = _ROOM * np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    out: dict[int, list[Caster]] = {}
+    for caster in every:
+        corners = placed.pose(caster.body).apply(caster.corners)
+        planes = ConvexHull((corners[:, None] + cube).reshape(-1, 3)).equations
+        for k in range(inner.shape[1]):
+            if rays_taken(inner[:, k : k + 1], planes).any():
+                out.setdefault(k, []).append(caster)
+    return out
+
+
+def _corners(caster: Caster, placed: PlacedBodies, owner: np.ndarray) -> np.ndarray:
+    """Corners of a body for every image, world, (B, C, 3)."""
+    k = placed.index[caster.body]
+    own = caster.corners @ np.swapaxes(placed.rotation[:, k].real, 1, 2) + placed.translation[:, k].real[:, None]
+    return np.asarray(own[owner])
+
+
+@dataclass(frozen=True, eq=False)
+class _Bundle:
+    """Rays from one surface to the next in B beams, over the stop.
+
+    Attributes:
+        start, end: coefficients of the rays' points at both, (B, K, 3), for ``products``.
+        middle: of both, (B, 2, 3).
+        spread: their derivatives by the stop's x and y in the mean, (B, 2, 3, 2).
+        along: mean direction, (B, 3).
+        axes: square to it, (B, 2, 3).
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    middle: np.ndarray
+    spread: np.ndarray
+    along: np.ndarray
+    axes: np.ndarray
+
+    @classmethod
+    def between(cls, start: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
+        """From points (B, N, 3) to points (B, N, 3), for nodes of the stop."""
+        both = np.stack([start, end], axis=1)
+        weight = nodes.share
+        middle = np.einsum("n,bknx->bkx", weight, both)
+        # x and y are orthogonal over the disk, their squares 1/4 in the mean
+        spread = 4.0 * np.einsum("n,ni,bknx->bkxi", weight, np.stack([nodes.x, nodes.y], axis=-1), both)
+        way = middle[:, 1] - middle[:, 0]
+        along = way / np.linalg.norm(way, axis=-1, keepdims=True)
+        least = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+        terms = to_terms(nodes, DEGREE) @ both
+        return cls(terms[:, 0], terms[:, 1], middle, spread, along, transverse_axes(along, least))
+
+    @classmethod
+    def parallel(cls, launched: np.ndarray, heading: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
+        """Light from far away up to a distance (B,) beyond the points (B, N, 3) of a wavefront."""
+        far = launched - _FAR * heading[:, None]
+        return cls.between(far, launched + (end[:, None] * heading)[:, None], nodes)
+
+    def may_meet(self, corners: np.ndarray) -> bool:
+        """Whether the sphere about a body (B, C, 3) meets any of the beams, which are parallel."""
+        centre = corners.mean(axis=1)
+        size = np.max(np.linalg.norm(corners - centre[:, None], axis=-1), axis=-1)
+        off = np.einsum("bix,bx->bi", self.axes, centre - self.middle[:, 0])
+        radius = np.linalg.norm(np.einsum("bix,bxj->bij", self.axes, self.spread[:, 0]), axis=(1, 2))
+        return bool(np.any(np.linalg.norm(off, axis=-1) < 1.1 * radius + size))
+
+    def outline(self, corners: np.ndarray) -> np.ndarray:
+        """Outline of a convex body (B, C, 3) on the stop's unit disk, (B, V, 2); empty where it takes nothing."""
+        corners = self._inside(corners)
+        packed = np.concatenate([np.squeeze(self._guess(corners)[0], -1), corners], axis=-1)
+        angle = 2.0 * np.pi * (np.arange(_WINDOW_SIDES) + 0.5) / _WINDOW_SIDES
+        normal = np.broadcast_to(np.stack([np.cos(angle), np.sin(angle)], axis=-1), (len(packed), _WINDOW_SIDES, 2))
+        cut = intersect(hull(packed), normal, np.full(normal.shape[:2], _WINDOW))
+        empty = area(cut) < SMALLEST
+        if np.all(empty):
+            return np.zeros((len(cut), 3, 2))
+        out, place = cut[..., :2], cut[..., 2:]
+        slope = self._guess(place)[1]
+        for _ in range(_STEPS):
+            basis = products(out[..., 0], out[..., 1], DEGREE)
+            start = basis @ self.start
+            way = basis @ self.end - start
+            arm = place - start
+            ahead = np.einsum("bvx,bx->bv", arm, self.along) / np.einsum("bvx,bx->bv", way, self.along)
+            miss = np.einsum("bix,bvx->bvi", self.axes, arm - ahead[..., None] * way)
+            out = out + np.squeeze(np.linalg.solve(slope, miss[..., None]), -1)
+        return np.where(empty[:, None, None], out[:, :1], out)
+
+    def _guess(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Stop coordinates (B, C, 2, 1) of rays through points in the mean, and d(transverse)/d(stop), (B, C, 2, 2)."""
+        first, way = self.middle[:, :1], (self.middle[:, 1:] - self.middle[:, :1])
+        ahead = self._ahead(place)[..., None]
+        off = np.einsum("bix,bcx->bci", self.axes, place - first - ahead * way)
+        near, far = (np.einsum("bix,bxj->bij", self.axes, self.spread[:, k])[:, None] for k in (0, 1))
+        slope = near + ahead[..., None] * (far - near)
+        return np.linalg.solve(slope, off[..., None]), slope
+
+    def _ahead(self, place: np.ndarray) -> np.ndarray:
+        """Share of the way at which points lie, (B, C)."""
+        way = np.einsum("bx,bx->b", self.middle[:, 1] - self.middle[:, 0], self.along)
+        return np.asarray(np.einsum("bcx,bx->bc", place - self.middle[:, :1], self.along) / way[:, None])
+
+    def _inside(self, corners: np.ndarray) -> np.ndarray:
+        """Corners of the part of a body between both ends of the way, (B, D, 3)."""
+        for low, sign in ((0.0, 1.0), (-_LAST, -1.0)):
+            depth = sign * self._ahead(corners) - low
+            if np.all(depth >= 0.0):
+                continue
+            # where lines between corners on both sides cross the end; those that do not cross give a corner
+            i, j = np.triu_indices(corners.shape[1], 1)
+            crossing = (depth[:, i] >= 0.0) != (depth[:, j] >= 0.0)
+            share = depth[:, i] / np.where(crossing, depth[:, i] - depth[:, j], 1.0)
+            cut = corners[:, i] + np.where(crossing, share, 0.0)[..., None] * (corners[:, j] - corners[:, i])
+            deepest = np.argmax(depth, axis=-1)
+            inside = np.take_along_axis(corners, deepest[:, None, None], axis=1)
+            kept = np.where((depth >= 0.0)[..., None], corners, inside)
+            cut = np.where(crossing[..., None], cut, inside)
+            corners = np.concatenate([kept, cut], axis=1)
+        return corners
+
+
+_FAR = 100.0
+"""How far before the first mirror bodies are looked for, metres."""

@@ -1,0 +1,111 @@
+"""Convex polygons in batches against qhull, against sums of their parts, and known integrals."""
+
+from math import factorial
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from optics.convex_polygon import area, clip, compact, difference, hull, intersect, quadrature, sides
+from optics.pupil_edge import PupilEdge
+from optics.pupil_shadow import FEW_SIDES, PupilShadow, separate
+
+RNG = np.random.default_rng(7)
+SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
+CIRCLE = np.array([[0.0], [0.0], [1.0]], complex)
+
+
+def test_hulls_have_the_area_of_qhull() -> None:
+    points = RNG.normal(size=(40, 9, 2))
+    points[:, 8] = points[:, 0]  # a corner that is there twice
+    np.testing.assert_allclose(area(hull(points)), [ConvexHull(p).volume for p in points], rtol=1e-12)
+
+
+def test_what_is_cut_off_and_what_stays_make_the_whole() -> None:
+    inside, outside = intersect(SOME, *sides(OTHERS)), difference(SOME, OTHERS)
+    np.testing.assert_allclose(area(inside) + sum(area(part) for part in outside), area(SOME), atol=1e-13)
+    np.testing.assert_allclose(area(inside), area(intersect(OTHERS, *sides(SOME))), atol=1e-13)
+
+
+def test_half_planes_and_empty_polygons() -> None:
+    square = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+    normal = np.array([[1.0, 0.0]])
+    for limit, left in ((2.0, 1.0), (0.25, 0.25), (-1.0, 0.0)):
+        assert area(clip(square, normal, np.array([limit])))[0] == left
+    twice = np.repeat(square, 2, axis=1)
+    assert compact(twice).shape == square.shape
+    assert area(compact(twice))[0] == 1.0
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_quadrature_is_exact_for_its_polynomials(count: int) -> None:
+    """Integrals over a triangle: a! b! / (a + b + 2)!; a polygon's are those of its triangles."""
+    triangle = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])
+    points, weights = quadrature(triangle, count)
+    for a in range(count):
+        for b in range(count):
+            want = factorial(a) * factorial(b) / factorial(a + b + 2)
+            assert np.sum(weights * points.real**a * points.imag**b) == pytest.approx(want, rel=1e-12)
+    points, weights = quadrature(SOME[:, ::-1], count)  # of the other sense
+    np.testing.assert_allclose(weights.sum(axis=-1), area(SOME), rtol=1e-12)
+
+
+def test_shadows_that_overlap_count_once() -> None:
+    pieces, owners = separate([SOME, OTHERS])
+    union = area(SOME) + area(OTHERS) - area(intersect(SOME, *sides(OTHERS)))
+    np.testing.assert_allclose(area(pieces).sum(axis=-1), union, atol=1e-12)
+    assert owners[0] == 0
+    assert set(owners[1:]) == {1}
+    # where one is nothing in a pupil, the other stays whole there
+    nothing = np.where(np.arange(60)[:, None, None] % 2 == 0, SOME[:, :1], SOME)
+    pieces, _ = separate([nothing, OTHERS])
+    np.testing.assert_allclose(area(pieces).sum(axis=-1)[::2], area(OTHERS)[::2], atol=1e-12)
+
+
+def test_a_disk_in_a_disk_by_its_parts() -> None:
+    """What shadows take of a circle's overlap with itself: a shadow as large as half of it leaves the other half's own
+    overlap, a lens cut by chords, known from circular segments.
+    """
+    half = np.array([[[[-2.0, -2.0], [2.0, -2.0], [2.0, 0.0], [-2.0, 0.0]]]])
+    shadow = PupilShadow.within(half, CIRCLE)
+    assert shadow.area[0] == pytest.approx(0.5 * np.pi, rel=1e-5)
+    for s in (0.3, 0.9, 1.6):
+        # shifted along the cut the upper half disk overlaps itself in half the lens, square to it in less
+        lens = 2.0 * np.arccos(0.5 * s) - 0.5 * s * np.sqrt(4.0 - s * s)
+        _, weights = shadow.overlap(np.zeros(2, int), np.array([s, -1j * s]), 3)
+        # up to the polygon of the rim, which has the circle's area as a whole
+        assert lens + weights[0].sum() == pytest.approx(0.5 * lens, abs=1e-4)
+        # moved up by s: the segment of the lower circle above y = s/2 + s/2 ...
+        segment = np.arccos(min(s, 1.0)) - s * np.sqrt(max(1.0 - s * s, 0.0))
+        assert lens + weights[1].sum() == pytest.approx(segment if s < 1.0 else 0.0, abs=2e-4)
+
+
+def test_rounding_in_corners_cuts_nothing_off() -> None:
+    """Corners 1e-17 apart have a side of no direction."""
+    square = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+    rough = np.repeat(square, 2, axis=1)
+    rough[0, 1::2] += 1e-17 * np.array([[3.0, 1.0], [-1.0, 2.0], [1.0, -5.0], [0.0, 4.0]])
+    assert area(intersect(square, *sides(rough)))[0] == 1.0
+
+
+def test_an_edge_that_is_no_circle() -> None:
+    """The part of a polygon within the pupil's true edge against a fine polygon of that edge."""
+    harmonics = np.zeros((7, 1), complex)
+    harmonics[[4, 6, 0], 0] = 1.0, 0.015 + 0.01j, 0.01j
+    angle = 2.0 * np.pi * np.arange(4096) / 4096
+    edge = PupilEdge(harmonics[:, 0]).boundary(angle)[0]
+    fine = np.stack([edge.real, edge.imag], axis=-1)[None]
+    box = np.array([[[[0.5, 0.3], [0.9, 0.3], [0.9, 1.2], [0.5, 1.2]]]])
+    shadow = PupilShadow.within(box, harmonics, FEW_SIDES)
+    want = area(intersect(fine, *sides(box[0])))[0]
+    # chords of 64 sides lie (pi/64)^2 / 3 = 0.8e-3 inside of a circle, for which their area is made up; this edge's
+    # curvature is another by a sixth along an arc of 0.55: 7e-5
+    assert shadow.area[0] == pytest.approx(want, abs=7e-5)
+    shift = np.array([0.4 + 0.2j])
+    _, weights = shadow.overlap(np.zeros(1, int), shift, 3)
+    move = np.array([0.4, 0.2])
+    own = intersect(fine, *sides(box[0]))
+    far = [intersect(own, *sides(fine + sign * move)) for sign in (1.0, -1.0)]
+    both = intersect(own, *sides(own + move))
+    want = -sum(area(part)[0] for part in far) + area(both)[0]
+    assert weights.sum() == pytest.approx(want, abs=2 * 7e-5)

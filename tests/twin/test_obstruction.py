@@ -1,0 +1,326 @@
+"""Shadows of bodies in pupils: against rays that meet triangles, rasters of the pupil, and one way against another."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+import twin.render as command
+from optics import quadrature, zernike
+from optics.aperture import Circle, Rectangle
+from optics.imaging import imaging_rays
+from optics.pose import Pose
+from optics.solid import solid_mesh
+from optics.trace import make_rays, trace
+from optics.transfer import TransferTable, polychromatic_transfer, transfer
+from optics.tree import Motion
+from optics.wavefront import path_to_sphere
+from scenes.baffle import Plate
+from scenes.load import load_band_detectors
+from scenes.shadow import ImagingShadows
+from tests.twin.commands import invoke
+from twin.image_quality import _CameraBench, image_quality
+from twin.line_ccd import LineCcd, band_wavelengths
+from twin.target_path import TargetPath
+
+CAMERA, ROOT = "forward", "base/forward"
+PRISM = f"{ROOT}/monitor/left/prism_180"
+MOVED = {
+    PRISM: Motion(shift=(4e-3, 15e-3, 0.0), rotate=(0.0, 0.0, 0.05)),
+    f"{ROOT}/M2": Motion(shift=(2e-5, 1e-5, -2e-5)),
+}
+SPIRAL = 40_000
+
+
+def path_of(instrument, backend, obstructed: bool = True) -> TargetPath:
+    shadows = ImagingShadows(instrument, CAMERA, backend) if obstructed else None
+    return TargetPath(instrument.assembly, CAMERA, ROOT, instrument.cameras[CAMERA], backend, shadows=shadows)
+
+
+def places_of(instrument) -> np.ndarray:
+    line = instrument.cameras[CAMERA].spec.line
+    return np.array([[side * 0.5 * line.pixels * line.pitch, 0.0] for side in (1.0, 0.0, -1.0)])
+
+
+def rays_of(path: TargetPath, state, directions: np.ndarray, nodes):
+    placed = path.assembly.place([state])
+    systems, to_stop = path._systems(state, len(directions), placed)
+    launch = path._launch(directions)
+    rays = imaging_rays(path.backend, systems, to_stop, directions, launch, path.stop, nodes, path._axes[:, 1])
+    return placed, systems, rays
+
+
+def shadows_of(path: TargetPath, state, directions: np.ndarray):
+    placed, systems, rays = rays_of(path, state, directions, path.nodes)
+    chain = path.assembly.sequences[f"{CAMERA}/imaging"]
+    owner = np.zeros(len(directions), int)
+    return path.shadows.cast(path.assembly, placed, owner, systems, chain, rays, directions, path.nodes)
+
+
+def spiral() -> quadrature.PupilNodes:
+    """Points evenly spread over the disk."""
+    k = np.arange(SPIRAL)
+    r, angle = np.sqrt((k + 0.5) / SPIRAL), np.pi * (3.0 - np.sqrt(5.0)) * k
+    return quadrature.PupilNodes(r * np.cos(angle), r * np.sin(angle), np.full(SPIRAL, np.pi / SPIRAL))
+
+
+def meets(triangles: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Which rays from points (N, 3) along one direction meet any of the triangles (Moeller and Trumbore)."""
+    found = np.zeros(len(start), bool)
+    for a, b, c in triangles:
+        p = np.cross(way, c - a)
+        scale = (b - a) @ p
+        if scale == 0.0:
+            continue  # seen on edge
+        u = (start - a) @ p / scale
+        q = np.cross(start - a, b - a)
+        v = q @ way / scale
+        found |= (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+    return found
+
+
+@pytest.mark.parametrize("state", [{}, MOVED], ids=["nominal", "moved"])
+def test_share_of_the_prisms_against_rays_and_triangles(gf7_pair, backend, state) -> None:
+    """Points of a spiral miss a boundary of length L of the unit disk by some L / sqrt(N) in N^(1/2) points: 3e-5 of
+    the disk rms were seen, 1.5e-4 is five times that.
+    """
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places_of(gf7_pair))
+    placed, _, rays = rays_of(path, state, directions, spiral())
+    shadows = shadows_of(path, state, directions)
+    shares = shadows.shares()
+    total = np.zeros((len(directions), SPIRAL), bool)
+    for solid in gf7_pair.solids:
+        own = solid_mesh(solid, gf7_pair.assembly.place()).mesh
+        triangles = placed.pose(solid.path).apply(own.vertices[own.faces].reshape(-1, 3)).reshape(-1, 3, 3)
+        taken = np.array([meets(triangles, r - 50.0 * d, d) for r, d in zip(rays.launched, directions, strict=True)])
+        np.testing.assert_allclose(shares.get(solid.path, 0.0), taken.mean(axis=-1), atol=1.5e-4)
+        total |= taken
+    assert set(shares) == {PRISM, PRISM.replace("left", "right")}
+    np.testing.assert_allclose(shadows.on_disk.area / np.pi, total.mean(axis=-1), atol=1.5e-4)
+    assert np.all(shadows.on_disk.area / np.pi > 0.05)
+
+
+def test_a_moved_prism_moves_its_shadow(gf7_pair, backend) -> None:
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places_of(gf7_pair))
+    still, moved = (shadows_of(path, state, directions).shares() for state in ({}, MOVED))
+    right = PRISM.replace("left", "right")
+    np.testing.assert_allclose(moved[right], still[right], atol=2e-5)  # only the beam has moved, by micrometres
+    assert np.max(np.abs(moved[PRISM] - still[PRISM])) > 1e-3
+
+
+def raster(pupil, size: int, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each cell of [-1, 1]^2 that is free, and cells' middles; shadows by half-planes."""
+    step = 2.0 / size
+    middle = -1.0 + step * (np.arange(size) + 0.5)
+    x, y = np.meshgrid(middle, middle)
+    free = np.zeros((size, size))
+    angle = np.linspace(-np.pi, np.pi, 2001)
+    edge = pupil.edge.boundary(angle)[0]
+    order = np.argsort(np.angle(edge))
+    for i in range(parts):
+        for j in range(parts):
+            px, py = x + ((i + 0.5) / parts - 0.5) * step, y + ((j + 0.5) / parts - 0.5) * step
+            rim = np.interp(np.arctan2(py, px), np.angle(edge)[order], np.abs(edge)[order], period=2.0 * np.pi)
+            inside = np.hypot(px, py) < rim
+            for piece in pupil.shadow.pieces[0]:
+                after = np.roll(piece, -1, axis=0)
+                left = [(q - p)[0] * (py - p[1]) - (q - p)[1] * (px - p[0]) for p, q in zip(piece, after, strict=True)]
+                if np.ptp(piece, axis=0).min() > 0.0:
+                    inside &= ~np.all(np.array(left) >= 0.0, axis=0)
+            free += inside
+    return free / parts**2, x + 1j * y
+
+
+def test_transfer_function_against_the_autocorrelation_of_a_raster(gf7_pair, backend) -> None:
+    """Shifts by whole cells, so that only the edges of the raster err: 1e-3 of the diameter a cell, a sixteenth of it
+    known; some 1e-4 of the result, of which the mean over an edge leaves 3e-5.
+    """
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places_of(gf7_pair)[:2])
+    size, wavelength = 512, 650e-9
+    for pupil in path.pupils({}, directions, path.places({}, directions)):
+        free, p = raster(pupil, size)
+        path_length, amplitude = pupil.values(p)
+        field = free * amplitude * np.exp(2j * np.pi / wavelength * path_length)
+        spectrum = np.fft.fft2(field, (2 * size, 2 * size))
+        found = np.fft.ifft2(np.abs(spectrum) ** 2) / np.sum(free * amplitude**2)
+        cells = [(40, 0), (0, 40), (128, -64), (200, 90), (0, 230), (230, 0), (-150, 150), (300, 120)]
+        shift = 2.0 / size * np.array(cells)
+        frequency = shift @ pupil.axes.T / wavelength
+        got = transfer(pupil, frequency, wavelength, np.zeros(1))[0]
+        want = np.array([found[row, column] for column, row in cells])
+        np.testing.assert_allclose(got, want, atol=2e-4)
+        clear = transfer(replace(pupil, shadow=None), frequency, wavelength, np.zeros(1))[0]
+        assert np.max(np.abs(clear - want)) > 0.01
+
+
+def test_light_and_table_of_a_cut_pupil(gf7_pair, backend) -> None:
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places_of(gf7_pair))
+    pupil = path.pupils({}, directions, path.places({}, directions))[1]
+    share = sum(s[1] for s in shadows_of(path, {}, directions).shares().values())
+    # the beam is evenly lit before the first mirror, the stop is not quite its picture
+    assert 1.0 - pupil.light == pytest.approx(share, rel=0.01)
+    wavelengths, weights = np.linspace(480e-9, 800e-9, 4), np.ones(4)
+    table = TransferTable.build(pupil, wavelengths, weights)
+    angle = np.radians(np.arange(0.0, 180.0, 7.5))
+    frequency = 30e3 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    frequency = np.concatenate([0.1 * frequency, frequency, 2.0 * frequency])
+    want = polychromatic_transfer(pupil, frequency, wavelengths, weights, np.zeros(1))[0]
+    np.testing.assert_allclose(table(*frequency.T), want, atol=2e-4)  # as the table says
+
+
+def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
+    """MTF of ``image_quality`` and of a target's path, with shadows, in a moved state."""
+    model = gf7_pair.cameras[CAMERA]
+    band = model.spec.bands["P"]
+    places = np.array([[side * 0.5 * band.pixels * band.pitch, band.offset] for side in (1.0, 0.0)])
+    quality = image_quality(gf7_pair, backend, [{}, MOVED], (1.0, 0.0)).cameras[CAMERA]
+    free = image_quality(gf7_pair, backend, [{}, MOVED], (1.0, 0.0), obstruction=False).cameras[CAMERA]
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places)
+    frequency = 0.5 / band.pitch * np.eye(2)
+    ccd = LineCcd.from_specs(band, load_band_detectors(model.spec)[band.detector])
+    for k, pupil in enumerate(path.pupils({}, directions, path.places({}, directions))):
+        found = polychromatic_transfer(pupil, frequency, *band_wavelengths(band), np.zeros(1))[0]
+        want = np.abs(found * ccd.transfer(*frequency.T))
+        # wavelengths are others; kinks of shadows' overlaps over the band leave some 1e-5
+        assert quality.mtf_along_line[0, k] == pytest.approx(want[0], abs=1e-4)
+        assert quality.mtf_along_track[0, k] == pytest.approx(want[1], abs=1e-4)
+        assert quality.light_lost[0, k] == pytest.approx(1.0 - pupil.light, abs=1e-5)
+    assert np.all(free.light_lost == 0.0)
+    assert not free.bodies
+    assert np.all(free.mtf_along_track - quality.mtf_along_track > 0.01)
+
+
+def test_wavefront_error_is_that_of_the_free_part(gf7_pair, backend) -> None:
+    """Against a mean over points of a spiral that are in no shadow."""
+    path = path_of(gf7_pair, backend)
+    state = {**MOVED, f"{ROOT}/M3": Motion(figure={7: 30e-9, 5: 20e-9})}
+    quality = image_quality(gf7_pair, backend, [state], (0.0,)).cameras[CAMERA]
+    free = image_quality(gf7_pair, backend, [state], (0.0,), obstruction=False).cameras[CAMERA]
+    found = {}
+    for name, camera in (("cut", quality), ("free", free)):
+        found[name] = camera.wfe[0, 0]
+    assert abs(found["cut"] / found["free"] - 1.0) > 0.005
+    bench_rays, position = pixel_rays(gf7_pair, backend, state)
+    error = path_to_sphere(
+        bench_rays.position, bench_rays.direction, bench_rays.path, position,
+        float(path.model.first_order.exit_pupil_distance[0]),
+    )[0]  # fmt: skip
+    nodes = spiral()
+    placed = gf7_pair.assembly.place([state])
+    taken = np.zeros(SPIRAL, bool)
+    heading = np.cross(bench_rays.axes[0, 0], bench_rays.axes[0, 1])
+    for solid in gf7_pair.solids:
+        own = solid_mesh(solid, gf7_pair.assembly.place()).mesh
+        triangles = placed.pose(solid.path).apply(own.vertices[own.faces].reshape(-1, 3)).reshape(-1, 3, 3)
+        taken |= meets(triangles, bench_rays.launched[0], heading)
+    tilts = zernike.basis(3, nodes.x, nodes.y)
+    for name, kept in (("free", np.ones(SPIRAL, bool)), ("cut", ~taken)):
+        rest = error[kept] - tilts[kept] @ np.linalg.lstsq(tilts[kept], error[kept], rcond=None)[0]
+        # the spiral's mean of squares is right to some 1e-4
+        assert np.sqrt(np.mean(rest**2)) / 650e-9 == pytest.approx(found[name], rel=3e-4)
+
+
+def pixel_rays(instrument, backend, state):
+    """Dense rays to the middle of the line CCD, as ``image_quality`` has them."""
+    bench = _CameraBench(instrument, CAMERA, backend, (0.0,), 650e-9, None)
+    bench.nodes = spiral()
+    return bench._trace([state])[0], bench.points[:, None]
+
+
+def with_plate(instrument, plate: Plate):
+    return replace(instrument, baffles=(*instrument.baffles, plate))
+
+
+def test_a_round_plate_before_the_first_mirror(gf7_pair, backend) -> None:
+    """A disk square to the beam takes its share of the beam's cross-section, by each of two parts, or as a ring."""
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places_of(gf7_pair)[1:2])
+    _, _, rays = rays_of(path, {}, directions, path.nodes)
+    middle = rays.launched[0].mean(axis=0) + 0.0 * directions[0]
+    z = directions[0]
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    turn = np.stack([x, np.cross(z, x), z], axis=-1)
+    cross_section = float(np.sum(rays.launch_area))
+    base = shadows_of(path, {}, directions).on_disk.area[0] / np.pi
+
+    def light(outline) -> float:
+        own = path_of(with_plate(gf7_pair, Plate("disk", "base", Pose(turn, middle), outline)), backend)
+        return own.pupils({}, directions, own.places({}, directions))[0].light
+
+    clear = light(Circle(1e-4))
+    assert clear == pytest.approx(1.0 - base, abs=1e-3)
+    # 48 corners of a circle have 0.3 % less than its area
+    polygon = 24.0 * np.sin(np.pi / 24.0)
+    assert clear - light(Circle(0.05)) == pytest.approx(polygon * 0.05**2 / cross_section, rel=2e-3)
+    ring = polygon * (0.05**2 - 0.03**2) / cross_section
+    assert clear - light(Circle(0.05, inner=0.03)) == pytest.approx(ring, rel=2e-3)
+
+
+def test_a_plate_between_two_mirrors(gf7_pair, backend) -> None:
+    """Against the rays themselves: which of them go through the plate on their way from the first to the second."""
+    path = path_of(gf7_pair, backend)
+    directions = path.directions(places_of(gf7_pair))
+    nodes = spiral()
+    placed, systems, rays = rays_of(path, {}, directions, nodes)
+    way = np.broadcast_to(directions[:, None], rays.launched.shape)
+    chain = path.assembly.sequences[f"{CAMERA}/imaging"]
+    traced = trace(backend, systems, make_rays(backend, rays.launched, way), keep=range(len(chain)))
+    start, end = (
+        np.stack([placed.pose(path.assembly.elements[chain[k]].body).apply(hit) for hit in traced.hit(k)])
+        for k in (0, 1)
+    )
+    middle = 0.5 * (start[1] + end[1])
+    size = np.ptp(middle, axis=0).max()
+    along = (end - start)[1].mean(axis=0)
+    z = along / np.linalg.norm(along)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    pose = Pose(np.stack([x, np.cross(z, x), z], axis=-1), middle.mean(axis=0) + 0.1 * size * x)
+    outline = Rectangle(0.1 * size, 0.07 * size)
+    own = path_of(with_plate(gf7_pair, Plate("plate", "base", pose, outline)), backend)
+    shares = shadows_of(own, {}, directions).shares()
+    into = pose.inverse()
+    for k in range(len(directions)):
+        a, b = into.apply(start[k]), into.apply(end[k])
+        share = a[:, 2] / (a[:, 2] - b[:, 2])
+        at = a + share[:, None] * (b - a)
+        taken = outline.contains(at[:, 0], at[:, 1]) & (share > 0.0) & (share < 1.0)
+        assert 0.005 < taken.mean() < 0.2
+        assert shares["plate"][k] == pytest.approx(taken.mean(), abs=2e-4)
+
+
+@pytest.mark.slow
+def test_ignored_obstruction_is_told_everywhere_and_leaves_the_monitor_alone(tmp_path) -> None:
+    """The same frames of the spots, since their way through prisms is no obstruction; another image quality, another
+    target; terminal, JSON and report say it.
+    """
+    found = {}
+    for mode in ("traced", "ignore"):
+        render = {"images": ["spots", "pinhole"], "quality": True, "frames": 2, "obstruction": mode}
+        job = tmp_path / f"{mode}.yaml"
+        job.write_text(yaml.safe_dump({"instrument": "gf7_pair", "render": render}))
+        result = invoke(command.app, job, "--out", tmp_path / mode)
+        assert result.exit_code == 0
+        quality, mtf = (json.loads((tmp_path / mode / name).read_text()) for name in ("quality.json", "mtf.json"))
+        assert quality["obstruction"] == mtf["obstruction"] == mode
+        report = (tmp_path / mode / "report.html").read_text()
+        assert ("free" in result.output) == (mode == "ignore") == ("<code>obstruction: ignore</code>" in report)
+        spots = {file.name: file.read_bytes() for file in (tmp_path / mode / "images").glob("*_after.tiff")}
+        found[mode] = quality, mtf, {name: data for name, data in spots.items() if "pinhole" not in name}
+    traced, ignored = found["traced"], found["ignore"]
+    assert traced[2]
+    assert traced[2] == ignored[2]
+    lost = traced[0]["cameras"][CAMERA]["light_lost"]["centre"]
+    place = traced[1]["truth"]["cameras"][CAMERA]["places"]["centre"]
+    assert lost == pytest.approx(place["light_lost"]["after"], abs=1e-3)
+    assert lost > 0.07
+    assert ignored[0]["cameras"][CAMERA]["light_lost"]["centre"] == 0.0
+    assert ignored[1]["truth"]["cameras"][CAMERA]["places"]["centre"]["light_lost"]["after"] == 0.0
