@@ -1,0 +1,119 @@
+"""The mutation test: `python -m tests.mutation --out DIR [--count 400] [--only optics,analysis/orbit] [--seed 1] [--json]`."""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from scenes.yaml_file import read_yaml
+from tests.mutation.campaign import Verdict, read_verdicts, run_campaign
+from tests.mutation.coverage_map import measure, read_map
+from tests.mutation.mutants import mutants_below
+
+HELP = """Put small faults into the source, one at a time, and see whether a test finds each.
+
+A seeded sample of all possible faults is drawn from the physics and the estimators. The tests that run a fault's lines are
+tried, quick ones first, until one fails. What survives is either a gap in the tests or changes nothing that could be seen;
+the second kind stands in equivalent.yaml with its reason. An interrupted campaign goes on where it was.
+
+Examples:
+
+  python -m tests.mutation --out runs/mutation                           400 faults, some hours on two cores\n
+  python -m tests.mutation --out runs/mutation --only optics --count 40  some of them\n
+  python -m tests.mutation --out runs/mutation --again                   survivors once more, after new tests\n
+
+Exit code: 0 at least 90 % of the faults that are not equivalent were found, 1 fewer, 2 bad input.
+"""
+PLACES = ("optics", "analysis", "twin/monitor.py", "twin/monitor_derivative.py", "twin/detector.py")
+TESTS = ("optics", "analysis", "oracles", "scenes", "twin")
+"""Folders of tests that take part; those of the commands' robustness, of the papers' verdicts and of speed do not."""
+LIMIT = 0.90
+EQUIVALENT = Path(__file__).with_name("equivalent.yaml")
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+def equivalents() -> dict[str, str]:
+    """Key -> why no test can tell this mutant from the source."""
+    return {entry["key"]: entry["reason"] for entry in read_yaml(EQUIVALENT).data["equivalent"]}
+
+
+def summary(verdicts: list[Verdict], known: dict[str, str]) -> dict[str, Any]:
+    """Counts, score and survivors as they go into the report."""
+    counted = [one for one in verdicts if one.fate == "killed" or one.mutant.key not in known]
+    fates = Counter(one.fate for one in counted)
+    killed = fates["killed"]
+    return {
+        "mutants": len(verdicts),
+        "equivalent": len(verdicts) - len(counted),
+        "killed": killed,
+        "survived": fates["survived"],
+        "uncovered": fates["uncovered"],
+        "score": killed / len(counted) if counted else 1.0,
+        "survivors": [
+            {
+                "key": one.mutant.key,
+                "where": f"{one.mutant.path}:{one.mutant.line[0]}",
+                "scope": one.mutant.scope,
+                "before": one.mutant.before,
+                "after": one.mutant.after,
+                "fate": one.fate,
+            }
+            for one in sorted(counted, key=lambda one: (one.mutant.path, one.mutant.line))
+            if one.fate != "killed"
+        ],
+    }
+
+
+@app.command(help=HELP)
+def main(
+    out: Annotated[Path, typer.Option(help="Folder for the coverage, the results and the summary.")],
+    count: Annotated[int, typer.Option(min=1, help="How many faults.")] = 400,
+    only: Annotated[str | None, typer.Option(help="Files or folders of the source, with commas between them.")] = None,
+    seed: Annotated[int, typer.Option(help="Which faults are drawn.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="How many at once.")] = 2,
+    again: Annotated[bool, typer.Option("--again", help="Try the survivors again, with coverage measured anew.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")] = False,
+) -> None:
+    """Measure coverage, draw, try, tell."""
+    root = Path.cwd()
+    places = tuple(only.split(",")) if only else PLACES
+    missing = [place for place in places if not (root / place).exists()]
+    if missing:
+        print(f"no such file or folder: {', '.join(missing)}; run this in the project's folder", file=sys.stderr)
+        raise typer.Exit(2)
+    every = mutants_below(root, places)
+    chosen = random.Random(seed).sample(every, min(count, len(every)))
+    folder, results = out / "coverage", out / "results.jsonl"
+    out.mkdir(parents=True, exist_ok=True)
+    before = read_verdicts(results)
+    if again:
+        for file in folder.glob("*"):
+            file.unlink()
+    todo = [one for one in chosen if one.key not in before or (again and before[one.key].fate != "killed")]
+    if todo:
+        files = [file for name in TESTS for file in sorted((root / "tests" / name).glob("test_*.py"))]
+        measure(root, files, PLACES, folder, workers)
+        run_campaign(root, todo, read_map(folder, root), results, workers)
+    verdicts = read_verdicts(results)
+    found = summary([verdicts[one.key] for one in chosen], equivalents())
+    (out / "summary.json").write_text(json.dumps(found, indent=2) + "\n")
+    if as_json:
+        print(json.dumps(found, indent=2))
+    else:
+        for one in found["survivors"]:
+            print(f"{one['key']} {one['where']} {one['scope']}: {one['before']} -> {one['after']} ({one['fate']})")
+        print(
+            f"{found['killed']} of {found['mutants']} killed, {found['survived']} survived, {found['uncovered']} uncovered, "
+            f"{found['equivalent']} equivalent: score {100 * found['score']:.1f} %"
+        )
+    raise typer.Exit(0 if found["score"] >= LIMIT else 1)
+
+
+if __name__ == "__main__":
+    app()

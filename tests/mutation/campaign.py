@@ -1,0 +1,177 @@
+"""Runs the tests against one fault after the other, each worker in a copy of the tree of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from tests.mutation.coverage_map import CoverageMap
+from tests.mutation.mutants import Mutant
+
+Fate = Literal["killed", "survived", "uncovered"]
+STAGES = ((40.0, 4), (120.0, 10_000), (240.0, 10_000))
+"""For each round of tests its seconds at the most (without any fault) and how many cases of one test function. The last
+round takes whole files: a fixture that lasts the session or a cached function is run by the first test alone that asks."""
+_STARTING = 60.0
+"""Seconds that starting pytest and compiling kernels may take on a busy machine, beside five times the tests' own."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one mutant.
+
+    Attributes:
+        mutant: the fault.
+        fate: "killed" by a test that failed or hung, "survived" all that run its lines, "uncovered" where none does.
+        by: the first test that failed; "" where none did, or none can be named.
+        tests: how many tests ran at the most.
+        seconds: how long it took.
+    """
+
+    mutant: Mutant
+    fate: Fate
+    by: str
+    tests: int
+    seconds: float
+
+    def as_json(self) -> dict[str, object]:
+        """A line of the results' file."""
+        return {"key": self.mutant.key, **asdict(self)}
+
+
+def read_verdicts(file: Path) -> dict[str, Verdict]:
+    """The results so far, by the mutants' keys; a later line replaces an earlier one."""
+    found: dict[str, Verdict] = {}
+    if file.exists():
+        for line in file.read_text().splitlines():
+            entry = json.loads(line)
+            key = entry.pop("key")
+            fields = entry.pop("mutant")
+            mutant = Mutant(**{**fields, "line": tuple(fields["line"]), "span": tuple(fields["span"])})
+            found[key] = Verdict(mutant=mutant, **entry)
+    return found
+
+
+def run_campaign(
+    root: Path, chosen: list[Mutant], known: CoverageMap, results: Path, workers: int, say: bool = True
+) -> None:
+    """Try every mutant and add a line to the results as soon as its fate is known."""
+    with _copies(root, workers) as copies, ThreadPoolExecutor(workers) as pool:
+        free: queue.SimpleQueue[Path] = queue.SimpleQueue()
+        for copy in copies:
+            free.put(copy)
+
+        def work(mutant: Mutant) -> Verdict:
+            copy = free.get()
+            try:
+                return try_mutant(copy, mutant, known)
+            finally:
+                free.put(copy)
+
+        started, done = time.monotonic(), 0
+        with results.open("a") as stream:
+            for future in as_completed([pool.submit(work, mutant) for mutant in chosen]):
+                verdict = future.result()
+                stream.write(json.dumps(verdict.as_json()) + "\n")
+                stream.flush()
+                done += 1
+                if say:
+                    left = (time.monotonic() - started) / done * (len(chosen) - done)
+                    where = f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
+                    print(f"{done}/{len(chosen)} {verdict.fate} {where}; {left / 60:.0f} min left", file=sys.stderr, flush=True)
+
+
+def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap) -> Verdict:
+    """Put a fault into a copy of the tree, run the tests that meet it, quick ones first, and take it out again."""
+    started = time.monotonic()
+    covering = known.covering(mutant.path, mutant.line)
+    if not covering:
+        return Verdict(mutant, "uncovered", "", 0, 0.0)
+    file = copy / mutant.path
+    source = file.read_bytes()
+    file.write_bytes(mutant.applied(source))
+    count = 0
+    try:
+        for tests in rounds(covering, known):
+            count += len(tests)
+            killed, by = _run(copy, tests, sum(known.seconds[name] for name in tests))
+            if killed:
+                return Verdict(mutant, "killed", by, count, time.monotonic() - started)
+    finally:
+        file.write_bytes(source)
+    return Verdict(mutant, "survived", "", count, time.monotonic() - started)
+
+
+def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
+    """Tests to run one after the other until one fails."""
+    files = {name.split("::")[0] for name in covering}
+    whole = sorted((name for name in known.seconds if name.split("::")[0] in files), key=lambda name: known.seconds[name])
+    ran: set[str] = set()
+    for (seconds, cases), names in zip(STAGES, (covering, covering, whole), strict=True):
+        tests: list[str] = []
+        count: Counter[str] = Counter()
+        for name in names:
+            function = name.split("[")[0]
+            if name in ran or count[function] >= cases:
+                continue
+            # One test may be longer than the round: the only one that meets the line is not left out for its length.
+            if tests and seconds < known.seconds[name]:
+                break
+            seconds -= known.seconds[name]
+            count[function] += 1
+            tests.append(name)
+        if tests:
+            ran |= set(tests)
+            yield tests
+
+
+def _run(copy: Path, tests: list[str], seconds: float) -> tuple[bool, str]:
+    """Whether one of the tests fails, and which."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE", "-m", ""]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+    # Arguments in a file: there can be thousands.
+    with tempfile.NamedTemporaryFile("w", suffix=".args", dir=copy) as arguments:
+        arguments.write("\n".join(tests))
+        arguments.flush()
+        try:
+            ended = subprocess.run(
+                [*command, f"@{arguments.name}"],
+                cwd=copy,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=5.0 * seconds + _STARTING,
+            )
+        except subprocess.TimeoutExpired:
+            return True, "time"
+    if ended.returncode == 0:
+        return False, ""
+    failed = [line for line in ended.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return True, failed[0].split(" ", 1)[1].split(" - ")[0] if failed else f"exit {ended.returncode}"
+
+
+@contextmanager
+def _copies(root: Path, workers: int) -> Iterator[list[Path]]:
+    """Copies of the tree without what is made, with byte code that is checked by its source's hash."""
+    made = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycache__", "*.egg-info")
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
+        copies = [Path(folder) / str(number) for number in range(workers)]
+        for copy in copies:
+            shutil.copytree(root, copy, ignore=made)
+            # By time stamps, a fault put in within the second of the last run would go unseen.
+            compile_all = [sys.executable, "-m", "compileall", "-q", "--invalidation-mode", "checked-hash", "."]
+            subprocess.run(compile_all, cwd=copy, check=True, stdout=subprocess.DEVNULL)
+        yield copies

@@ -1,0 +1,80 @@
+"""Which tests run which line: measured once, a process for each file of tests, so that no file profits from another's fixtures."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import coverage
+
+
+@dataclass(frozen=True)
+class CoverageMap:
+    """Lines and the tests that run them.
+
+    Attributes:
+        tests: source file -> line -> names of tests; a test named "" stands for the import of the module.
+        seconds: test -> how long it takes, with its fixtures; only tests that pass without any fault put in.
+    """
+
+    tests: dict[str, dict[int, list[str]]]
+    seconds: dict[str, float]
+
+    def covering(self, path: str, lines: tuple[int, int]) -> list[str]:
+        """The tests that run one of the lines, the quickest first; for what runs at import, all that run the file."""
+        by_line = self.tests.get(path, {})
+        names = {name for line in range(lines[0], lines[1] + 1) for name in by_line.get(line, [])}
+        if names == {""}:
+            names = {name for found in by_line.values() for name in found}
+        return sorted(names & self.seconds.keys(), key=lambda name: (self.seconds[name], name))
+
+
+def read_map(folder: Path, root: Path) -> CoverageMap:
+    """The map from what `measure` left in a folder."""
+    tests: dict[str, dict[int, list[str]]] = {}
+    seconds: dict[str, float] = {}
+    for file in sorted(folder.glob("*.coverage")):
+        times = file.with_suffix(".json")
+        if not times.exists():
+            continue
+        seconds |= json.loads(times.read_text())
+        data = coverage.CoverageData(basename=str(file))
+        data.read()
+        for source in data.measured_files():
+            by_line = tests.setdefault(Path(source).relative_to(root).as_posix(), {})
+            for line, names in data.contexts_by_lineno(source).items():
+                by_line.setdefault(line, []).extend(names)
+    return CoverageMap(tests, seconds)
+
+
+def measure(root: Path, files: list[Path], places: tuple[str, ...], folder: Path, workers: int) -> list[Path]:
+    """Run files of tests under coverage; those measured before are left out.
+
+    Returns:
+        The files for which nothing could be measured.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def run(file: Path) -> bool:
+        target = folder / (file.relative_to(root).as_posix().replace("/", "__") + ".coverage")
+        if target.exists() and target.with_suffix(".json").exists():
+            return True
+        environment = os.environ | {
+            "TWIN_COVERED": ",".join(str(root / place) for place in places),
+            "TWIN_COVERAGE_FILE": str(target),
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
+        subprocess.run(command, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        done = target.exists() and target.with_suffix(".json").exists()
+        print(f"{'measured' if done else 'NOT measured'} {file.relative_to(root)}", file=sys.stderr, flush=True)
+        return done
+
+    with ThreadPoolExecutor(workers) as pool:
+        done = list(pool.map(run, files))
+    return [file for file, good in zip(files, done, strict=True) if not good]

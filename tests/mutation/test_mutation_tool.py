@@ -1,0 +1,80 @@
+"""The mutation tool itself, on a toy tree: what it puts in, what it finds, what it calls a survivor."""
+
+import ast
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.mutation.__main__ import equivalents, summary
+from tests.mutation.campaign import read_verdicts, run_campaign
+from tests.mutation.coverage_map import measure, read_map
+from tests.mutation.mutants import mutants_below, mutants_of
+
+SOURCE = b'''"""A toy."""
+LENGTH: float = 2.0
+
+def half(x: float, limit: float = 3.0) -> float:
+    if x > limit:
+        raise ValueError(f"{x + 1} is beyond {limit}")
+    return x / LENGTH - 0.0 * x
+
+def unused(x):
+    return -x
+'''
+TESTS = """
+import pytest
+from toy import half
+
+def test_half():
+    assert half(3.0) == 1.5
+
+def test_limit():
+    with pytest.raises(ValueError):
+        half(3.5)
+"""
+
+
+def test_each_mutant_changes_one_expression_and_still_parses():
+    found = mutants_of("toy.py", SOURCE)
+    for one in found:
+        assert ast.dump(ast.parse(one.applied(SOURCE))) != ast.dump(ast.parse(SOURCE))
+    texts = {(one.before, one.after) for one in found}
+    assert ("x > limit", "False") in texts
+    assert ("x / LENGTH", "(x * LENGTH)") in texts
+    assert ("x / LENGTH - 0.0 * x", "(x / LENGTH)") in texts
+    assert not any("x + 1" in before for before, _ in texts)
+
+
+def test_keys_differ_and_do_not_move_with_other_code():
+    before = mutants_of("toy.py", SOURCE)
+    after = mutants_of("toy.py", b'"""Longer."""\n\nOTHER = 1\n' + SOURCE)
+    assert len({one.key for one in before}) == len(before)
+    assert {one.key for one in before} < {one.key for one in after}
+
+
+def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
+    root = tmp_path / "tree"
+    shutil.copytree(Path(__file__).parent, root / "tests/mutation", ignore=shutil.ignore_patterns("test_*", "__pycache__"))
+    (root / "toy.py").write_bytes(SOURCE)
+    (root / "tests/test_toy.py").write_text(TESTS)
+    assert measure(root, [root / "tests/test_toy.py"], ("toy.py",), tmp_path / "coverage", 1) == []
+    known = read_map(tmp_path / "coverage", root)
+    wanted = {("x / LENGTH", "(x * LENGTH)"): "killed", ("0.0 * x", "(0.0 / x)"): "survived", ("-x", "(x)"): "uncovered"}
+    chosen = [one for one in mutants_below(root, ("toy.py",)) if (one.before, one.after) in wanted]
+    run_campaign(root, chosen, known, tmp_path / "results.jsonl", 2, say=False)
+    found = read_verdicts(tmp_path / "results.jsonl")
+    assert {(one.mutant.before, one.mutant.after): one.fate for one in found.values()} == wanted
+    assert (root / "toy.py").read_bytes() == SOURCE
+    nothing_known = summary(list(found.values()), {})
+    assert nothing_known["score"] == pytest.approx(1 / 3)
+    (survivor,) = (one for one in found.values() if one.fate == "survived")
+    assert summary(list(found.values()), {survivor.mutant.key: "times nothing"})["score"] == pytest.approx(1 / 2)
+
+
+def test_every_equivalent_mutant_still_exists_and_has_a_reason():
+    root = Path(__file__).parents[2]
+    keys = {one.key for one in mutants_below(root, ("optics", "analysis", "twin"))}
+    known = equivalents()
+    assert known.keys() <= keys
+    assert all(len(reason) > 20 for reason in known.values())
