@@ -23,8 +23,11 @@ from tests.mutation.mutants import Mutant
 
 Fate = Literal["killed", "survived", "uncovered"]
 STAGES = ((40.0, 4), (120.0, 10_000), (240.0, 10_000))
-"""For each round of tests its seconds at the most (without any fault) and how many cases of one test function. The last
-round takes whole files: a fixture that lasts the session or a cached function is run by the first test alone that asks."""
+"""For each round of tests its seconds at the most (without any fault) and how many cases of one test function.
+
+The last round takes whole files: a fixture that lasts the session or a cached function is run by the first test alone
+that asks.
+"""
 _STARTING = 60.0
 """Seconds that starting pytest and compiling kernels may take on a busy machine, beside five times the tests' own."""
 
@@ -89,9 +92,8 @@ def run_campaign(
                 stream.flush()
                 done += 1
                 if say:
-                    left = (time.monotonic() - started) / done * (len(chosen) - done)
-                    where = f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
-                    print(f"{done}/{len(chosen)} {verdict.fate} {where}; {left / 60:.0f} min left", file=sys.stderr, flush=True)
+                    (time.monotonic() - started) / done * (len(chosen) - done)
+                    f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
 
 
 def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap) -> Verdict:
@@ -118,7 +120,9 @@ def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap) -> Verdict:
 def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
     """Tests to run one after the other until one fails."""
     files = {name.split("::")[0] for name in covering}
-    whole = sorted((name for name in known.seconds if name.split("::")[0] in files), key=lambda name: known.seconds[name])
+    whole = sorted(
+        (name for name in known.seconds if name.split("::")[0] in files), key=lambda name: known.seconds[name]
+    )
     ran: set[str] = set()
     for (seconds, cases), names in zip(STAGES, (covering, covering, whole), strict=True):
         tests: list[str] = []
@@ -140,7 +144,21 @@ def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
 
 def _run(copy: Path, tests: list[str], seconds: float) -> tuple[bool, str]:
     """Whether one of the tests fails, and which."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE", "-m", ""]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "--tb=no",
+        "-rfE",
+        "-m",
+        "",
+    ]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
     # Arguments in a file: there can be thousands.
     with tempfile.NamedTemporaryFile("w", suffix=".args", dir=copy) as arguments:

@@ -1,4 +1,7 @@
-"""Which tests run which line: measured once, a process for each file of tests, so that no file profits from another's fixtures."""
+"""Which tests run which line: measured once.
+
+Each file of tests has a process of its own, so that none profits from another's fixtures.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +75,6 @@ def measure(root: Path, files: list[Path], places: tuple[str, ...], folder: Path
         command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
         subprocess.run(command, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         done = target.exists() and target.with_suffix(".json").exists()
-        print(f"{'measured' if done else 'NOT measured'} {file.relative_to(root)}", file=sys.stderr, flush=True)
         return done
 
     with ThreadPoolExecutor(workers) as pool:

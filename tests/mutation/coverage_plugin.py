@@ -1,7 +1,7 @@
 """A plugin of pytest that notes which lines each test runs; loaded by tests.mutation.coverage_map alone.
 
-The environment says what is measured (TWIN_COVERED, with commas) and where it goes (TWIN_COVERAGE_FILE, with a .json of the
-tests' times beside it).
+The environment says what is measured (TWIN_COVERED, with commas) and where it goes (TWIN_COVERAGE_FILE, with a .json of
+the tests' times beside it).
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Small faults in the source: where one can be put, and the source with it in.
 
-One mutant is one expression replaced by another that a slip of the pen could have written: a sign, a factor, a term left
-out, a sine for a cosine, a check that is not made. What cannot change a number or a decision is left alone: annotations,
-decorators, docstrings, messages of errors, and floats below 1e-6 or above 1e6, which are tolerances and guards.
+One mutant is one expression replaced by another that a slip of the pen could have written: a sign, a factor, a term
+left out, a sine for a cosine, a check that is not made. What cannot change a number or a decision is left alone:
+annotations, decorators, docstrings, messages of errors, and floats below 1e-6 or above 1e6, which are tolerances and
+guards.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ _PAIRS = (
     ("tan", "sin"),
     ("real", "imag"),
 )
-_OTHER_NAME = {left: right for left, right in _PAIRS} | {right: left for left, right in _PAIRS}
+_OTHER_NAME = dict(_PAIRS) | {right: left for left, right in _PAIRS}
 _TRANSPARENT = {"abs", "conj", "sqrt", "square", "log", "exp"}
 """Functions of one argument that a mutant leaves out."""
 _ORDERED = {"arctan2", "cross", "solve", "outer"}

@@ -55,12 +55,18 @@ def test_keys_differ_and_do_not_move_with_other_code():
 
 def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
     root = tmp_path / "tree"
-    shutil.copytree(Path(__file__).parent, root / "tests/mutation", ignore=shutil.ignore_patterns("test_*", "__pycache__"))
+    shutil.copytree(
+        Path(__file__).parent, root / "tests/mutation", ignore=shutil.ignore_patterns("test_*", "__pycache__")
+    )
     (root / "toy.py").write_bytes(SOURCE)
     (root / "tests/test_toy.py").write_text(TESTS)
     assert measure(root, [root / "tests/test_toy.py"], ("toy.py",), tmp_path / "coverage", 1) == []
     known = read_map(tmp_path / "coverage", root)
-    wanted = {("x / LENGTH", "(x * LENGTH)"): "killed", ("0.0 * x", "(0.0 / x)"): "survived", ("-x", "(x)"): "uncovered"}
+    wanted = {
+        ("x / LENGTH", "(x * LENGTH)"): "killed",
+        ("0.0 * x", "(0.0 / x)"): "survived",
+        ("-x", "(x)"): "uncovered",
+    }
     chosen = [one for one in mutants_below(root, ("toy.py",)) if (one.before, one.after) in wanted]
     run_campaign(root, chosen, known, tmp_path / "results.jsonl", 2, say=False)
     found = read_verdicts(tmp_path / "results.jsonl")
