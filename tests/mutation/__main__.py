@@ -18,7 +18,7 @@ from tests.mutation.mutants import mutants_below
 HELP = """Put small faults into the source, one at a time, and see whether a test finds each.
 
 A seeded sample of all possible faults is drawn from the physics and the estimators. The tests that run a fault's lines
-are tried, quick ones first, until one fails. What survives is either a gap in the tests or changes nothing that could be
+are tried, quick ones first, until one fails. What survives is either a gap in the tests or changes nothing that can be
 seen; the second kind stands in equivalent.yaml with its reason. An interrupted campaign goes on where it was.
 
 Examples:

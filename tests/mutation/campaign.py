@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import queue
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -15,6 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -28,8 +31,12 @@ STAGES = ((40.0, 4), (120.0, 10_000), (240.0, 10_000))
 The last round takes whole files: a fixture that lasts the session or a cached function is run by the first test alone
 that asks.
 """
-_STARTING = 60.0
-"""Seconds that starting pytest and compiling kernels may take on a busy machine, beside five times the tests' own."""
+_STARTING = 60
+"""Processor seconds that starting pytest and compiling kernels may take, beside ten times what the tests take.
+
+Not time on the clock, for a busy machine must not make a mutant look as if it hung."""
+_WAITING = 3600.0
+"""Seconds after which a mutant that waits for ever, without computing, is given up."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +167,7 @@ def _run(copy: Path, tests: list[str], seconds: float) -> tuple[bool, str]:
         "",
     ]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+    limit = _STARTING + int(10.0 * seconds)
     # Arguments in a file: there can be thousands.
     with tempfile.NamedTemporaryFile("w", suffix=".args", dir=copy) as arguments:
         arguments.write("\n".join(tests))
@@ -171,10 +179,13 @@ def _run(copy: Path, tests: list[str], seconds: float) -> tuple[bool, str]:
                 env=environment,
                 capture_output=True,
                 text=True,
-                timeout=5.0 * seconds + _STARTING,
+                timeout=_WAITING,
+                preexec_fn=partial(resource.setrlimit, resource.RLIMIT_CPU, (limit, limit + 5)),
             )
         except subprocess.TimeoutExpired:
             return True, "time"
+    if ended.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        return True, "time"
     if ended.returncode == 0:
         return False, ""
     failed = [line for line in ended.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
