@@ -76,6 +76,9 @@ def main(
     only: Annotated[str | None, typer.Option(help="Files or folders of the source, with commas between them.")] = None,
     seed: Annotated[int, typer.Option(help="Which faults are drawn.")] = 1,
     workers: Annotated[int, typer.Option(min=1, help="How many at once.")] = 2,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="The quickest tests of each fault only; more survive.")
+    ] = False,
     again: Annotated[
         bool, typer.Option("--again", help="Try the survivors again, with coverage measured anew.")
     ] = False,
@@ -99,7 +102,7 @@ def main(
     if todo:
         files = [file for name in TESTS for file in sorted((root / "tests" / name).glob("test_*.py"))]
         measure(root, files, PLACES, folder, workers)
-        run_campaign(root, todo, read_map(folder, root), results, workers)
+        run_campaign(root, todo, read_map(folder, root), results, workers, 1 if quick else 3)
     verdicts = read_verdicts(results)
     found = summary([verdicts[one.key] for one in chosen], equivalents())
     (out / "summary.json").write_text(json.dumps(found, indent=2) + "\n")

@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +26,7 @@ from tests.mutation.coverage_map import CoverageMap
 from tests.mutation.mutants import Mutant
 
 Fate = Literal["killed", "survived", "uncovered"]
-STAGES = ((40.0, 4), (120.0, 10_000), (240.0, 10_000))
+STAGES = ((25.0, 3), (60.0, 10_000), (120.0, 10_000))
 """For each round of tests its seconds at the most (without any fault) and how many cases of one test function.
 
 The last round takes whole files: a fixture that lasts the session or a cached function is run by the first test alone
@@ -76,9 +77,9 @@ def read_verdicts(file: Path) -> dict[str, Verdict]:
 
 
 def run_campaign(
-    root: Path, chosen: list[Mutant], known: CoverageMap, results: Path, workers: int, say: bool = True
+    root: Path, chosen: list[Mutant], known: CoverageMap, results: Path, workers: int, most: int = 3, say: bool = True
 ) -> None:
-    """Try every mutant and add a line to the results as soon as its fate is known."""
+    """Try every mutant, in ``most`` rounds of tests, and add a line to the results as soon as its fate is known."""
     with _copies(root, workers) as copies, ThreadPoolExecutor(workers) as pool:
         free: queue.SimpleQueue[Path] = queue.SimpleQueue()
         for copy in copies:
@@ -87,7 +88,7 @@ def run_campaign(
         def work(mutant: Mutant) -> Verdict:
             copy = free.get()
             try:
-                return try_mutant(copy, mutant, known)
+                return try_mutant(copy, mutant, known, most)
             finally:
                 free.put(copy)
 
@@ -103,7 +104,7 @@ def run_campaign(
                     f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
 
 
-def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap) -> Verdict:
+def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3) -> Verdict:
     """Put a fault into a copy of the tree, run the tests that meet it, quick ones first, and take it out again."""
     started = time.monotonic()
     covering = known.covering(mutant.path, mutant.line)
@@ -114,7 +115,7 @@ def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap) -> Verdict:
     file.write_bytes(mutant.applied(source))
     count = 0
     try:
-        for tests in rounds(covering, known):
+        for tests in islice(rounds(covering, known), most):
             count += len(tests)
             killed, by = _run(copy, tests, sum(known.seconds[name] for name in tests))
             if killed:
