@@ -1,6 +1,7 @@
 """Fixtures that every test may use. They last the session, so that kernels compile and cameras are derived once."""
 
 import os
+import signal
 from functools import cache
 
 import pytest
@@ -39,7 +40,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Leave linear algebra one thread in each of several processes, before they are started and load it.
 
     Several threads of OpenBLAS wait actively, for each other's processor. Dr.Jit's wait asleep and stay as they are.
+
+    Under ``nohup`` every process starts deaf to SIGHUP, and the programs respect it; the tests of that signal do not
+    mean it.
     """
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if getattr(config.option, "numprocesses", None):
         for library in ("OPENBLAS", "OMP", "MKL"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")

@@ -532,6 +532,9 @@ def test_an_existing_folder_is_replaced_only_by_force(fake, tmp_path):
     assert (second.exit_code, second.stdout) == (2, "")
     assert "--force" in second.stderr
     assert (target / "note.txt").exists()
+    third = run("--out", target, "--force")
+    assert (third.exit_code, "note.txt" in third.stderr) == (2, True)
+    (target / "note.txt").unlink()
     assert run("--out", target, "--force").exit_code == 0
     assert files(target) == FILES
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
