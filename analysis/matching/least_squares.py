@@ -8,18 +8,24 @@ with u counted from the template's middle, A an affine matrix, and second deriva
 sharpness. The template is interpolated and not the image, so that the image's noise enters as it is and does not pull
 the fit towards places between pixels, where an interpolated image is smoother.
 
+**Noise of the template.** Its slopes are steeper than those of what it shows, so that a fit of it as it is claims too
+much and its place leans towards whole pixels: errors in variables. The best prediction of the image by such a template
+is a low pass of it (Wiener), and what that leaves is uncorrelated with what it was made from. So each template is
+smoothed by the strongest Gaussian of some whose residuals in the image are the least but for chance, and the second
+derivatives fit the rest. Neither noise needs to be known, and a template without noise is hardly smoothed.
+
 **Covariance.** Noise of the image, interpolated noise of the template and what the model leaves unexplained all stand
 in the residuals. Assumed: over one window they are stationary, with a variance of its own (residual square sum over
 redundancy) and with a correlation of neighbours up to three pixels that all points share. It is the median over
 the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel)
-the covariance is B C B'. The noise of a template that is as noisy as the image would make slopes too steep and the
-place lean towards whole pixels; the second derivatives act as a smoothing that the fit chooses, and take nearly all of
-it away. Not in the covariance: what pulls all points alike (an error of the reference's georeference), aliasing of the
-image, and the interpolation's own error, some thousandths of a pixel for detail up to 0.45 cycles a pixel.
+the covariance is B C B', and more where smoothing leaves few residuals to tell it by. To it comes what residuals tell
+of displacements that differ within the window (`analysis.matching.window_relief`) and the error of interpolation. Not
+in the covariance: what pulls all points alike (an error of the reference's georeference) and aliasing of the image.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -29,7 +35,8 @@ from analysis.matching.checks import checked_image, checked_places, checked_temp
 from analysis.matching.options import MatchOptions
 from analysis.matching.reason import Reason
 from analysis.matching.residual_correlation import ResidualCorrelation, residual_correlation
-from analysis.matching.spline import SplineStack
+from analysis.matching.spline import SplineStack, low_passed
+from analysis.matching.window_relief import WindowRelief, window_relief
 
 __all__ = ["Fits", "least_squares"]
 
@@ -42,6 +49,12 @@ _REST = 2e-4
 _LONGEST_STEP = 0.7
 # Steps are found to this relative accuracy where the normal matrix is singular.
 _RIDGE = 1e-11
+# Rms of the Gaussians a template may be smoothed by, px; those of a ninth of the window at most.
+_SMOOTHINGS = (0.0, 0.35, 0.7, 1.1, 1.7, 2.6)
+# Chi-square of one unknown, exceeded by chance in 5 per cent.
+_CHANCE = 4.0
+# Standard deviation of a place by interpolation of detail up to 0.45 cycles a pixel without noise, px.
+_INTERPOLATION = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +69,12 @@ class Fits:
         sigma: (n,) residual standard deviation, DN of the image, by redundancy.
         contrast: (n,) standard deviation of the image in the window over that of one pixel's noise, the latter from
             differences of 2 x 2 pixels.
+        smoothing: (n,) rms of the Gaussian that the template was smoothed by, px.
         iterations: (n,) steps.
         reason: (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, SATURATED, FLAT, DIVERGED, MOVED,
             DISTORTED.
-        spread: what the covariance is made of.
+        spread: what the covariance of the noise is made of.
+        relief: what is seen of displacements within the windows.
     """
 
     place: Array
@@ -68,13 +83,37 @@ class Fits:
     correlation: Array
     sigma: Array
     contrast: Array
+    smoothing: Array
     iterations: Index
     reason: NDArray[np.int8]
     spread: ResidualCorrelation
+    relief: WindowRelief
 
     def covariance(self, good: NDArray[np.bool_] | None = None) -> Array:
-        """(n, 2, 2) px^2 of places, with the correlation of residuals of points good (n,); None: the converged."""
-        return self.spread.covariance(self.reason == Reason.ACCEPTED if good is None else good)
+        """(n, 2, 2) px^2 of places, with what points good (n,) have in common; None: the converged."""
+        noise, relief = self.covariances(good)
+        return noise + relief
+
+    def covariances(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
+        """The two parts of `covariance`: of noise and interpolation, and of displacements within the window."""
+        common = self.reason == Reason.ACCEPTED if good is None else good
+        noise = self.spread.covariance(common)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            coloured = np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2)
+        relief = self.relief.covariance(self.spread.variance, coloured, common)
+        return noise * self._hidden()[:, None, None] + _INTERPOLATION**2 * np.eye(2), relief
+
+    def _hidden(self) -> Array:
+        """(n,) by how much more noise there is where the slopes are than the residuals show; NaN if they show none.
+
+        A smoothed template has one independent value to 4 pi rms^2 pixels. Its noise is in these alone and loses one to
+        each unknown, while that of the image is white. With equal noise in both, and where half of the amplitude passes
+        the smoothing, as slopes do, the template has a third of it.
+        """
+        unknowns = self.spread.unknowns
+        with np.errstate(invalid="ignore", divide="ignore"):
+            left = self.spread.pixels / (4.0 * np.pi * self.smoothing**2) - unknowns
+            return np.where(self.smoothing > 0, np.where(left > 0, 1.0 + unknowns / (3.0 * left), np.nan), 1.0)
 
 
 def least_squares(
@@ -107,9 +146,13 @@ def least_squares(
     columns = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in fields(Fits)
-        if field.name != "spread"
+        if field.name not in ("spread", "relief")
     }
-    return Fits(**columns, spread=ResidualCorrelation.joined([part.spread for part in parts]))
+    return Fits(
+        **columns,
+        spread=ResidualCorrelation.joined([part.spread for part in parts]),
+        relief=WindowRelief.joined([part.relief for part in parts]),
+    )
 
 
 def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:
@@ -118,8 +161,6 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
     reach = half - options.margin
     row, column = (g.ravel().astype(np.float64) for g in np.mgrid[-reach : reach + 1, -reach : reach + 1])
     grey, anchor, reason = _windows(image, templates, start, reach, options)
-    stack = SplineStack(np.where((reason == 0)[:, None, None], templates, 0.0))
-
     shift = start - anchor
     affine = np.tile(np.eye(2), (count, 1, 1))
     linear = np.full((count, options.parameters - 2 - 4 * options.affine), np.nan)
@@ -127,30 +168,47 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
     iterations = np.zeros(count, np.intp)
     design = np.zeros((count, options.parameters, row.size))
     residual = np.full((count, row.size), np.nan)
-    going = np.flatnonzero(reason == 0)
-    for iteration in range(options.iterations + 1):
-        if not going.size:
-            break
-        step, design[going], residual[going] = _step(
-            stack, going, grey[going], (row, column), shift[going], affine[going], linear[going, 1:], iteration, options
-        )
-        size = np.abs(step[:, :2]).max(axis=1)
-        turn = step[:, 2:6].reshape(-1, 2, 2) if options.affine else np.zeros((going.size, 2, 2))
-        rest = np.maximum(size, reach * np.abs(turn).max(axis=(1, 2))) < _REST
-        moved = iteration > 0
-        short = np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))[:, None]
-        if moved:
-            shift[going] += short * step[:, :2]
-            affine[going] += short[:, :, None] * turn
-        linear[going] = step[:, 2 + 4 * options.affine :]
-        iterations[going] = iteration
-        far = np.abs(shift[going] + anchor[going] - start[going]).max(axis=1) > options.largest_move
-        bent = np.abs(affine[going] - np.eye(2)).max(axis=(1, 2)) > options.largest_distortion
-        reason[going[bent]] = Reason.DISTORTED
-        reason[going[far]] = Reason.MOVED
-        going = going[~((rest & moved) | far | bent)]
-    reason[going] = Reason.DIVERGED
-    return _summary(grey, anchor + shift, affine, linear, design, residual, iterations, reason, reach)
+    patch = np.where((reason == 0)[:, None, None], templates, 0.0)
+    smoothing = np.zeros(count)
+    # at the start a template that is not yet in place seems to need more smoothing than at the end
+    for turn in range(2):
+        going = np.flatnonzero(reason == 0)
+        most = float(smoothing.max(initial=0.0)) if turn else math.inf
+        chosen = _best_smoothing(patch, going, grey, (row, column), shift, affine, most, options)
+        going = going[(chosen != smoothing)[going] | (turn == 0)]
+        smoothing = chosen
+        stack = SplineStack(low_passed(patch, smoothing))
+        for iteration in range(options.iterations + 1):
+            if not going.size:
+                break
+            step, design[going], residual[going] = _step(
+                stack,
+                going,
+                grey[going],
+                (row, column),
+                shift[going],
+                affine[going],
+                linear[going, 1:],
+                iteration,
+                options,
+            )
+            size = np.abs(step[:, :2]).max(axis=1)
+            bend = step[:, 2:6].reshape(-1, 2, 2) if options.affine else np.zeros((going.size, 2, 2))
+            rest = np.maximum(size, reach * np.abs(bend).max(axis=(1, 2))) < _REST
+            moved = iteration > 0
+            short = np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))[:, None]
+            if moved:
+                shift[going] += short * step[:, :2]
+                affine[going] += short[:, :, None] * bend
+            linear[going] = step[:, 2 + 4 * options.affine :]
+            iterations[going] += moved
+            far = np.abs(shift[going] + anchor[going] - start[going]).max(axis=1) > options.largest_move
+            bent = np.abs(affine[going] - np.eye(2)).max(axis=(1, 2)) > options.largest_distortion
+            reason[going[bent]] = Reason.DISTORTED
+            reason[going[far]] = Reason.MOVED
+            going = going[~((rest & moved) | far | bent)]
+        reason[going] = Reason.DIVERGED
+    return _summary(grey, anchor + shift, affine, linear, design, residual, smoothing, iterations, reason, reach)
 
 
 def _windows(
@@ -180,6 +238,38 @@ def _windows(
     return grey, np.where(reason[:, None] == Reason.TEMPLATE, 0.0, anchor), reason
 
 
+def _best_smoothing(
+    templates: Array,
+    which: Index,
+    grey: Array,
+    window: tuple[Array, Array],
+    shift: Array,
+    affine: Array,
+    most: float,
+    options: MatchOptions,
+) -> Array:
+    """(n,) px, most at most: the strongest with which templates predict the image as well as with the best, after one
+    linear step. 0 for those that are not which.
+    """
+    best = np.zeros(len(templates))
+    if not which.size:
+        return best
+    # the gain of the first guess only scales columns, which residuals do not feel
+    linear = np.zeros((which.size, options.parameters - 3 - 4 * options.affine))
+    linear[:, :1] = 1.0
+    most = min(most, math.sqrt(grey.shape[1]) / 9.0)
+    some = np.array([smoothing for smoothing in _SMOOTHINGS if smoothing <= most])
+    square = np.zeros((len(some), which.size))
+    for k, smoothing in enumerate(some):
+        stack = SplineStack(low_passed(templates, np.full(len(templates), smoothing)))
+        residual = _step(stack, which, grey[which], window, shift[which], affine[which], linear, 1, options)[2]
+        square[k] = np.einsum("np,np->n", residual, residual)
+    # too little smoothing claims too much, too much loses a little
+    alike = square <= square.min(axis=0) * (1.0 + _CHANCE / grey.shape[1])
+    best[which] = some[len(some) - 1 - np.argmax(alike[::-1], axis=0)]
+    return best
+
+
 def _step(
     stack: SplineStack,
     which: Index,
@@ -194,11 +284,13 @@ def _step(
     """Gauss-Newton step of place and matrix with the new linear unknowns, design (m, q, p) and residuals (m, p)."""
     apart = np.stack([window[0] - shift[:, :1], window[1] - shift[:, 1:]], axis=1)
     u = affine @ apart + stack.size // 2
-    value = stack(u[:, 0], u[:, 1], which, order=3 if options.sharpness else 1)
+    # third derivatives only count where the second have a share
+    bent = options.sharpness and bool(linear[:, 1:].any())
+    value = stack(u[:, 0], u[:, 1], which, order=2 + bent if options.sharpness else 1)
     # the linear unknowns are not known before the first pass, which finds them for the place at the start
     known = linear.T[:, :, None] if iteration else np.zeros((linear.shape[1], len(grey), 1))
     by_row, by_column = known[0] * value[1], known[0] * value[2]
-    if options.sharpness:
+    if bent:
         by_row = by_row + known[1] * value[6] + known[2] * value[8]
         by_column = by_column + known[1] * value[7] + known[2] * value[9]
     slope = np.stack([by_row, by_column], axis=1)
@@ -226,6 +318,7 @@ def _summary(
     linear: Array,
     design: Array,
     residual: Array,
+    smoothing: Array,
     iterations: Index,
     reason: NDArray[np.int8],
     reach: int,
@@ -243,9 +336,7 @@ def _summary(
         contrast = np.sqrt(total / grey.shape[1]) / (
             0.7413 * np.median(np.abs(checker).reshape(len(grey), (side - 1) ** 2), axis=1)
         )
-    spread = residual_correlation(
-        np.where(none[:, None, None], np.nan, design), np.where(none[:, None], np.nan, residual), side
-    )
+    fitted = np.where(none[:, None, None], np.nan, design), np.where(none[:, None], np.nan, residual)
     hidden = np.where(none, np.nan, 1.0)
     return Fits(
         place * hidden[:, None],
@@ -254,7 +345,9 @@ def _summary(
         correlation * hidden,
         np.sqrt(square / redundancy) * hidden,
         contrast,
+        smoothing * hidden,
         iterations,
         reason,
-        spread,
+        residual_correlation(*fitted, side),
+        window_relief(*fitted, side),
     )

@@ -26,7 +26,8 @@ class Matches:
 
     Attributes:
         place: (n, 2) row and column of the templates' middles in the image; NaN where least squares matching gave none.
-        covariance: (n, 2, 2) px^2, for those that follow the model; see `analysis.matching.least_squares`.
+        covariance: (n, 2, 2) px^2, of noise and of displacements within the window; see
+            `analysis.matching.least_squares`.
         correlation: (n,) of the image with the fitted template; of the search where there is no fit; NaN if neither.
         ratio: (n,) second best to best peak of the search.
         accepted: (n,) bool.
@@ -89,9 +90,11 @@ def match(
     weak = np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value) < chosen.least_correlation
     reason[_open(reason) & weak] = Reason.WEAK
     reason[(reason == 0) & (peaks.ratio > chosen.largest_ratio)] = Reason.AMBIGUOUS
-    covariance = fits.covariance(reason == Reason.ACCEPTED)
+    noise, relief = fits.covariances(reason == Reason.ACCEPTED)
+    covariance = noise + relief
     # NaN compares false
-    reason[(reason == 0) & ~(_worst(covariance) <= chosen.largest_sigma)] = Reason.UNCERTAIN
+    reason[(reason == 0) & ~(_worst(noise) <= chosen.largest_sigma)] = Reason.UNCERTAIN
+    reason[(reason == 0) & ~(_worst(covariance) <= chosen.largest_sigma)] = Reason.RELIEF
     reason[_open(reason) & (reason != 0) & (fits.contrast < chosen.least_contrast)] = Reason.FLAT
     return Matches(
         place=fits.place,

@@ -15,17 +15,19 @@ class MatchOptions:
     Attributes:
         affine: solve for an affine change beside the shift.
         sharpness: solve for a difference in sharpness along rows and columns (second derivatives of the template).
-            Where the template is noisy (image against image) this also damps its noise; without it the slopes of a
-            noisy template are too steep, the place is drawn towards whole pixels, and the covariance is too small.
+            They also fit what the smoothing of a noisy template leaves; without it the place of image against image
+            is drawn towards whole pixels.
         margin: rows and columns at each side of a template that only feed its interpolation, px; also bounds how far
             the fit may go before the template's rim enters it.
         iterations: most Gauss-Newton steps.
-        least_correlation: of template and image after the fit; below it WEAK. White noise of r times the texture's
-            standard deviation alone brings it down to 1 / sqrt(1 + r^2).
+        least_correlation: of the fitted, smoothed template and the image; below it WEAK. A guard against the unrelated
+            only: white noise of r times the texture's standard deviation in the image alone brings it down to
+            1 / sqrt(1 + r^2), and largest_sigma judges what that leaves.
         largest_ratio: of the second best to the best peak of the search; above it AMBIGUOUS.
         largest_move: of the fit from the search's peak along an axis, px.
         largest_distortion: of any element of the affine matrix from the unit matrix.
-        largest_sigma: of the place along its worst direction, px.
+        largest_sigma: of the place along its worst direction, px; above it UNCERTAIN, or RELIEF where only
+            displacements within the window bring it there.
         least_contrast: standard deviation of the image under the template over that of one pixel's noise; a point that
             fails otherwise is called FLAT below it.
         saturation: DN from which a pixel counts as saturated; None: the largest value of an integer type.
@@ -35,7 +37,7 @@ class MatchOptions:
     sharpness: bool = True
     margin: int = 3
     iterations: int = 20
-    least_correlation: float = 0.6
+    least_correlation: float = 0.3
     largest_ratio: float = 0.9
     largest_move: float = 1.5
     largest_distortion: float = 0.2

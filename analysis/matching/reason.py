@@ -23,6 +23,7 @@ class Reason(IntEnum):
     MOVED = 10
     DISTORTED = 11
     UNCERTAIN = 12
+    RELIEF = 13
 
     @property
     def text(self) -> str:
@@ -44,4 +45,5 @@ _TEXTS = {
     Reason.MOVED: "least squares matching left the correlation's peak",
     Reason.DISTORTED: "the affine change is too large",
     Reason.UNCERTAIN: "the standard deviation is too large",
+    Reason.RELIEF: "parts of the window are displaced against each other",
 }

@@ -28,12 +28,15 @@ class ResidualCorrelation:
         white: (n, 2, 2) covariance of the place for residuals that are white with unit variance.
         influence: (n, lags, 2, 2) by how much correlation 1 at a lag and at its opposite raises it.
         correlation: (n, lags) of the residuals, freed of what the fit takes out of white noise.
+        pixels, unknowns: (n,) of the fits.
     """
 
     variance: Array
     white: Array
     influence: Array
     correlation: Array
+    pixels: NDArray[np.intp]
+    unknowns: NDArray[np.intp]
 
     @staticmethod
     def joined(parts: Sequence[ResidualCorrelation]) -> ResidualCorrelation:
@@ -41,11 +44,16 @@ class ResidualCorrelation:
         columns = ([getattr(part, name) for part in parts] for name in ResidualCorrelation.__annotations__)
         return ResidualCorrelation(*(np.concatenate(column) for column in columns))
 
+    @property
+    def plain(self) -> Array:
+        """(n, 2, 2) px^2, for white residuals."""
+        return np.asarray(self.variance[:, None, None] * self.white)
+
     def covariance(self, good: NDArray[np.bool_]) -> Array:
         """(n, 2, 2) px^2, with the median correlation of points good (n,)."""
         chosen = self.correlation[good & np.isfinite(self.variance)]
         if not len(chosen):
-            return np.asarray(self.variance[:, None, None] * self.white)
+            return self.plain
         matrix = self.white + np.einsum("l,nlij->nij", np.median(chosen, axis=0), self.influence)
         # in units of the white one, so that no direction falls below its share
         (a, b), (_, c) = np.moveaxis(self.white, 0, -1)
@@ -67,10 +75,11 @@ def residual_correlation(design: Array, residual: Array, side: int) -> ResidualC
     white = np.full((count, 2, 2), np.nan)
     influence = np.full((count, len(_LAGS), 2, 2), np.nan)
     correlation = np.full((count, len(_LAGS)), np.nan)
+    size = np.full(count, pixels), np.full(count, unknowns)
     scale = np.sqrt(np.einsum("nqp,nqp->nq", design, design))
     used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all(scale > 0, axis=1))
     if not used.size:
-        return ResidualCorrelation(variance, white, influence, correlation)
+        return ResidualCorrelation(variance, white, influence, correlation, *size)
     scaled = design[used] / scale[used, :, None]
     # a pseudo-inverse, because some unknowns may be open where there is little texture
     inverse = np.linalg.pinv(scaled @ np.swapaxes(scaled, 1, 2), rcond=1e-11, hermitian=True)
@@ -91,4 +100,4 @@ def residual_correlation(design: Array, residual: Array, side: int) -> ResidualC
         taken = np.einsum("nqab,nqab->n", hat[here], column[there])
         seen = np.einsum("nab,nab->n", rest[here], rest[there])
         correlation[used, k] = (seen / variance[used] + taken) / pairs
-    return ResidualCorrelation(variance, white, influence, correlation)
+    return ResidualCorrelation(variance, white, influence, correlation, *size)

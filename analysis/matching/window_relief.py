@@ -1,0 +1,146 @@
+"""Displacement that differs within a window: parallax of relief, motion, an edge of depth.
+
+The fit takes one affine displacement for the whole window. What the ground adds to it leaves a trace in the residuals:
+slopes of the template times the local displacement. It is looked for as a random field d, of zero mean and covariance
+
+    tau^2 (1 + a) exp(-a),   a = sqrt(3) distance / length    (Matern, 3/2),
+
+on 5 x 5 blocks, with the side of the window for its length; both axes alike and independent. With Z (pixels by
+block and axis) the template's slopes, M the projection that fits everything else out, residuals r = M (Z d + noise),
+the score q = r'Z K Z'r has the expectation s^2 tr(K G) + tau^2 tr(K G K G), G = Z'M Z, and is the locally most powerful
+test of tau = 0 (a score test of a variance component). Its moments give tau^2; the place sought is that of the window's
+middle, d(0), and what the fit makes of d instead stands in the covariance.
+
+Few points say enough about tau alone. So they share one tau^2, the mean with the weights of its precision, taken as the
+mean of what it may be without being negative; those that stand out have their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+__all__ = ["WindowRelief", "window_relief"]
+
+Array = NDArray[np.float64]
+_BLOCKS = 5
+# Of the field over the window's side: shorter ones would be noise to the affine change, longer ones follow it.
+_LENGTH = 1.0
+# Standard deviations of tau^2 under no relief from which a point has its own; chance alone exceeds it in some 1e-3.
+_OWN = 4.0
+# To which it counts for all.
+_HELD = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class WindowRelief:
+    """Of n fits; NaN where there is none.
+
+    Attributes:
+        score: (n,) q, DN^2.
+        first: (n,) tr(K G): the score's expectation for white residuals of unit variance.
+        second: (n,) tr(K G K G), DN^2 px^-2: its expectation for tau of 1 px.
+        redundancy: (n,) of the fit.
+        effect: (n, 2, 2) covariance of the place for tau of 1 px.
+    """
+
+    score: Array
+    first: Array
+    second: Array
+    redundancy: Array
+    effect: Array
+
+    @staticmethod
+    def joined(parts: Sequence[WindowRelief]) -> WindowRelief:
+        """One after the other."""
+        columns = ([getattr(part, name) for part in parts] for name in WindowRelief.__annotations__)
+        return WindowRelief(*(np.concatenate(column) for column in columns))
+
+    def covariance(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> Array:
+        """What relief adds to the covariance of places.
+
+        Args:
+            variance: (n,) of the residuals, DN^2, by redundancy.
+            coloured: (n,) how much larger the correlation of residuals makes the covariance of the place than white
+                residuals would.
+            good: (n,) points that share what they have in common.
+
+        Returns:
+            (n, 2, 2) px^2.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            # relief is in the residuals' variance, too, which sets the noise that is taken off the score
+            rise = self.second - coloured * self.first**2 / self.redundancy
+            found = (self.score - variance * coloured * self.first) / rise
+            error = variance * coloured * np.sqrt(2.0 * self.second) / rise
+        known = np.isfinite(found) & (rise > 0) & (error > 0)
+        apart = np.zeros(len(found), bool)
+        apart[known] = found[known] > _OWN * error[known]
+        common = known & good
+        weight = 1.0 / error[common] ** 2
+        # what stands out counts a little: left out, it would make the others' relief too small
+        held = np.minimum(found, _HELD * error)[common]
+        total = float(weight.sum())
+        shared = _not_negative(float(weight @ held) / total, total**-0.5) if common.any() else 0.0
+        tau = np.where(apart, np.maximum(np.where(known, found, 0.0), shared), shared)
+        return np.asarray(tau[:, None, None] * self.effect)
+
+
+def _not_negative(value: float, error: float) -> float:
+    """Mean of a normal distribution's part above 0: a little more than nothing where value says nothing."""
+    at = value / error
+    return value + error * float(np.exp(norm.logpdf(at) - norm.logcdf(at)))
+
+
+def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
+    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit."""
+    count, unknowns, pixels = design.shape
+    score, first, second, redundancy = np.full((4, count), np.nan)
+    effect = np.full((count, 2, 2), np.nan)
+    scale = np.sqrt(np.einsum("nqp,nqp->nq", design, design))
+    used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all(scale > 0, axis=1))
+    if not used.size:
+        return WindowRelief(score, first, second, redundancy, effect)
+    share, field, middle = _field(side)
+    scaled = design[used] / scale[used, :, None]
+    inverse = np.linalg.pinv(scaled @ np.swapaxes(scaled, 1, 2), rcond=1e-11, hermitian=True)
+    slope = design[used, :2]
+    # (n, 2, ..., blocks): by the block's displacement along an axis; together (n, ..., 2 blocks)
+    seen = np.einsum("nap,pb->nab", slope * residual[used, None], share).reshape(len(used), -1)
+    shared = np.stack([(scaled * slope[:, a, None]) @ share for a in range(2)], axis=2)
+    shared = shared.reshape(len(used), unknowns, -1)
+    square = np.zeros((len(used), 2, len(field), 2, len(field)))
+    diagonal = np.arange(len(field))
+    for a in range(2):
+        for b in range(2):
+            square[:, a, diagonal, b, diagonal] = (slope[:, a] * slope[:, b]) @ share
+    free = square.reshape(len(used), 2 * len(field), 2 * len(field))
+    free = free - np.swapaxes(shared, 1, 2) @ inverse @ shared
+    both, at_middle = np.kron(np.eye(2), field), np.kron(np.eye(2), middle)
+    product = both @ free
+    score[used] = np.einsum("ni,ij,nj->n", seen, both, seen)
+    first[used] = np.trace(product, axis1=1, axis2=2)
+    second[used] = np.einsum("nij,nji->n", product, product)
+    redundancy[used] = pixels - unknowns
+    taken = (inverse[:, :2] @ shared) / scale[used, :2, None]
+    cross = at_middle @ np.swapaxes(taken, 1, 2)
+    effect[used] = np.eye(2) - cross - np.swapaxes(cross, 1, 2) + taken @ both @ np.swapaxes(taken, 1, 2)
+    return WindowRelief(score, first, second, redundancy, effect)
+
+
+def _field(side: int) -> tuple[Array, Array, Array]:
+    """Blocks of the pixels (p, b), correlation of the blocks (b, b) and of the window's middle with them (1, b)."""
+    line = np.arange(side) - side // 2
+    part = np.arange(side) * _BLOCKS // side
+    block = (_BLOCKS * part[:, None] + part).ravel()
+    share = (block[:, None] == np.arange(_BLOCKS**2)).astype(np.float64)
+    places = np.stack([g.ravel() for g in np.meshgrid(line, line, indexing="ij")], axis=1).astype(np.float64)
+    centre = (share.T @ places) / share.sum(axis=0)[:, None]
+    apart = np.linalg.norm(centre[:, None] - centre, axis=2), np.linalg.norm(centre, axis=1)[None]
+    steps = (np.sqrt(3.0) * d / (_LENGTH * side) for d in apart)
+    field, middle = ((1.0 + a) * np.exp(-a) for a in steps)
+    return share, field, middle

@@ -1,0 +1,163 @@
+"""Pairs of images with known disparity, noise in both, and other ways to match them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from sklearn.datasets import load_sample_image
+
+from analysis.matching.correlation import search
+from analysis.matching.matches import Matches, match, resampled
+from tests.analysis.texture_image import Texture, lattice
+
+HALF = 15
+SHIFT = np.array([0.37, -0.21])
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Images (k, k); the second shows at `true` (n, 2) what the first shows at `places` (n, 2)."""
+
+    first: np.ndarray
+    second: np.ndarray
+    places: np.ndarray
+    true: np.ndarray
+
+    def templates(self):
+        """(n, 31, 31) of the first image."""
+        offset = np.arange(-HALF, HALF + 1.0)
+        rows, columns = self.places[:, 0, None, None] + offset[:, None], self.places[:, 1, None, None] + offset
+        return resampled(self.first, *np.broadcast_arrays(rows, columns))
+
+    def predicted(self):
+        """Up to 2 px off."""
+        return self.true + np.random.default_rng(9).uniform(-2.0, 2.0, self.true.shape)
+
+    def matched(self) -> Matches:
+        return match(self.second, self.templates(), self.predicted(), reach=4)
+
+
+def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry="same", seed=0) -> Pair:
+    """side^2 points, windows apart, in a random texture of contrast 1.
+
+    noise: of both images; relief: rms of a random disparity along columns, px, of white noise under a Gaussian of rms
+    length px; radiometry: same, gain (0.6, with the second image's noise) or vignetted (to a half in the corners).
+    """
+    size = 47 * (side - 1) + 57
+    grid = np.arange(-24.0, size + 24.0, 0.5)
+    wave = Texture(seed + 1, slope=slope).grid(grid, grid)
+    surface = ndimage.spline_filter((wave - 800.0) / 120.0, 5)
+    return _pair(
+        lambda row, column: _at(surface, 2.0 * (row + 24.0), 2.0 * (column + 24.0)),
+        size,
+        lattice(side, 47, 28, seed + 3),
+        noise,
+        _relief(size, relief, length, seed),
+        radiometry,
+        seed,
+    )
+
+
+def photographed(*, noise=0.0, relief=1.0, step=0.0, seed=0) -> Pair:
+    """A photograph of a palace by the water (427 x 640, grey values 0 to 255), points where it is distinct or not.
+
+    step: px by which what lies right of every second stretch of 120 columns is nearer, with an edge of depth.
+    """
+    grey = load_sample_image("china.jpg").astype(float) @ [0.299, 0.587, 0.114]
+    # what an exact resampling takes: detail below the sampling limit
+    surface = ndimage.spline_filter(ndimage.gaussian_filter(grey, 0.7), 5)
+    smooth = _relief(380, relief, 12.0, seed)
+
+    def disparity(row, column):
+        return smooth(row, column) + step * (np.floor(column / 120.0) % 2)
+
+    return _pair(
+        lambda row, column: _at(surface, row + 24.0, column + 120.0),
+        380,
+        lattice(12, 30, 25, seed + 3),
+        noise,
+        disparity,
+        "same",
+        seed,
+    )
+
+
+def _at(surface, row, column):
+    return ndimage.map_coordinates(surface, [row, column], order=5, prefilter=False, mode="nearest")
+
+
+def _relief(size, rms, length, seed):
+    if not rms:
+        return lambda row, column: np.zeros(np.broadcast(row, column).shape)
+    wave = ndimage.gaussian_filter(
+        np.random.default_rng(seed + 7).standard_normal((size + 60,) * 2), length, mode="wrap"
+    )
+    surface = ndimage.spline_filter(rms / wave.std() * wave, 5)
+    return lambda row, column: _at(surface, row + 30.0, column + 30.0)
+
+
+def _pair(shown, size, places, noise, disparity, radiometry, seed) -> Pair:
+    row, column = np.mgrid[:size, :size].astype(float)
+    first = shown(row, column)
+    second = shown(row + SHIFT[0], column + SHIFT[1] + disparity(row, column))
+    gain = 0.6 if radiometry == "gain" else 1.0
+    if radiometry == "vignetted":
+        second = (second + 4.0) * (1.0 - 0.25 * ((row - size / 2) ** 2 + (column - size / 2) ** 2) / (size / 2) ** 2)
+    rng = np.random.default_rng(seed + 11)
+    first = first + noise * rng.standard_normal(first.shape)
+    second = gain * (second + noise * rng.standard_normal(second.shape)) + 3.0
+    true = places - SHIFT
+    # contracts where the disparity's slope is below 1
+    for _ in range(100):
+        there = np.stack([places[:, 0] - SHIFT[0], places[:, 1] - SHIFT[1] - disparity(*true.T)], axis=1)
+        true = 0.5 * (true + there)
+    return Pair(first, second, places, true)
+
+
+def parabola(pair: Pair) -> np.ndarray:
+    """Errors (n, 2) of normalised cross-correlation with a parabola through its peak."""
+    return search(pair.second, pair.templates(), pair.predicted(), 4).place - pair.true
+
+
+def rivals(pair: Pair) -> dict[str, np.ndarray]:
+    """Errors (n, 2) of other methods from the whole pixel of the correlation's peak; NaN where one fails."""
+    peaks = pair.true + parabola(pair)
+    templates = pair.templates().astype(np.float32)
+    start = np.nan_to_num(np.rint(peaks), nan=HALF).astype(int)
+    out = {"NCC, parabola": peaks - pair.true}
+    for name, method in (("phase correlation", _phase), ("upsampled correlation", _upsampled), ("ECC", _ecc)):
+        error = np.full(peaks.shape, np.nan)
+        for k, (row, column) in enumerate(start):
+            if np.isfinite(peaks[k]).all():
+                window = pair.second[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
+                error[k] = start[k] + method(templates[k], window.astype(np.float32)) - pair.true[k]
+        out[name] = error
+    return out
+
+
+def _phase(template, window):
+    hann = cv2.createHanningWindow(template.shape, cv2.CV_32F)
+    (x, y), _ = cv2.phaseCorrelate(template - template.mean(), window - window.mean(), hann)
+    return np.array([y, x])
+
+
+def _upsampled(template, window):
+    """Peak of the cross-correlation on a grid of a hundredth of a pixel by matrix Fourier transforms."""
+    hann = np.outer(np.hanning(template.shape[0] + 2)[1:-1], np.hanning(template.shape[0] + 2)[1:-1])
+    a, b = (np.fft.fft2(hann * (x - x.mean())) for x in (template, window))
+    shift, frequency = np.arange(-1.0, 1.005, 0.01), np.fft.fftfreq(template.shape[0])
+    kernel = np.exp(2j * np.pi * np.outer(shift, frequency))
+    height = (kernel @ (b * a.conj()) @ kernel.T).real
+    return shift[np.array(np.unravel_index(np.argmax(height), height.shape))]
+
+
+def _ecc(template, window):
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
+    try:
+        _, warp = cv2.findTransformECC(
+            template, window, np.eye(2, 3, dtype=np.float32), cv2.MOTION_AFFINE, stop, None, 1
+        )
+    except cv2.error:
+        return np.full(2, np.nan)
+    return (warp @ [HALF, HALF, 1.0] - HALF)[::-1]

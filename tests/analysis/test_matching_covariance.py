@@ -1,0 +1,102 @@
+"""Do places keep in their covariances, whatever texture, noise of both images, relief within a window and radiometry?
+Half of chi-square a point, by Monte Carlo; a point may be refused instead.
+"""
+
+import numpy as np
+import pytest
+
+from analysis.matching.matches import Reason
+from tests.analysis.stereo_pairs import Pair, photographed, rivals, textured
+
+# texture slope (0.5 sharp, 2 soft), noise of both images over contrast, relief in px with its length, radiometry
+EASY = {"slope": 1.0, "noise": 0.1, "relief": 0.0, "length": 12.0, "radiometry": "same"}
+SMALL = [
+    {},
+    {"noise": 0.5},
+    {"noise": 1.0},
+    {"slope": 2.0, "noise": 0.25},
+    {"relief": 2.0, "length": 25.0},
+    {"noise": 0.5, "relief": 1.0, "radiometry": "vignetted"},
+]
+FULL = [
+    {"slope": slope, "noise": noise, "relief": relief, "length": length, "radiometry": radiometry}
+    for slope in (0.5, 1.0, 2.0)
+    for noise in (0.05, 0.25, 0.5, 1.0)
+    for relief, length in ((0.0, 12.0), (0.5, 12.0), (1.0, 25.0), (2.0, 25.0))
+    for radiometry in (("same", "gain", "vignetted") if slope == 1.0 and relief in (0.0, 1.0) else ("same",))
+]
+# Fewer accepted is a refusal.
+LEAST = 0.1
+
+
+def judged(pair: Pair):
+    """Accepted (n,), errors (n, 2) and halves of chi-square of the accepted."""
+    found = pair.matched()
+    error, used = found.place - pair.true, found.accepted
+    square = np.einsum("ni,nij,nj->n", error[used], np.linalg.inv(found.covariance[used]), error[used])
+    return used, error, 0.5 * square, found
+
+
+@pytest.mark.parametrize("changes", SMALL, ids=str)
+def test_errors_keep_in_their_covariances(changes) -> None:
+    """64 points: three standard deviations of the mean half of chi-square of those accepted beyond 0.8 and 1.3, which
+    the large grid shows.
+    """
+    used, error, square, _found = judged(textured(8, **EASY | changes))
+    assert used.mean() > (0.5 if {"noise", "relief"} <= changes.keys() or changes.get("noise") == 1.0 else 0.8)
+    chance = 3.0 / np.sqrt(used.sum())
+    assert 0.8 - chance < square.mean() < 1.3 + chance
+    # 0.2 px is the largest sigma
+    assert (np.abs(error[used]).max(axis=1) > 0.5).mean() < 0.05
+
+
+def test_steps_of_depth_are_refused_or_widened() -> None:
+    """A photograph with smooth disparity and edges of depth of 2 px; a tenth of its windows holds an edge."""
+    used, error, _square, found = judged(photographed(noise=2.0, relief=0.3, step=2.0))
+    assert used.sum() > 30
+    assert (found.reason == Reason.RELIEF).sum() > 5
+    assert (np.abs(error[used]).max(axis=1) > 0.5).mean() < 0.06
+
+
+def test_turned_and_brighter_pairs_say_the_same() -> None:
+    """Rows and columns are alike; a gain and an offset change nothing."""
+    pair = textured(6, **EASY | {"noise": 0.5})
+    found = pair.matched()
+    turned = Pair(pair.first.T, pair.second.T, pair.places[:, ::-1], pair.true[:, ::-1])
+    brighter = Pair(3.0 * pair.first + 50.0, 0.5 * pair.second - 7.0, pair.places, pair.true)
+    # the predictions of the turned pair differ: fits stop within 2e-4 px of the same place, a few smooth otherwise
+    start = np.isfinite(found.place).all(axis=1)
+    across = turned.matched()
+    both = start & np.isfinite(across.place).all(axis=1) & found.accepted & across.accepted
+    assert both.mean() > 0.9
+    assert np.median(np.abs(across.place[both][:, ::-1] - found.place[both])) < 1e-3
+    other = brighter.matched()
+    assert np.array_equal(other.accepted, found.accepted)
+    assert np.abs(other.place - found.place)[found.accepted].max() < 1e-6
+    assert other.covariance[found.accepted] == pytest.approx(found.covariance[found.accepted], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_large_grid() -> None:
+    """324 points a cell; one holds or is refused. Printed with the rivals, RMS over the same points, px."""
+    wrong = []
+    print("slope noise relief radiometry share rms sigma chi2/2 beyond 0.5 px; NCC phase upsampled ECC")  # noqa: T201
+    for cell in FULL:
+        pair = textured(18, **cell)
+        used, error, square, found = judged(pair)
+        text = f"{cell['slope']:4} {cell['noise']:5} {cell['relief']:4} {cell['radiometry']:>9} {used.mean():5.2f}"
+        if used.any():
+            far = (np.abs(error[used]).max(axis=1) > 0.5).mean()
+            sigma = np.sqrt(np.trace(found.covariance[used], axis1=1, axis2=2).mean() / 2.0)
+            text += f" {_rms(error[used]):6.3f} {sigma:6.3f} {square.mean():6.2f} {far:6.3f}"
+            text += "".join(f" {_rms(e[used]):7.3f}" for e in rivals(pair).values())
+        print(text, flush=True)  # noqa: T201
+        # two standard deviations of the mean of 324
+        if used.mean() > LEAST and not 0.8 - 0.11 < square.mean() < 1.3 + 0.11:
+            wrong.append(text)
+    assert not wrong, "\n".join(wrong)
+
+
+def _rms(error) -> float:
+    good = error[np.isfinite(error).all(axis=1)]
+    return float(np.sqrt(np.mean(good**2))) if len(good) else np.nan
