@@ -15,6 +15,8 @@ LEAST_POINTS = 5
 # Where the window holds too few points it may reach down to this part of the peak.
 WIDEST_FRACTION = 0.3
 _ROUNDS, _NEWTON_STEPS = 12, 4
+# Relative change in a step below which a curve rests: a round more would change it by rounding.
+_AT_REST = 1e-6
 
 
 def main_peak(z: Array, v: Array, weight: Array, fraction: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -72,13 +74,16 @@ class Lobe:
         self.x0 = x0
 
     def settle(self, fraction: float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Fit, choose the points within reach of the fitted vertex, and again, until the choice rests: (B, Z)."""
+        """Fit, choose the points within reach of the fitted vertex, and again, until both rest: (B, Z).
+
+        A curve that does not come to rest gets all rounds, alone as in company.
+        """
         for _ in range(_ROUNDS):
-            self._newton(mask, _NEWTON_STEPS)
+            moved = self._newton(mask, _NEWTON_STEPS)
             chosen, wider = self.window(fraction), self.window(min(fraction, WIDEST_FRACTION))
             chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], wider, chosen)
             chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], mask, chosen)
-            if np.array_equal(chosen, mask):
+            if np.array_equal(chosen, mask) and np.all(moved < _AT_REST):
                 break
             mask = chosen
         self._newton(mask, 2 * _NEWTON_STEPS)
@@ -110,10 +115,15 @@ class Lobe:
         form, slope = 1.0 - u + self.quartic * u**2, 2 * self.quartic * u - 1.0
         return p * form, np.stack([form, -2 * a * away * p * slope, p * slope * away**2], axis=2)
 
-    def _newton(self, mask: NDArray[np.bool_], steps: int) -> None:
-        """Gauss-Newton steps with the points of the mask; bounded, so that a bad curve cannot run away."""
+    def _newton(self, mask: NDArray[np.bool_], steps: int) -> Array:
+        """Gauss-Newton steps with the points of the mask; bounded, so that a bad curve cannot run away.
+
+        Returns the last one's largest relative change, (B,), of x0 in widths of the lobe.
+        """
         weight = np.where(mask, self.weight, 0.0)
+        moved = np.full(len(mask), np.inf)
         for _ in range(steps):
+            p, x0, a = self.p, self.x0, self.a
             value, slope = self._values()
             step = _solve(slope, weight, self.v - value)
             width = 1.0 / np.sqrt(self.a)
@@ -122,6 +132,8 @@ class Lobe:
             self.x0 = np.clip(self.x0, self.ends[0] - 2.0 * width, self.ends[1] + 2.0 * width)
             self.a = np.clip(self.a + step[:, 2], 0.5 * self.a, 2.0 * self.a)
             self.a = np.clip(self.a, 1e-6, 1e6)
+            moved = np.max(np.abs([self.p / p - 1.0, (self.x0 - x0) / width, self.a / a - 1.0]), axis=0)
+        return moved
 
     def result(self, mask: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
         """Peak, position, second derivative, each (B,), and their covariance (B, 3, 3)."""

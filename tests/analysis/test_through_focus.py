@@ -204,13 +204,17 @@ def test_peak_outside_the_scan(focus, frequency, reason, remedy):
 
 
 def test_flat_curves():
-    """1000 curves of noise alone: less than 1% of them get any other name than flat, and none a vertex."""
+    """1000 curves of noise alone: less than 1% of them get any other name than flat, and none a vertex; each of them
+    gets the same name alone.
+    """
     value = 0.2 + np.random.default_rng(2).normal(0, 0.01, (1000, 25))
     told = focus_vertices(np.linspace(-1e-3, 1e-3, 25), value, 0.01, strict=False)
     assert not np.any(told.fault == "")
     assert np.mean(told.fault != "flat") < 0.01
     assert np.all(np.isnan(told.position))
     assert not told.used.any()
+    alone = [focus_vertices(np.linspace(-1e-3, 1e-3, 25), one, 0.01, strict=False).fault for one in value[:40]]
+    assert alone == told.fault[:40].tolist()
     with pytest.raises(FocusError, match="no curvature above the noise; scan a wider range"):
         focus_vertices(np.linspace(-1e-3, 1e-3, 25), value, 0.01)
 
@@ -243,6 +247,30 @@ def test_other_faults():
     told = focus_vertices(z, batch, 0.004, strict=False)
     assert list(told.fault) == ["", "flat", ""]
     assert np.isfinite(told.position[[0, 2]]).all()
+
+
+@pytest.mark.parametrize(("count", "rest"), [(3, []), (5, ["2 more"])])
+def test_three_faults_are_told_and_more_are_counted(count, rest):
+    with pytest.raises(FocusError) as caught:
+        focus_vertices(np.linspace(-1e-3, 1e-3, 25), np.full((count, 25), 0.2), 0.01)
+    assert str(caught.value).count("no curvature above the noise") == 3
+    assert str(caught.value).split("; and ")[1:] == rest
+    assert list(caught.value.faults) == [(k,) for k in range(count)]
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6])
+def test_the_unit_of_length_does_not_matter(unit):
+    """Metres, millimetres, micrometres: the same vertices and the same faults, of clear and of faint curves."""
+    z = steps(50 * UM, -0.6e-3, 0.6e-3)
+    noise = np.random.default_rng(4).normal(0, 0.02, (200, z.size))
+    value = curve(z, np.linspace(-0.7e-3, 0.7e-3, 200), PAN, 0.2) + noise
+    metres = focus_vertices(z, value, 0.02, strict=False)
+    other = focus_vertices(unit * z, value, 0.02, strict=False)
+    assert np.array_equal(other.fault, metres.fault)
+    assert np.array_equal(other.used, metres.used)
+    assert 20 < np.sum(metres.fault == "") < 180
+    for name, power in (("position", 1), ("sigma", 1), ("peak", 0), ("peak_sigma", 0), ("curvature", -2)):
+        assert getattr(other, name) == pytest.approx(unit**power * getattr(metres, name), rel=1e-9, nan_ok=True), name
 
 
 @pytest.mark.parametrize(
