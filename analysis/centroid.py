@@ -217,8 +217,13 @@ def _gauss(
             ends.append((w @ (flat - m)[:, :, None])[:, :, 0])
         slope[:, :, k] = (ends[1] - ends[0]) / (2 * scale[:, k, None])
     maps = np.linalg.solve(slope, weighted)[:, :2].reshape(count, 2, height, width)
-    inside = weighted[:, 3]  # the background's derivative is 1, so its weighted row is the weight
-    chi = ((flat - model) ** 2 * inside).sum(axis=1) / np.maximum(np.count_nonzero(inside, axis=1) - size, 1)
+    weight = weighted[:, 3]  # the background's derivative is 1, so its weighted row is the weight
+    # A pixel in the window's soft edge counts as the part of it that is inside; so do the parameters fitted to it.
+    inside = spot_image.soft_window(theta[:, :2], height, width, radius, "circle")[0].reshape(count, 1, -1)
+    across = design.transpose(0, 2, 1)
+    fitted = np.linalg.solve(weighted @ across, (weighted * inside) @ across)
+    freedom = inside.sum(axis=(1, 2)) - np.trace(fitted, axis1=1, axis2=2)
+    chi = ((flat - model) ** 2 * weight).sum(axis=1) / freedom
     determinant = theta[:, 4] * theta[:, 6] - theta[:, 5] ** 2 if elliptical else theta[:, 4] ** 2
     flux = 2 * np.pi * theta[:, 2] / np.sqrt(determinant)
     everywhere = np.zeros((count, 2, full_height, full_width))
