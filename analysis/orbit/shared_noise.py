@@ -31,14 +31,14 @@ Array = NDArray[np.float64]
 _RHO = 2.0 - np.sqrt(3.0)
 # Stretches of z this far apart correlate by 1e-9 and are kept apart.
 _GAP = 18
-# Shorter stretches have corners that touch.
-_SHORT = 8
+# z that one moment needs: no stretch is shorter.
+_NEEDED = 4
 
 
 def reading_variance(time: Array, interval: float) -> Array:
     """(n,) variance of the spline at times (n,) for readings of unit variance: 1 at a reading, 0.76 halfway."""
     _, blend = _blend(time, interval)
-    return np.asarray(np.einsum("ni,ij,nj->n", blend, _covariance(4), blend))
+    return np.asarray(np.einsum("ni,ij,nj->n", blend, _covariance(_NEEDED), blend))
 
 
 def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> Array:
@@ -89,7 +89,7 @@ class Series:
     def correction_at(self, time: Array, shared: Array) -> Array:
         """(n, 3) at other times, for rays that took no part; zero, the prior's mean, far from all that did."""
         first, blend = _blend(time, self.term.interval or 1.0)
-        wanted = first[:, None] + np.arange(4)
+        wanted = first[:, None] + np.arange(_NEEDED)
         where = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
         z = shared[self.column : self.column + self.size].reshape(-1, 3)[where]
         there = (self.numbers[where] == wanted)[:, :, None]
@@ -112,7 +112,7 @@ class Series:
         )
 
     def _four(self, line: str) -> NDArray[np.intp]:
-        return np.asarray(self.places[line][:, None] + np.arange(4))
+        return np.asarray(self.places[line][:, None] + np.arange(_NEEDED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ def _series(one: CalibrationField, term: NoiseTerm, column: int) -> Series | Non
     if not timed:
         return None
     found = {line: _blend(time, term.interval) for line, time in timed.items()}
-    used = np.unique(np.concatenate([first[:, None] + np.arange(4) for first, _ in found.values()]))
+    used = np.unique(np.concatenate([first[:, None] + np.arange(_NEEDED) for first, _ in found.values()]))
     steps = np.diff(used)
     filled = [np.arange(a, a + s) for a, s in zip(used[:-1], np.where(steps < _GAP, steps, 1), strict=True)]
     numbers = np.concatenate([*filled, used[-1:]])
@@ -226,11 +226,9 @@ def _covariance(count: int) -> Array:
 
 
 def _precision(count: int) -> sparse.csr_matrix:
-    """Inverse of `_covariance`: inside it is the square of (1 4 1) / 6, the first and last two rows are special."""
-    if count <= _SHORT:
-        return sparse.csr_matrix(np.linalg.inv(_covariance(count)))
+    """Inverse of `_covariance`, for four or more: inside the square of (1 4 1) / 6, special in two rows at each end."""
     bands = [np.full(count - abs(k), v / 36.0) for k, v in ((0, 18.0), (1, 8.0), (2, 1.0))]
     matrix = sparse.diags([bands[2], bands[1], bands[0], bands[1], bands[2]], [-2, -1, 0, 1, 2]).tolil()
-    corner = np.linalg.inv(_covariance(_SHORT))
+    corner = np.linalg.inv(_covariance(_NEEDED))
     matrix[:2, :2], matrix[-2:, -2:] = corner[:2, :2], corner[-2:, -2:]
     return sparse.csr_matrix(matrix)

@@ -65,10 +65,15 @@ def square(found, truth):
     return error / scale @ np.linalg.solve(unit, error / scale), len(error)
 
 
-def test_covariance_of_points_is_that_of_the_spline():
+@pytest.mark.parametrize(
+    "moments",
+    [np.concatenate([np.linspace(0.03, 1.9, 23), np.linspace(6.11, 6.3, 5)]), np.array([0.03]), np.array([0.03, 0.2])],
+    ids=["long and short", "one", "two"],
+)
+def test_covariance_of_points_is_that_of_the_spline(moments):
     """SciPy's spline is linear in the readings, so its matrix gives the covariance; its ends, 60 readings away, leave
-    0.27^60. A gap of 30 readings cuts the unknowns into two stretches, of correlation 1e-16."""
-    moments = np.concatenate([np.linspace(0.03, 1.9, 23), np.linspace(6.11, 6.3, 5)])
+    0.27^60. A gap of 30 readings cuts the unknowns into two stretches, of correlation 1e-16. A single moment has the
+    shortest stretch there is."""
     knots = 0.125 * np.arange(-60, 120)
     by_reading = CubicSpline(knots, np.eye(len(knots)))(moments)
     count = len(moments)
