@@ -398,6 +398,14 @@ def test_misfit_opens_nothing():
     assert len(free.open) == 1
 
 
+def test_tie_points_check_nothing_as_control():
+    """Redundancies add up to the degrees of freedom; only control has one of its own, three coordinates each."""
+    field = measured(VIEW, np.random.default_rng(42), control=np.arange(60) % 4 == 0)
+    found = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, variance_components=True)
+    assert sum(found.redundancy.values()) == pytest.approx(found.degrees_of_freedom, abs=1e-6)
+    assert 0 < found.redundancy["control"] < 3 * 15
+
+
 def test_variance_factors_are_bounded():
     """Exact data: no noise at all is found, and the factors end where they must."""
     found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_XY, variance_components=True)

@@ -46,6 +46,15 @@ def test_a_constant_is_kept(name: str) -> None:
     np.testing.assert_allclose(made.weights(BETWEEN).sum(axis=1), 1.0, rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.parametrize("name", LINEAR)
+def test_the_zero_of_the_circle_does_not_matter(name: str) -> None:
+    """The same curve where angles are counted from the middle of the points; 1e-16 of an angle over a step of 0.01."""
+    value, turn = wave(ANGLE), np.radians(-102.0)
+    here, there = fit(name, ANGLE, value, 0.1), fit(name, ANGLE + turn, value, 0.1)
+    assert there.settings == pytest.approx(here.settings)
+    np.testing.assert_allclose(there(BETWEEN + turn), here(BETWEEN), rtol=0.0, atol=1e-9)
+
+
 def test_a_polynomial_is_found() -> None:
     x = np.degrees(ANGLE) - 102.0
     made = fit("polynomial", ANGLE, x**3 - 20.0 * x, 1.0)

@@ -208,6 +208,10 @@ def test_line_level():
     found = [line_level(turned[:, 1], turned[:, 0] + n, sigma) for n in noise]
     assert bounds(sum(((f.angle - 8 * ARCMIN) / f.sigma) ** 2 for f in found), 2000)
     assert bounds(sum(f.chi_square for f in found), 2000 * 4)
+    # far from level, where the angle is no more its tangent: 0.2 m apart, 0.1 m across, by hand
+    steep = line_level([-0.1, 0.1], [0.05, -0.05], 10 * UM)
+    assert steep.angle == pytest.approx(np.arctan(0.5), rel=1e-12)
+    assert steep.sigma == pytest.approx(np.sqrt(2) * 10 * UM / 0.2 * np.cos(steep.angle) ** 2, rel=1e-12)
     two = line_level([-0.1, 0.1], [0.0, 0.0], 10 * UM)
     assert two.sigma == pytest.approx(np.sqrt(2) * 10 * UM / 0.2, rel=1e-12)
     assert two.degrees_of_freedom == 0

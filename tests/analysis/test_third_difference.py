@@ -1,9 +1,11 @@
 """Third differences of made-up orbit and attitude series."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from analysis.orbit.third_difference import WHITE_GAIN, third_difference
+from analysis.orbit.third_difference import WHITE_GAIN, WHITE_LAG, third_difference
 
 RATE, RADIUS = 1.1068e-3, 6878137.0
 
@@ -17,6 +19,15 @@ def test_white_noise_is_recovered_with_its_uncertainty():
     assert found.rms == pytest.approx(WHITE_GAIN * found.white_sigma)
     # false alarm 6e-5 each and a little more in a finite series: three of 200 has a chance of 1e-5
     assert np.sum(~found.white) < 3
+
+
+def test_white_is_told_at_four_standard_deviations_of_the_lag():
+    """Scatter of the lag over 4000 series of white noise, known to 1.1 per cent; the limit to 7 per cent of it."""
+    found = third_difference(np.arange(1003.0), np.random.default_rng(3).standard_normal((1003, 4000)))
+    limit = 4.0 * found.lag.std()
+    for side in (-1.0, 1.0):
+        lag = WHITE_LAG + side * limit * np.array([1 - 0.07, 1 + 0.07])
+        assert replace(found, lag=lag).white.tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("step", "floor"), [(1.0, 6.6e-3), (10.0, 6.6)])

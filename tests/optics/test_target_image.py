@@ -248,6 +248,19 @@ def test_shift_of_the_target_is_a_phase_of_the_transfer_function() -> None:
         assert np.max(np.abs(plain - target_image(target, diffraction(pitch=PITCH), CUTOFF, x, y))) > 0.01
 
 
+def test_the_unit_of_length_does_not_matter() -> None:
+    """The image does not change when everything is ten million times as large, with a cut-off below one cycle."""
+    large = 1e7
+    x, y = centred(28, PITCH), centred(24, PITCH)
+    far_x, far_y = centred(28, large * PITCH), centred(24, large * PITCH)
+    for target in (siemens_star(6, 7e-5), slanted_edge(TILT), pinhole(5e-5)):
+        near = target_image(target, diffraction(pitch=PITCH), CUTOFF, x, y)
+        magnified = target.mapped(lambda points: large * points, tolerance=large * 1e-10)
+        cutoff = CUTOFF / large
+        far = target_image(magnified, diffraction(cutoff, large * PITCH), cutoff, far_x, far_y)
+        np.testing.assert_allclose(far, near, rtol=0, atol=1e-10)
+
+
 def test_levels_add() -> None:
     """Babinet: a dark disk on bright is bright less a bright disk; an edge and a disk beside it sum."""
     x = centred(24, PITCH)

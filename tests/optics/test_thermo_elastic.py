@@ -2,7 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 from skfem import CellBasis, ElementHex2, MeshTet1
 
 from optics.aperture import Circle, Rectangle
@@ -95,6 +95,16 @@ class TestMeshes:
             np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0], axis=0), axis=0
         )
         assert area.sum() / 2 == pytest.approx(hull.area, rel=1e-12)
+
+    @pytest.mark.parametrize("name", list(BODIES))
+    def test_a_polyhedron_is_cut_the_same_way_anywhere(self, name: str) -> None:
+        """Its cells depend on its own shape and not on where the origin lies: 1e-16 of 10 m of rounding."""
+        corners, spacing = BODIES[name]
+        shift = np.array([3.0, -4.0, 8.0])
+        here, there = polyhedron_mesh(corners @ TURN.T, spacing), polyhedron_mesh(corners @ TURN.T + shift, spacing)
+        assert there.t.shape == here.t.shape
+        distance, _ = cKDTree(here.p.T + shift).query(there.p.T)
+        assert distance.max() < 1e-12
 
     @pytest.mark.parametrize("behind", [1.0, -1.0])
     @pytest.mark.parametrize(
