@@ -377,6 +377,19 @@ def test_bad_regions_are_explained(image, message):
         measure_edge(image)
 
 
+@pytest.mark.parametrize("turned", [slice(None), slice(None, None, -1)])
+def test_both_sides_need_the_same_margin(turned):
+    """10 px from the line's end to the last column: a column fewer is refused, wherever the bright side is."""
+    image = noisy(edge_image(5))
+    edge = measure_edge(image)
+    end = edge.position + math.tan(abs(edge.angle)) * 63 / 2
+    enough = math.ceil(end + 10.0)
+    for level in (image, BRIGHT + DARK - image):
+        assert measure_edge(level[:, : enough + 1][:, turned]).mtf[0] == pytest.approx(1.0)
+        with pytest.raises(EdgeError, match=r"comes within 9\.\d px of the region's side"):
+            measure_edge(level[:, :enough][:, turned])
+
+
 def test_stated_saturation():
     image = noisy(edge_image(5))
     with pytest.raises(EdgeError, match="pixels reach the saturation level of 1100: lower"):
