@@ -421,6 +421,16 @@ def test_priors_pull_as_their_weight_says():
     assert found.value("forward y") - found.value("nadir y") == pytest.approx(-23e-6, abs=5e-9)
     without = adjust([field], LABORATORY, NOISE, gauge=HOLD_X)
     assert found.sigma["Beijing yaw"] < 0.8 * without.sigma["Beijing yaw"]
+    # one that contradicts the images by five sigmas of both adds their square to chi-square
+    combination = np.zeros(len(without.names))
+    combination[[without.names.index("forward y"), without.names.index("nadir y")]] = 1.0, -1.0
+    variance = (2e-6) ** 2 + combination @ without.covariance @ combination
+    wrong = replace(prior, value=float(combination @ without.values + 5.0 * np.sqrt(variance)), sigma=2e-6)
+    against = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, priors=[wrong])
+    assert against.chi_square - without.chi_square == pytest.approx(
+        25.0, rel=1e-5
+    )  # linear but for the second order of some 1e-6
+    assert against.degrees_of_freedom == without.degrees_of_freedom + 1
 
 
 def test_seven_fields_are_quick_and_check_points_gain():

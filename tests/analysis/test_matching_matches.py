@@ -8,7 +8,7 @@ import pytest
 from analysis.matching.consensus import consensus
 from analysis.matching.correlation import search
 from analysis.matching.distinct_points import distinct_points
-from analysis.matching.matches import MatchOptions, Reason, match
+from analysis.matching.matches import Matches, MatchOptions, Reason, match
 from tests.analysis.texture_image import Texture, detected
 
 SIZE = 800
@@ -144,6 +144,17 @@ def test_search_is_good_to_tenths(texture, frame, points):
     assert short.value.max() < 0.8
     with pytest.raises(ValueError, match="improve the prediction"):
         search(frame, texture.patches(places), places, 0)
+
+
+def test_sigma_is_that_of_the_worst_direction():
+    """An ellipse of errors with axes of 0.1 and 0.04 px, turned all ways; a circle has no worst direction."""
+    turn = np.radians(np.arange(0, 180, 15))
+    axis = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    covariance = 0.04**2 * np.eye(2) + (0.1**2 - 0.04**2) * axis[:, :, None] * axis[:, None, :]
+    covariance[-1] = 0.04**2 * np.eye(2)
+    one, accepted = np.ones(len(turn)), np.ones(len(turn), bool)
+    found = Matches(np.zeros((len(turn), 2)), covariance, one, one, accepted, np.zeros(len(turn), np.int8))
+    assert found.sigma == pytest.approx(np.where(np.arange(len(turn)) < len(turn) - 1, 0.1, 0.04), rel=1e-12)
 
 
 def test_no_points_are_an_empty_result(frame):

@@ -152,6 +152,16 @@ def test_spurious_resolution_is_not_the_peak():
         assert np.all(np.diff(taken) < 41 * UM)  # one run of neighbours
 
 
+def test_the_best_measured_points_are_not_the_peak():
+    """Ten times the precision beyond the dark zeros, where the contrast is a tenth: sigmas tell values, not heights."""
+    z = steps(25 * UM, -0.6e-3, 0.6e-3)
+    sigma = np.where(np.abs(z) > 0.3e-3, 0.0002, 0.002)
+    value = curve(z, [20 * UM], PAN, 0.2)[0] + sigma * np.random.default_rng(6).standard_normal(z.size)
+    found = focus_vertex(z, value, sigma)
+    assert found.position == pytest.approx(20 * UM, abs=5 * found.sigma + 0.1 * UM)
+    assert np.abs(z[found.used]).max() < 0.25e-3
+
+
 def test_batch_agrees_with_single_curves():
     rng = np.random.default_rng(5)
     z = steps(50 * UM, -0.6e-3, 0.6e-3)

@@ -39,6 +39,7 @@ def test_a_round_ellipse_is_a_circle() -> None:
     xy = np.random.default_rng(1).uniform(-2.0, 2.0, (2, 500))
     np.testing.assert_array_equal(Ellipse(1.0, 1.0).contains(*xy), Circle(1.0).contains(*xy))
     assert Ellipse(1.0, 1.0).bounds == Circle(1.0).bounds
+    np.testing.assert_allclose(Ellipse(1.0, 1.0).outline(), Circle(1.0).outline(), rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("sizes", [(0.0, 0.0), (-1.0, 0.0), (1.0, 1.0), (1.0, -0.1), (float("nan"), 0.0)])
