@@ -171,7 +171,7 @@ def test_places_that_cannot_tell():
     with pytest.raises(ObservabilityError, match=r"Y' = constant.*slope_y"):
         fit_focal_plane(line[:, ::-1], np.zeros(5), UM)
     for angle in np.radians(np.arange(15, 375, 30)):
-        with pytest.raises(ObservabilityError, match="one straight line along.*place some of them off that line"):
+        with pytest.raises(ObservabilityError, match=r"one straight line along.*place some of them off that line"):
             fit_focal_plane(FIELDS[:, None] * [np.cos(angle), np.sin(angle)], np.zeros(5), UM)
     with pytest.raises(ObservabilityError, match="all places are one"):
         fit_focal_plane(np.full((4, 2), 0.1), np.zeros(4), UM)

@@ -8,6 +8,7 @@ Statistical limits are two-sided chi-square quantiles with a false-alarm rate of
 """
 
 import math
+import re
 import time
 from functools import cache
 
@@ -375,6 +376,19 @@ def spot():
 def test_bad_regions_are_explained(image, message):
     with pytest.raises(EdgeError, match=message):
         measure_edge(image)
+
+
+def test_a_speck_is_named_where_it_is_all_ways_round():
+    def place(image):
+        with pytest.raises(EdgeError) as caught:
+            measure_edge(image)
+        row, column = re.search(r"near its row (\d+), column (\d+) ", str(caught.value)).groups()
+        return int(row), int(column)
+
+    row, column = place(spot())
+    assert place(spot()[:, ::-1]) == (row, 63 - column)
+    assert place(spot().T) == (column, row)
+    assert place(spot().T[::-1]) == (63 - column, row)
 
 
 @pytest.mark.parametrize("turned", [slice(None), slice(None, None, -1)])
