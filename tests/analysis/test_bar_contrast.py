@@ -180,6 +180,17 @@ def test_bad_regions_are_explained(image, frequency, message):
         measure_bars(image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), frequency)
 
 
+@pytest.mark.parametrize("row", ["upper", "lower"])
+@pytest.mark.parametrize("column", ["left", "right"])
+def test_a_quarter_without_bars_is_named(row, column):
+    """A patch of even grey in one corner takes a quarter of that quarter's bars, and none of the others'."""
+    image = noisy(GOOD)
+    rows, columns = (slice(0, 16) if side in ("upper", "left") else slice(48, 64) for side in (row, column))
+    image[rows, columns] = 650.0
+    with pytest.raises(BarError, match=f"amplitude in its {row} {column} quarter"):
+        measure_bars(image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), 0.3)
+
+
 @pytest.mark.parametrize(
     ("dark", "bright", "message"),
     [
