@@ -490,6 +490,10 @@ def test_bad_points():
             fit_plane(station, Strip.of(SCENE.station + np.linspace(0.9, 1, 5)[:, None] * ray, 1.0), method)
         with pytest.raises(PlaneError, match="at one place"):
             fit_plane(station, Strip.of(np.repeat(points[:1], 5, axis=0), 1.0), method)
+        # the spread that is needed counts in sigmas of an axis, of unequal ones in their root mean square
+        for noise, needed in ((1.0, "10"), (np.tile(np.diag([1.0, 1.0, 10.0]), (5, 1, 1)), "20")):
+            with pytest.raises(PlaneError, match=rf"10 sigmas \({needed} m\) are needed"):
+                fit_plane(station, Strip.of(np.repeat(points[:1], 5, axis=0), noise), method)
         # noise of 2 m does not make a strip of one place
         scatter = points[0] + 2.0 * np.random.default_rng(1).standard_normal((30, 3))
         with pytest.raises(PlaneError, match="at one place"):

@@ -248,6 +248,18 @@ def test_shift_of_the_target_is_a_phase_of_the_transfer_function() -> None:
         assert np.max(np.abs(plain - target_image(target, diffraction(pitch=PITCH), CUTOFF, x, y))) > 0.01
 
 
+@pytest.mark.parametrize("shift", [(1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-3), (0.0, -1e-3)])
+def test_target_and_window_may_lie_anywhere(shift: tuple[float, float]) -> None:
+    """Moved together they give the same image, with the same guard about them: to the rounding of phases."""
+    x, y = centred(28, PITCH), centred(24, PITCH)
+    there_x, there_y = Grid(x.start + shift[0], PITCH, x.count), Grid(y.start + shift[1], PITCH, y.count)
+    for target in (siemens_star(6, 7e-5), pinhole(5e-5)):
+        moved = target.mapped(lambda points: points + shift)
+        here = target_image(target, diffraction(pitch=PITCH), CUTOFF, x, y, 2e-4)
+        there = target_image(moved, diffraction(pitch=PITCH), CUTOFF, there_x, there_y, 2e-4)
+        np.testing.assert_allclose(there, here, rtol=0, atol=1e-10)
+
+
 def test_the_unit_of_length_does_not_matter() -> None:
     """The image does not change when everything is ten million times as large, with a cut-off below one cycle."""
     large = 1e7
