@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import random
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ import typer
 from scenes.yaml_file import read_yaml
 from tests.mutation.campaign import Verdict, read_verdicts, run_campaign
 from tests.mutation.coverage_map import measure, read_map
-from tests.mutation.mutants import mutants_below
+from tests.mutation.mutants import Mutant, mutants_below
 
 HELP = """Put small faults into the source, one at a time, and see whether a test finds each.
 
@@ -40,6 +40,11 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 def equivalents() -> dict[str, str]:
     """Key -> why no test can tell this mutant from the source."""
     return {entry["key"]: entry["reason"] for entry in read_yaml(EQUIVALENT).data["equivalent"]}
+
+
+def drawn(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
+    """A sample without an order of its own: a mutant is in or out whatever is written elsewhere in the source."""
+    return sorted(every, key=lambda one: hashlib.sha256(f"{seed} {one.key}".encode()).digest())[:count]
 
 
 def summary(verdicts: list[Verdict], known: dict[str, str]) -> dict[str, Any]:
@@ -89,9 +94,9 @@ def main(
     places = tuple(only.split(",")) if only else PLACES
     missing = [place for place in places if not (root / place).exists()]
     if missing:
+        typer.echo(f"error: no such file or folder: {', '.join(missing)}; run this in the project's folder", err=True)
         raise typer.Exit(2)
-    every = mutants_below(root, places)
-    chosen = random.Random(seed).sample(every, min(count, len(every)))
+    chosen = drawn(mutants_below(root, places), count, seed)
     folder, results = out / "coverage", out / "results.jsonl"
     out.mkdir(parents=True, exist_ok=True)
     before = read_verdicts(results)
@@ -107,10 +112,14 @@ def main(
     found = summary([verdicts[one.key] for one in chosen], equivalents())
     (out / "summary.json").write_text(json.dumps(found, indent=2) + "\n")
     if as_json:
-        pass
+        typer.echo(json.dumps(found, indent=2))
     else:
-        for _one in found["survivors"]:
-            pass
+        for one in found["survivors"]:
+            typer.echo(f"{one['key']} {one['where']} {one['scope']}: {one['before']} -> {one['after']} ({one['fate']})")
+        typer.echo(
+            f"{found['killed']} of {found['mutants']} killed, {found['survived']} survived, {found['uncovered']} "
+            f"uncovered, {found['equivalent']} equivalent: score {100 * found['score']:.1f} %"
+        )
     raise typer.Exit(0 if found["score"] >= LIMIT else 1)
 
 

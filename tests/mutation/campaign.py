@@ -22,6 +22,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal
 
+import typer
+
 from tests.mutation.coverage_map import CoverageMap
 from tests.mutation.mutants import Mutant
 
@@ -100,8 +102,10 @@ def run_campaign(
                 stream.flush()
                 done += 1
                 if say:
-                    (time.monotonic() - started) / done * (len(chosen) - done)
-                    f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
+                    left = (time.monotonic() - started) / done * (len(chosen) - done)
+                    where = f"{verdict.mutant.path}:{verdict.mutant.line[0]}"
+                    text = f"{done}/{len(chosen)} {verdict.fate} {where}; about {left / 60:.0f} min left"
+                    typer.echo(text, err=True)
 
 
 def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3) -> Verdict:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import coverage
+import typer
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ def measure(root: Path, files: list[Path], places: tuple[str, ...], folder: Path
         command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
         subprocess.run(command, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         done = target.exists() and target.with_suffix(".json").exists()
+        typer.echo(f"{'coverage of' if done else 'NO coverage of'} {file.relative_to(root)}", err=True)
         return done
 
     with ThreadPoolExecutor(workers) as pool:

@@ -5,8 +5,9 @@ import shutil
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from tests.mutation.__main__ import equivalents, summary
+from tests.mutation.__main__ import app, drawn, equivalents, summary
 from tests.mutation.campaign import read_verdicts, run_campaign
 from tests.mutation.coverage_map import measure, read_map
 from tests.mutation.mutants import mutants_below, mutants_of
@@ -24,6 +25,7 @@ def unused(x):
 '''
 TESTS = """
 import pytest
+from typer.testing import CliRunner
 from toy import half
 
 def test_half():
@@ -51,6 +53,21 @@ def test_keys_differ_and_do_not_move_with_other_code():
     after = mutants_of("toy.py", b'"""Longer."""\n\nOTHER = 1\n' + SOURCE)
     assert len({one.key for one in before}) == len(before)
     assert {one.key for one in before} < {one.key for one in after}
+
+
+def test_a_sample_keeps_its_mutants_when_others_come():
+    few = mutants_of("toy.py", SOURCE)
+    more = mutants_of("toy.py", SOURCE + b"\n\ndef other(x):\n    return 2 * x + 1\n")
+    picked = {one.key for one in drawn(few, 5, seed=1)}
+    assert picked != {one.key for one in drawn(few, 5, seed=2)}
+    again = {one.key for one in drawn(more, 5, seed=1)}
+    assert again - picked <= {one.key for one in more} - {one.key for one in few}
+
+
+def test_a_place_that_is_not_there_is_told(tmp_path):
+    result = CliRunner().invoke(app, ["--out", str(tmp_path), "--only", "optics/lens.py"])
+    assert result.exit_code == 2
+    assert "optics/lens.py" in result.stderr
 
 
 def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
