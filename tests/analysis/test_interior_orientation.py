@@ -2,6 +2,8 @@
 own statistics under noise that is common to many points, and what a narrow field can say of the principal point.
 """
 
+import math
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -411,6 +413,8 @@ def test_sets():
             assert sets.principal_distance[k] == f
             assert sets.principal_point[k] == p
             assert np.array_equal(sets.distortion[k], distortion(position[k], GF7, f, p))
+        assert sets.mean[0] == pytest.approx(math.fsum(sets.principal_distance) / 10, rel=1e-15)
+        assert sets.mean[1] == pytest.approx(math.fsum(sets.principal_point) / 10, rel=1e-12)
         assert sets.rms_distortion**2 == pytest.approx(
             sets.mean_distortion**2 + 0.9 * sets.scatter_distortion**2, rel=1e-9
         )

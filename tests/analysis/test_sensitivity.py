@@ -1,6 +1,7 @@
 """Figs. 3-5 of paper 000 on the synthetic descending pass near 40 N 116 E, in ECEF."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -105,6 +106,16 @@ def test_statements_can_fail():
     swapped = sensitivity(Station.of(SCENE.station, 0.5), exchanged, PAIRS)
     failed = {statement.kind for statement in STATEMENTS if not judge(statement, swapped).holds}
     assert failed >= {"increases", "decreases", "largest", "far_larger"}
+
+
+def test_answers_of_opposite_sign_are_not_alike():
+    (close,) = (statement for statement in STATEMENTS if statement.kind == "close")
+    rows = table(descending_pass(lat=45 * DEG, lon=120 * DEG))
+    assert judge(close, rows).holds
+    turned = [
+        replace(row, slope=-row.slope) if (row.what, row.axis) == (close.what, close.axes[0]) else row for row in rows
+    ]
+    assert not judge(close, turned).holds
 
 
 def test_rows_for_the_result():

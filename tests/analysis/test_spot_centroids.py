@@ -190,6 +190,13 @@ def test_shape_that_does_not_fit_shows_in_chi_square(template, light, before, pl
     assert np.all(maximum_likelihood_fit(ghost, FRAMES, NOISE, template).reduced_chi_square > 2)
 
 
+def test_every_spot_needs_a_template_that_exists(template):
+    mean = record(electrons([(47.3, 48.1), (48.2, 47.7)]), pattern(2, 1), 2)
+    for wrong in ([0, template.count], [-1, 0]):
+        with pytest.raises(ValueError, match="index must be"):
+            maximum_likelihood_fit(mean, FRAMES, NOISE, template, np.array(wrong))
+
+
 @pytest.mark.parametrize("elliptical", [False, True])
 def test_a_gaussian_fits_in_chi_square(elliptical):
     """100 Gaussian spots of about 100 degrees of freedom each, in a window whose soft edge is a third of its pixels: 5

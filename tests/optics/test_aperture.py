@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
 
-from optics.aperture import Circle, Ellipse, Rectangle
+from optics.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.backend import Backend
+from optics.surface import plane
+from tests.optics.bench import PASS, Stage, beam, build, run
 
 
 def test_circle() -> None:
@@ -40,6 +43,23 @@ def test_a_round_ellipse_is_a_circle() -> None:
     np.testing.assert_array_equal(Ellipse(1.0, 1.0).contains(*xy), Circle(1.0).contains(*xy))
     assert Ellipse(1.0, 1.0).bounds == Circle(1.0).bounds
     np.testing.assert_allclose(Ellipse(1.0, 1.0).outline(), Circle(1.0).outline(), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "aperture",
+    [
+        Circle(1.0, (0.3, -0.4)),
+        Circle(1.0, (0.3, -0.4), inner=0.5),
+        Ellipse(1.2, 0.7, (0.3, -0.4)),
+        Rectangle(1.2, 0.7, (0.3, -0.4)),
+    ],
+)
+def test_rays_pass_where_a_decentred_aperture_is_open(backend: Backend, aperture: Aperture) -> None:
+    points = np.random.default_rng(1).uniform(-2.0, 2.0, (400, 2))
+    assembly = build(Stage(plane(), PASS, aperture=aperture))
+    *_, valid = run(backend, assembly, *beam(points, -1.0, np.array([0.0, 0.0, 1.0])))
+    np.testing.assert_array_equal(valid, aperture.contains(*points.T))
+    assert 20 < np.count_nonzero(valid) < 380
 
 
 @pytest.mark.parametrize("sizes", [(0.0, 0.0), (-1.0, 0.0), (1.0, 1.0), (1.0, -0.1), (float("nan"), 0.0)])
