@@ -2,8 +2,9 @@
 
 A convex body takes from a beam the rays that go through it; over the stop these fill the convex outline of its corners,
 each of them at the ray that passes through it, with straight sides (on the stop they bend by the aberrations of the
-pupil, some 1e-4 of its radius). The bodies stand where the state puts them, with the shape they have as designed. A
-camera's own mirrors and board throw no shadow into its beam, as its prescription gives them no substrates.
+pupil, some 1e-4 of its radius). The bodies stand where the state puts them and are as large as it makes them, with the
+shape they have as designed. A camera's own mirrors and board throw no shadow into its beam, as its prescription gives
+them no substrates.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scipy.spatial import ConvexHull
 
 from optics.aim import transverse_axes
 from optics.aperture import Circle
-from optics.assembly import Assembly
+from optics.assembly import Assembly, points_to_world
 from optics.backend import Backend
 from optics.convex_polygon import area, hull, intersect
 from optics.imaging import ImagingRays
@@ -193,8 +194,7 @@ class ImagingShadows:
 
     def _end(self, placed: PlacedBodies, owner: np.ndarray, launched: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """How far it is from the launch points to the first mirror's middle, (B,)."""
-        k = placed.index[self._first]
-        middle = placed.translation[:, k].real + placed.rotation[:, k].real @ np.array(self._centre)
+        middle = points_to_world(placed, self._first, np.array([self._centre])).real[:, 0]
         return np.asarray(np.sum((middle[owner] - launched.mean(axis=1)) * heading, axis=-1))
 
     def _hits(
@@ -244,9 +244,7 @@ def _between_mirrors(
 
 def _corners(caster: Caster, placed: PlacedBodies, owner: np.ndarray) -> np.ndarray:
     """Corners of a body for every image, world, (B, C, 3)."""
-    k = placed.index[caster.body]
-    own = caster.corners @ np.swapaxes(placed.rotation[:, k].real, 1, 2) + placed.translation[:, k].real[:, None]
-    return np.asarray(own[owner])
+    return np.asarray(points_to_world(placed, caster.body, caster.corners).real[owner])
 
 
 @dataclass(frozen=True, eq=False)
