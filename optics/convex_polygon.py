@@ -10,6 +10,8 @@ from functools import cache
 
 import numpy as np
 
+from optics.quadrature import gauss
+
 _NO_LIMIT = 1e30
 """Of a side without length: finite, so that it can be multiplied."""
 
@@ -191,15 +193,6 @@ def from_boundary(
     weights = to_weights @ moments @ to_weights.T
     points = (middle[:, :1] + half[:, :1] * own)[:, :, None] + 1j * (middle[:, 1:] + half[:, 1:] * own)[:, None]
     return points.reshape(rows, count**2), weights.reshape(rows, count**2)
-
-
-@cache
-def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss' points and weights on [-1, 1]."""
-    points, weights = np.polynomial.legendre.leggauss(count)
-    for array in (points, weights):
-        array.setflags(write=False)
-    return points, weights
 
 
 @cache

@@ -18,13 +18,13 @@ from optics.convex_polygon import (
     compact,
     difference,
     from_boundary,
-    gauss,
     intersect,
     quadrature,
     sides,
     widened,
 )
 from optics.pupil_edge import PupilEdge
+from optics.quadrature import gauss
 
 RIM_SIDES = 256
 """Of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of it

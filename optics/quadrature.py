@@ -82,3 +82,12 @@ def _frozen(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> PupilNodes:
     for array in arrays:
         array.setflags(write=False)
     return PupilNodes(*arrays)
+
+
+@cache
+def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss' points and weights on [-1, 1], (count,) each, read-only."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    for array in (points, weights):
+        array.setflags(write=False)
+    return points, weights

@@ -16,13 +16,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import map_coordinates, spline_filter
 
 from optics.pupil_function import PupilFunction
+from optics.quadrature import gauss
 from optics.threads import cores, one_blas_thread
 
 _AT_ONCE = 2**17
@@ -115,14 +115,6 @@ LEAST_ACROSS = 13
 """Nodes across the chords for a constant phase: their length goes through half a period of a sine."""
 
 
-@cache
-def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
-    points, weights = np.polynomial.legendre.leggauss(count)
-    for array in (points, weights):
-        array.setflags(write=False)
-    return points, weights
-
-
 def _correlate(
     pupil: PupilFunction, shift: np.ndarray, wavelength: np.ndarray, defocus: np.ndarray, part: str = "all"
 ) -> np.ndarray:
@@ -140,7 +132,7 @@ def _correlate(
         s, k = shift[which], wave[which]
         own = []
         if part != "shadow":
-            own.append(pupil.edge.overlap(s, right[:, which], left[:, which], _gauss(across), _gauss(along)))
+            own.append(pupil.edge.overlap(s, right[:, which], left[:, which], gauss(across), gauss(along)))
         if pupil.shadow is not None and part != "clear":
             nodes = pupil.shadow.least_nodes + max(across - LEAST_ACROSS, along - LEAST_ALONG)
             own.append(pupil.shadow.overlap(np.zeros(len(s), int), s, nodes))
