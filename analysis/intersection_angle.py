@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC, CameraParameters
+from analysis.monitoring import CameraParameters
+from analysis.units import ARCSEC
 
 __all__ = ["IntersectionAngleChange", "exact", "first_order"]
 

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.monitoring import ARCSEC, CameraParameters
+from analysis.monitoring import CameraParameters
+from analysis.units import ARCSEC
 
 __all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "observability"]
 

@@ -30,8 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.units import ARCSEC
+
 __all__ = [
-    "ARCSEC",
     "ESTIMATORS",
     "PARAMETERS",
     "PER_SI",
@@ -45,7 +46,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-ARCSEC = math.pi / 180 / 3600
 ESTIMATORS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 """Keys of the parameters in results, which end in their unit."""

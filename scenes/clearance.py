@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -21,11 +20,8 @@ from optics.solid import Face, Solid, SolidError, face_plane, solid_mesh
 from optics.tree import PlacedBodies
 from scenes.channel import BASE, CENTRAL_PRISM
 from scenes.errors import InputError, Issue, KeyPath
+from scenes.instrument_model import Instrument, MisplacedError, key_of
 from scenes.mirror_mesh import BOARD, CHIP, behind, board_size, mirror_mesh
-from scenes.misplaced import MisplacedError, key_of
-
-if TYPE_CHECKING:
-    from scenes.instrument_model import Instrument
 
 LEAST_GAP = 20e-6
 """Bodies nearer than this count as touching, metres: what the path tracer needs between two of them."""

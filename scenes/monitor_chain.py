@@ -33,7 +33,7 @@ from optics.tree import Body, RigidTree
 from scenes.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.channel import BASE, CENTRAL_PRISM, Channel
 from scenes.errors import KeyPath
-from scenes.misplaced import MisplacedError, key_of
+from scenes.instrument_model import MisplacedError, key_of
 from scenes.prism_model import null_point, prism_0, prism_180, roof_offset
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, settings
 from optics.backend import Backend, load_backend
 from optics.threads import cores
 from scenes.camera_model import CameraModel, derive_camera
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.job import JobSpec
 from scenes.load import load_camera, load_instrument
 from scenes.resolved import resolve_job

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from analysis.intersection_angle import IntersectionAngleChange
-from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI, CameraParameters
+from analysis.monitoring import PARAMETERS, PER_SI, CameraParameters
 from analysis.recovery import ESTIMATORS, Recovery, recover
 from analysis.spot_positions import SpotError
+from analysis.units import ARCSEC
 from optics.aim import AimError
 from optics.heat import Temperature
 from optics.threads import cores, one_blas_thread

@@ -13,8 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, coefficients
+from analysis.monitoring import coefficients
 from analysis.recovery import ESTIMATORS, Recovery, measure_spots, recover
+from analysis.units import ARCSEC
 from optics.backend import Backend
 from optics.heat import Temperature
 from optics.threads import cores, one_blas_thread

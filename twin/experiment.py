@@ -17,7 +17,8 @@ from analysis.spot_template import SpotTemplate
 from optics.backend import Backend
 from optics.threads import cores, one_blas_thread
 from optics.tree import Motion, State
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.job import JobSpec, noll
 from scenes.resolved import ResolvedJob
 from scenes.thermal_model import TemperatureError, ThermalModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.laboratory.distortion import run_distortion
+from twin.laboratory.distortion_sections import run_distortion
 from twin.laboratory.focus_result import run_focus
 from twin.laboratory.turntable_result import run_turntable_test
 from twin.trial.command import add_test

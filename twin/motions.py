@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.tree import ORIGIN, Motion, State
 from scenes.channel import BASE, CENTRAL_PRISM
 from scenes.instrument_model import Instrument

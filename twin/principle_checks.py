@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.autocollimator import AXES, column_component, mean_difference, reading_of_normal, relation_factor
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.backend import Backend
 from optics.rotation import rotation_matrix
 from scenes.turntable import PrincipleExperimentSpec, PrincipleSetup

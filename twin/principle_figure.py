@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.quadrature import PupilNodes
 from scenes.turntable_model import UNITS, mirror_body
 from twin import principle_printed as printed

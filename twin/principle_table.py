@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from analysis.autocollimator import AXES, column_component, exact_reading, mean_difference, relation_factor
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from scenes.turntable_model import UNITS
 
 

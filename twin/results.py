@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
+from analysis.monitoring import PARAMETERS, PER_SI
 from analysis.recovery import Recovery
+from analysis.units import ARCSEC
 from optics.tree import State
 from scenes.obstruction import Obstruction
 from scenes.resolved import ResolvedJob

@@ -17,9 +17,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import angles_between
 from analysis.orbit.planes import Method, PlaneFit, Station, Strip, fit_plane
+from analysis.units import ARCSEC
 
 __all__ = ["STATEMENTS", "Judgement", "Sensitivity", "Statement", "judge", "sensitivity"]
 

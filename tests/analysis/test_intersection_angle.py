@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from analysis.intersection_angle import exact, first_order
-from analysis.monitoring import ARCSEC, CameraParameters
+from analysis.monitoring import CameraParameters
+from analysis.units import ARCSEC
 
 FORWARD, BACKWARD = np.deg2rad(26.0), np.deg2rad(-5.0)
 SIGMA = np.diag([0.03, 0.04, 1.0, 1.0]) * ARCSEC

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from analysis.monitoring import (
-    ARCSEC,
     CameraParameters,
     MonitorGeometry,
     coefficients,
@@ -17,6 +16,7 @@ from analysis.monitoring import (
     paper_single,
     shift_covariance,
 )
+from analysis.units import ARCSEC
 
 # Field angles far larger than real ones, so that a forgotten cos^2 cannot hide.
 GEOMETRY = MonitorGeometry(7.68, 0.73, 7e-6, field_alpha_rad=0.3, field_beta_rad=0.2)

@@ -7,7 +7,8 @@ from importlib.util import find_spec
 
 from optics.backend import Backend, load_backend
 from scenes.camera_model import CameraModel, derive_camera
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.job import JobSpec
 from scenes.load import load_camera, load_instrument
 from scenes.resolved import resolve_job

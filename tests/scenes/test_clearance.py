@@ -13,7 +13,7 @@ from optics.rotation import rotation_matrix
 from scenes import obstruction
 from scenes.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, separation
 from scenes.errors import InputError
-from scenes.instrument_model import build_instrument
+from scenes.instrument_builder import build_instrument
 from scenes.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
 from scenes.obstruction import RAYS, find_obstructions
 

@@ -17,7 +17,8 @@ from optics.trace import make_rays, trace
 from optics.tree import Motion, compose
 from scenes.errors import InputError
 from scenes.instrument import MaterialsSpec
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.job import check_nodes
 from scenes.load import load_camera, load_instrument, load_job
 from scenes.resolved import resolve, resolve_job

@@ -6,7 +6,8 @@ import pytest
 from optics.frozen_map import FrozenMap
 from scenes.camera import CameraSpec
 from scenes.errors import InputError
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.load import load_camera, load_instrument
 from twin.truth import trace_sight
 

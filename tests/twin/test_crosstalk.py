@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
+from analysis.monitoring import PARAMETERS, PER_SI
 from analysis.recovery import measure_spots
+from analysis.units import ARCSEC
 from twin.crosstalk import crosstalk
 from twin.truth import trace_truth
 

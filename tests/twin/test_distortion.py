@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 from analysis.centroid import energy_centroid
-from analysis.monitoring import ARCSEC
 from analysis.orientation.measurement import locate_spots
+from analysis.units import ARCSEC
 from optics.backend import load_backend
 from optics.diffraction import Grid
 from optics.target_image import target_image

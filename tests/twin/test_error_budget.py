@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.heat import Temperature
 from scenes.errors import InputError
 from scenes.job import JobSpec

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from analysis import model_fit, monitoring
-from analysis.monitoring import ARCSEC, PER_SI
+from analysis.monitoring import PER_SI
 from analysis.recovery import measure_spots
+from analysis.units import ARCSEC
 from optics.tree import Motion
 from scenes.channel import BASE
 from twin.truth import trace_truth

@@ -6,8 +6,8 @@ from scipy import stats
 
 from analysis.centroid import mean_frames
 from analysis.likelihood import cramer_rao_bound
-from analysis.monitoring import ARCSEC
 from analysis.recovery import measure_spots, recover
+from analysis.units import ARCSEC
 from optics.tree import Motion
 from scenes.channel import BASE
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
-from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import STATEMENTS, judge
+from analysis.units import ARCSEC
 from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_angle import LINES
 from scenes.orbit_setup import AngleSetup, resolve_angle

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.tree import Motion
 from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_setup import AngleSetup, resolve_angle

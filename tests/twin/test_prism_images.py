@@ -14,7 +14,7 @@ from optics.glass import glass
 from optics.system import assemble
 from optics.trace import make_rays, trace
 from optics.tree import Motion
-from scenes.instrument_model import build_instrument
+from scenes.instrument_builder import build_instrument
 from scenes.load import load_camera
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 from twin.monitor import MonitorPath

@@ -20,7 +20,8 @@ from optics.trace import make_rays, trace
 from optics.transfer import polychromatic_transfer
 from optics.tree import Motion, State
 from scenes.camera_assembly import line_body
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.load import load_camera, load_instrument
 from scenes.scenery import build_scenery
 from scenes.thermal_model import ThermalModel

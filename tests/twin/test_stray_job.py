@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from optics.finish import COATED, MIRROR
 from scenes.baffle_spec import BaffleSpec
-from scenes.instrument_model import build_instrument
+from scenes.instrument_builder import build_instrument
 from scenes.job import JobSpec
 from scenes.load import LIBRARY
 from scenes.resolved import resolve_job

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from analysis import autocollimator, intersection_angle, monitoring, recovery
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from scenes.load import load_principle_experiment
 from twin import principle_checks, principle_table
 from twin.principle_experiment import Reader, run_principle_experiment

@@ -29,12 +29,10 @@ from analysis.orientation.measurement import (
 from analysis.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
-from optics.backend import Backend
 from scenes.lab_setup import DistortionSetup
 from twin.laboratory.distortion_bench import Advance, DistortionBench, DistortionRecord, DistortionTruth, silent
 from twin.laboratory.dividing_error import TurntableModel
 from twin.trial.bench_error import BenchError
-from twin.trial.result import LabResult
 
 Array = NDArray[np.float64]
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
@@ -222,16 +220,3 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> Spots:
             raise BenchError(problem, ("window",), "a larger window") from error
         remedy = "less light: 30 to 80 percent is good" if "saturated" in reason else "more light or more frames"
         raise BenchError(problem, ("light",), remedy) from error
-
-
-def run_distortion(setup: DistortionSetup, backend: Backend, seed: int, advance: Advance = silent) -> LabResult:
-    """``python -m twin.lab distortion``.
-
-    Raises:
-        InputError: ``as_built`` names what the camera does not have.
-        BenchError: the test cannot be carried out or measured as its file says.
-    """
-    # imported here: the sections show a run
-    from twin.laboratory.distortion_sections import lab_result
-
-    return lab_result(measure(DistortionBench.build(setup, backend, advance), seed, advance))

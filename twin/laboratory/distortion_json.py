@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.turntable.chauvenet import rejection_rate
+from analysis.units import ARCSEC
 from twin.laboratory.distortion import DistortionRun, rms
 
 

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
+from optics.backend import Backend
 from optics.frozen_map import FrozenMap
+from scenes.lab_setup import DistortionSetup
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Cell, SvgFigure, Table
 from twin.laboratory import printed_004
-from twin.laboratory.distortion import DistortionRun, rms
+from twin.laboratory.distortion import DistortionRun, measure, rms
+from twin.laboratory.distortion_bench import Advance, DistortionBench, silent
 from twin.laboratory.distortion_figure import curve_svg, points_svg, spot_svg
 from twin.laboratory.distortion_json import to_dict
 from twin.laboratory.turntable_figure import FIT_NAMES
@@ -23,6 +26,16 @@ from twin.trial.section import Section
 Array = NDArray[np.float64]
 SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
+
+
+def run_distortion(setup: DistortionSetup, backend: Backend, seed: int, advance: Advance = silent) -> LabResult:
+    """``python -m twin.lab distortion``.
+
+    Raises:
+        InputError: ``as_built`` names what the camera does not have.
+        BenchError: the test cannot be carried out or measured as its file says.
+    """
+    return lab_result(measure(DistortionBench.build(setup, backend, advance), seed, advance))
 
 
 def lab_result(run: DistortionRun) -> LabResult:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.rotation import rotation_vector
 from twin.edge_images import ALONG, TRACK
 from twin.laboratory.focus import Alignment, Shimming, State

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
 from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
 from analysis.turntable.chauvenet import rejection_rate
 from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from scenes.dividing_error import TurntableTestSpec
 from twin.laboratory.dividing_error import TurntableModel

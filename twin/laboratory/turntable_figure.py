@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.laboratory.turntable import TurntableRun
 from twin.report.svg import (
     BLUE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from scenes.units import ANGLE, format_quantity
 from twin.artefact import SvgFigure, Table
 from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC

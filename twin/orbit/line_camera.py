@@ -16,6 +16,7 @@ from numpy.polynomial import chebyshev
 
 from optics.assembly import points_to_world
 from optics.backend import Backend
+from optics.frozen_map import FrozenMap
 from optics.line_of_sight import chief_rays
 from optics.rotation import about_axis, rotation_matrix
 from optics.system import assemble
@@ -23,6 +24,8 @@ from optics.tree import State
 from scenes.camera_assembly import line_body
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
+from scenes.orbit_calibration import OrbitCalibrationSpec
+from scenes.orbit_simulate import OrbitSimulateSpec
 from scenes.three_line_camera import LineCameraSpec, ThreeLineCameraSpec
 
 TRACED_POINTS = 49
@@ -219,3 +222,18 @@ def _chopped(coefficients: np.ndarray) -> np.ndarray:
     size = np.max(np.abs(coefficients), axis=-1)
     used = np.flatnonzero(size > _NOISE * np.max(size))
     return coefficients[: used[-1] + 1]
+
+
+def changed_payload(
+    spec: OrbitCalibrationSpec | OrbitSimulateSpec, payload: ThreeLineCameraSpec
+) -> ThreeLineCameraSpec:
+    """The camera as it is after launch."""
+    lines = {}
+    for name, line in payload.lines.items():
+        if name in spec.changes:
+            change = spec.changes[name]
+            point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
+            focal = line.focal_length + change.focal_length
+            line = line.model_copy(update={"focal_length": focal, "principal_point": point})
+        lines[name] = line
+    return payload.model_copy(update={"lines": FrozenMap(lines)})

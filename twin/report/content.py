@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.recovery import ESTIMATORS
+from analysis.units import ARCSEC
 from optics.heat import Temperature
 from optics.tree import Motion
 from scenes.channel import BASE

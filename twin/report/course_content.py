@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, PER_SI
+from analysis.monitoring import PER_SI
 from analysis.recovery import ESTIMATORS
+from analysis.units import ARCSEC
 from scenes.course import moment
 from twin.course import CourseRun
 from twin.report.labels import PARAMETERS

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from analysis.monitoring import ARCSEC, PER_SI
+from analysis.monitoring import PER_SI
+from analysis.units import ARCSEC
 from scenes.channel import BASE
 from twin.course import CourseRun
 from twin.report.labels import PARAMETERS

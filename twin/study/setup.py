@@ -21,8 +21,9 @@ from scenes.study import StudySpec
 from scenes.study_factor import FactorSpec, Scalar
 from scenes.translate import validate
 from scenes.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
-from twin.study.base_job import BaseJob, base_job
+from twin.study.base_job import BaseJob
 from twin.study.config_tree import Tree, with_place, with_values
+from twin.study.jobs import base_job
 from twin.versions import source_digest, versions
 
 WHERE = {"render": EXAMPLES, "lab": LIBRARY / LAB, "orbit": LIBRARY / ORBIT}

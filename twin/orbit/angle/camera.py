@@ -13,7 +13,8 @@ from optics.rotation import rotation_matrix
 from optics.trace import BeamMissedError
 from optics.tree import State
 from scenes.errors import InputError
-from scenes.instrument_model import Instrument, build_instrument
+from scenes.instrument_builder import build_instrument
+from scenes.instrument_model import Instrument
 from scenes.job import JobSpec, perturbation_issues
 from scenes.thermal_model import TemperatureError, ThermalModel
 from twin.experiment import motions_of

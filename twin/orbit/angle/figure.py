@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import AXES
+from analysis.units import ARCSEC
 from twin.orbit.angle.procedure import AngleRun, Scatter
 from twin.report.svg import (
     BLUE,

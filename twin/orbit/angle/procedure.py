@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import (
     AlongTrackAngles,
     AngleError,
@@ -30,6 +29,7 @@ from analysis.orbit.angles import (
 from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneError, PlaneFit, Strip, fit_plane
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
 from analysis.orbit.sensitivity import Sensitivity, sensitivity
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from scenes.orbit_angle import PAPER_ANGLES
 from twin.orbit.angle.camera import angle_camera

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.backend import Backend
 from scenes.job import DEFAULT_PIVOT, PerturbationSpec
 from scenes.units import LENGTH, format_quantity

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import STATEMENTS, Judgement, judge
+from analysis.units import ARCSEC
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.angle.figure import drawn, panels, signs
 from twin.orbit.angle.procedure import AngleRun, Scatter, values_of

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.sensitivity import STATEMENTS, judge
+from analysis.units import ARCSEC
 from twin.orbit.angle.procedure import AngleRun, Scatter, values_of
 
 PRINTED_DIFFERENCE_ARCSEC = {"alpha": 0.44, "beta": 1.53}

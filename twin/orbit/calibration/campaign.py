@@ -31,7 +31,7 @@ from twin.orbit.calibration.points import FieldPoints, ImagePoints, PassData, im
 from twin.orbit.earth import Earth, east_north_up
 from twin.orbit.ground.random_field import stream
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.line_camera import LineCamera, line_cameras
+from twin.orbit.line_camera import LineCamera, changed_payload, line_cameras
 from twin.orbit.measurement_errors import TERMS
 from twin.orbit.orbit import propagate
 from twin.orbit.sensor import Sensor
@@ -42,7 +42,6 @@ from twin.trial.result import Advance, silent
 if TYPE_CHECKING:
     from scenes.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
     from scenes.orbit_setup import CalibrationSetup
-    from scenes.orbit_simulate import OrbitSimulateSpec
 
 _LEAST_IMAGE = 0.02
 """Pixels. Image points without errors are given this sigma, for an adjustment needs weights."""
@@ -203,21 +202,6 @@ def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
     drift = np.array(tracker.thermal.amplitude) * spec.errors.switched_on
     turn = np.array(tracker.bias) + np.sin(latitude - tracker.thermal.reference)[:, None] * drift
     return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
-
-
-def changed_payload(
-    spec: OrbitCalibrationSpec | OrbitSimulateSpec, payload: ThreeLineCameraSpec
-) -> ThreeLineCameraSpec:
-    """The camera as it is after launch."""
-    lines = {}
-    for name, line in payload.lines.items():
-        if name in spec.changes:
-            change = spec.changes[name]
-            point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
-            focal = line.focal_length + change.focal_length
-            line = line.model_copy(update={"focal_length": focal, "principal_point": point})
-        lines[name] = line
-    return payload.model_copy(update={"lines": FrozenMap(lines)})
 
 
 def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:

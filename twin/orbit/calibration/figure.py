@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS, misclosure
+from analysis.units import ARCSEC
 from scenes.orbit_angle import LINES
 from twin.orbit.calibration.campaign import true_bias
 from twin.orbit.calibration.influences import INNER

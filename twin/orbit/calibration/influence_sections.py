@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
+from analysis.units import ARCSEC
 from scenes.orbit_angle import LINES
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Cell, Table

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.adjustment import Adjustment, adjust
 from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
+from analysis.units import ARCSEC
 from optics.frozen_map import FrozenMap
 from scenes.orbit_angle import LINES
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields

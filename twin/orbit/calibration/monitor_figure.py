@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.orbit.calibration.monitor import Monitoring, PooledErrors
 from twin.orbit.calibration.procedure import CalibrationRun
 from twin.report.svg import BLUE, GREY, INK, LIGHT, VERMILION, look, new_figure, plain_axes, to_svg

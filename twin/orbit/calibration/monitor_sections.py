@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Artefact, Cell, SvgFigure, Table
 from twin.orbit.calibration.monitor import Monitoring, Treatment

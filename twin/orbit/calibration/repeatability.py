@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
+from analysis.units import ARCSEC
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.procedure import CalibrationRun
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.backend import Backend
 from scenes.units import ANGLE, LENGTH, format_quantity
 from twin.artefact import Cell, Table

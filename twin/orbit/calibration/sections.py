@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.calibration_parameters import RATE
+from analysis.units import ARCSEC
 from scenes.orbit_angle import LINES
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.calibration.field_sections import biases_section, fields_section

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.forward_intersection import CheckErrors
+from analysis.units import ARCSEC
 from twin.artefact import Cell, Table
 from twin.orbit.calibration.monitor import PooledErrors
 from twin.orbit.calibration.procedure import CalibrationRun

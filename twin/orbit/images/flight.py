@@ -13,14 +13,13 @@ from scenes.errors import KeyPath
 from scenes.orbit_simulate import OrbitSimulateSpec
 from scenes.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.attitude import Attitude
-from twin.orbit.calibration.campaign import changed_payload
 from twin.orbit.earth import Earth
 from twin.orbit.ground.random_field import stream
 from twin.orbit.images.camera_optics import optics_of
 from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
 from twin.orbit.images.points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
 from twin.orbit.light_effects import LightEffects
-from twin.orbit.line_camera import LineCamera, line_cameras
+from twin.orbit.line_camera import LineCamera, changed_payload, line_cameras
 from twin.orbit.orbit import propagate
 from twin.orbit.sensor import Sensor
 from twin.orbit.trajectory import Trajectory

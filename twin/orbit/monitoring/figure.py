@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.orbit.monitoring.procedure import MonitorRun
 from twin.report.svg import (
     BLUE,

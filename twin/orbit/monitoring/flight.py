@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, CameraParameters
+from analysis.monitoring import CameraParameters
 from analysis.orbit.monitored_camera import CalibratedLine, Sightings
+from analysis.units import ARCSEC
 from optics.aim import AimError
 from optics.backend import Backend
 from optics.frozen_map import FrozenMap

@@ -15,9 +15,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.intersection_angle import exact
-from analysis.monitoring import ARCSEC, CameraParameters
+from analysis.monitoring import CameraParameters
 from analysis.orbit.forward_intersection import check_errors
 from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, between, intersect_pair
+from analysis.units import ARCSEC
 from optics.frozen_map import FrozenMap
 from scenes.orbit_monitor import PARAMETERS
 from twin.orbit.line_camera import look_angle

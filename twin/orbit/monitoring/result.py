@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.backend import Backend
 from scenes.course import moment
 from twin.artefact import Cell, Table

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, PER_SI
+from analysis.monitoring import PER_SI
+from analysis.units import ARCSEC
 from scenes.course import moment
 from scenes.orbit_monitor import PARAMETERS
 from twin.artefact import Cell, SvgFigure, Table

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, PARAMETERS, PER_SI
+from analysis.monitoring import PARAMETERS, PER_SI
+from analysis.units import ARCSEC
 from scenes.orbit_monitor import PARAMETERS as APPLICABLE
 from twin.orbit.monitoring.flight import Cause
 from twin.orbit.monitoring.procedure import CaseErrors, MonitorRun, rms

@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import NearVerticalWarning, PlaneFit, fit_plane
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from scenes.orbit_angle import LINES
 from twin.orbit.angle.procedure import values_of

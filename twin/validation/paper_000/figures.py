@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Method, Strip
 from analysis.orbit.sensitivity import sensitivity
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from twin.artefact import SvgFigure, Table
 from twin.orbit.angle.flight import AnglePass, Measurement
@@ -181,9 +181,7 @@ def _reasons(sentence: Sentence, passes: Passes, other: Answers) -> Iterator[Exp
             )
 
 
-def _ordinate(
-    context: Context, found: list[Answers], places: Mapping[tuple[float, float], Answers]
-) -> CheckResult:
+def _ordinate(context: Context, found: list[Answers], places: Mapping[tuple[float, float], Answers]) -> CheckResult:
     signs = [s for s in SENTENCES if s.kind == "signs"]
     flipped = [{key: -v for key, v in a.rises.items()} for a in found]
     share = np.mean([s.holds(a.rises, a.growth) for s in signs for a in found])

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.planes import Method, PlaneFit, fit_plane
 from analysis.orbit.resection import Resection
+from analysis.units import ARCSEC
 from optics.backend import Backend
 from optics.frozen_map import FrozenMap
 from optics.rotation import rotation_matrix

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import angles_between
 from analysis.orbit.planes import fit_plane
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from twin.orbit.angle.flight import Measurement
 from twin.orbit.angle.procedure import centred, effect_rows

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Station
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from scenes.orbit_angle import LINES
 from twin.artefact import SvgFigure

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.angles import height_error, off_axis_angle
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from twin.orbit.angle.flight import AnglePass
 from twin.orbit.angle.procedure import sighted

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, MonitorGeometry
+from analysis.monitoring import MonitorGeometry
 from analysis.recovery import measure_spots
+from analysis.units import ARCSEC
 from optics.threads import cores, one_blas_thread
 from optics.tree import Motion
 from scenes.channel import BASE
@@ -94,9 +95,7 @@ def measured(context: Context) -> BudgetImages:
     geometry = next(iter(budget.experiment.calibration.cameras.values())).geometry
     inputs = (trials, together, groups)
     pitch = next(iter(budget.experiment.instrument.cameras.values())).spec.line.pitch
-    return BudgetImages(
-        geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, pitch, roll
-    )
+    return BudgetImages(geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, pitch, roll)
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from math import hypot, log, sqrt
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.artefact import Cell, Data, SvgFigure, Table
 from twin.error_budget import BudgetLine
 from twin.validation.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult

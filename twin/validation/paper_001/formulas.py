@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from statistics import fmean
 
-from analysis.monitoring import ARCSEC, MonitorGeometry
+from analysis.monitoring import MonitorGeometry
+from analysis.units import ARCSEC
 from twin.artefact import Cell, SvgFigure, Table
 from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context

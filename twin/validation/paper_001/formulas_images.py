@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from analysis import autocollimator
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.tree import Motion, State
 from scenes.channel import BASE
 from twin.experiment import MonitorExperiment

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.artefact import Cell, SvgFigure, Table
 from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.group import CheckGroup, Context

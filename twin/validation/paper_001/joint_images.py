@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.tree import Motion, State
 from scenes.channel import BASE
 from twin.experiment import MonitorExperiment

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.artefact import Cell, Table
 from twin.error_budget import Together
 from twin.validation.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from analysis import autocollimator
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from scenes.load import load_principle_experiment
 from scenes.turntable import PrincipleSetup
 from twin import principle_printed

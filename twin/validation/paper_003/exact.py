@@ -16,10 +16,10 @@ from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, pa
 from optics.frozen_map import FrozenMap
 from scenes.orbit_angle import LINES
 from scenes.orbit_setup import CalibrationSetup
-from twin.orbit.calibration.campaign import Campaign, FieldPass, changed_payload, fly_fields, line_model
+from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields, line_model
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone
 from twin.orbit.light_effects import NO_EFFECTS
-from twin.orbit.line_camera import line_cameras
+from twin.orbit.line_camera import changed_payload, line_cameras
 from twin.orbit.sensor import Platform, Sensor
 from twin.validation.paper_003.setups import Turned, true_sensors
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from twin.artefact import Cell, SvgFigure, Table
 from twin.orbit.ground.random_field import stream

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
+from analysis.units import ARCSEC
 from twin.report.svg import (
     BLUE,
     GREEN,

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS, INTERIOR
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from scenes.orbit_angle import LINES
 from scenes.orbit_calibration import CalibrationImagesSpec
@@ -285,9 +285,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             rms, sigma = _worst(found, names)
             said = " ".join(rendered.told(f, names) for f in found)
             how = f"{size}. Error and sigma: {said} The worst field counts. Rounds of the stepwise solution: {rounds}."
-            yield context.check(identifier).judge(
-                rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)]
-            )
+            yield context.check(identifier).judge(rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)])
     if "003.model.bias.yaw" in context.selected:
         values = {f.name: abs(f.error[n]) / f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW}
         sigma = max(f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW) / ARCSEC

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.report.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.paper_003.exact import Rank, Walk
 

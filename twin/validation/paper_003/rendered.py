@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.three_line_model import BIAS, INTERIOR
+from analysis.units import ARCSEC
 from scenes.orbit_angle import LINES
 from scenes.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields

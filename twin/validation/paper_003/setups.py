@@ -14,9 +14,9 @@ from scenes.load import LIBRARY, ORBIT
 from scenes.orbit_angle import LINES, EffectsSpec
 from scenes.orbit_setup import CalibrationSetup, resolve_calibration
 from scenes.orbit_spec import ThermalDriftSpec
-from twin.orbit.calibration.campaign import FieldPass, changed_payload
+from twin.orbit.calibration.campaign import FieldPass
 from twin.orbit.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.line_camera import line_cameras
+from twin.orbit.line_camera import changed_payload, line_cameras
 from twin.orbit.sensor import Platform, Sensor
 from twin.validation.chosen import Chosen
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
 from analysis.orbit.three_line_model import BIAS
+from analysis.units import ARCSEC
 from scenes.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, fly_fields
 from twin.validation.check import CONSISTENT, CORRECTED, UNDECIDED, Check, CheckResult, Explanation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
 from twin.laboratory.focus import line_turn, mount_of

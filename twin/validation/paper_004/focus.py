@@ -13,8 +13,8 @@ from analysis.focal_plane.plane_fit import fit_focal_plane
 from analysis.focal_plane.rigid_motion import RigidMotion
 from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
-from analysis.monitoring import ARCSEC
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
+from analysis.units import ARCSEC
 from optics.pose import Pose
 from optics.rotation import rotation_matrix
 from optics.threads import one_blas_thread

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from analysis.monitoring import ARCSEC
 from analysis.orientation.distortion_model import (
     distortion,
     principal_distance,
     principal_distance_and_point,
     principal_point,
 )
+from analysis.units import ARCSEC
 from twin.laboratory.distortion import DistortionRun, rms
 from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM
 from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
@@ -278,9 +278,7 @@ def _chi(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
     return check.judge(rms(score), 1.0 / np.sqrt(2 * len(tests)), how, 1.0)
 
 
-def _zero(
-    check: Check, tests: Sequence[SpotTest], found: Array, predicted: Array, equation: str
-) -> CheckResult:
+def _zero(check: Check, tests: Sequence[SpotTest], found: Array, predicted: Array, equation: str) -> CheckResult:
     """The principal point by a printed equation: the error of the zero comes out as p."""
     error = found - np.array([t.camera.p for t in tests])
     stated = rms(np.array([t.run.compensated.fit.sigma("principal_point") for t in tests]))

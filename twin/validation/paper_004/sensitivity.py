@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.laboratory.distortion import DistortionRun, rms
 from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM, FIT_RMS_ARCSEC, TEST_POINTS
 from twin.validation.check import REFUTED, Check, CheckResult, Explanation

@@ -11,10 +11,10 @@ from scipy.optimize import brentq
 from scipy.special import erfc
 from scipy.stats import norm
 
-from analysis.monitoring import ARCSEC
 from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
 from analysis.turntable.chauvenet import rejection_rate
 from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.units import ARCSEC
 from optics.threads import one_blas_thread
 from scenes.dividing_error import TurntableTestSpec
 from scenes.lab_setup import resolve_turntable

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from twin.report.svg import (
     BLUE,
     GREEN,

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, MonitorGeometry
+from analysis.monitoring import MonitorGeometry
+from analysis.units import ARCSEC
 from scenes.job import JobSpec
 from scenes.resolved import ResolvedJob, resolve_job
 from twin.artefact import Data

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, MonitorGeometry
+from analysis.monitoring import MonitorGeometry
+from analysis.units import ARCSEC
 from twin.artefact import Cell, SvgFigure, Table
 from twin.validation.group import Context
 from twin.validation.paper_001.ranges import figure

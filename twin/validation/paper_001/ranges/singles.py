@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC, MonitorGeometry
+from analysis.monitoring import MonitorGeometry
+from analysis.units import ARCSEC
 from optics.aim import AimError
 from optics.trace import BeamMissedError
 from optics.tree import State

@@ -1,0 +1,8 @@
+"""Units of angles in measured data and results."""
+
+from __future__ import annotations
+
+import math
+
+ARCSEC = math.pi / 180 / 3600
+"""One second of arc, rad."""
