@@ -90,7 +90,7 @@ def bare(backend, monkeypatch):
     """Function: changes of gf7_pair -> instrument, without the check that would refuse it."""
     import scenes.instrument_model
 
-    monkeypatch.setattr(scenes.instrument_model, "check_clearance", lambda instrument: None, raising=False)
+    monkeypatch.setattr(scenes.instrument_builder, "check_clearance", lambda instrument: None, raising=False)
     return lambda folder, *changes: built(changed(folder, *changes), backend)
 
 
