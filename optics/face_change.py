@@ -105,7 +105,7 @@ def _samples(aperture: Aperture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         half = (aperture.half_x, aperture.half_y)
         u, v, weight = nodes.x, nodes.y, nodes.share
     else:
-        s, w = np.polynomial.legendre.leggauss(16)
+        s, w = quadrature.gauss(16)
         half = (aperture.half_x, aperture.half_y)
         u, v, weight = np.tile(s, 16), np.repeat(s, 16), np.outer(w, w).ravel() / 4.0
     return aperture.centre[0] + half[0] * u, aperture.centre[1] + half[1] * v, weight

@@ -18,7 +18,7 @@ from numpy.polynomial import chebyshev
 from optics.diffraction import PupilField
 from optics.pupil_edge import PupilEdge
 from optics.pupil_shadow import PupilShadow
-from optics.quadrature import PupilNodes
+from optics.quadrature import PupilNodes, gauss
 from optics.threads import one_blas_thread
 
 DEGREE = 8
@@ -101,7 +101,7 @@ class PupilFunction:
     @cached_property
     def clear_power(self) -> float:
         """``power`` of the pupil without its shadow."""
-        rule = np.polynomial.legendre.leggauss(32)
+        rule = gauss(32)
         shift = np.zeros(1, complex)
         right, left, _ = self.edge.corners(shift)
         points, weight = self.edge.overlap(shift, right, left, rule, rule)

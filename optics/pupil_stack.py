@@ -16,7 +16,7 @@ from numpy.polynomial import chebyshev
 from optics.pupil_edge import PupilEdge
 from optics.pupil_function import DEGREE
 from optics.pupil_shadow import FEW_SIDES, PupilShadow
-from optics.quadrature import PupilNodes
+from optics.quadrature import PupilNodes, gauss
 from optics.threads import one_blas_thread
 from optics.transfer import nodes_for
 
@@ -160,7 +160,7 @@ class PupilStack:
         for which, across, along in self._pieces(float(np.max(wave)), steps, _AT_ONCE):
             flat = (which[:, None] * steps + np.arange(steps)).ravel()
             part = PupilEdge(edges.harmonics[:, flat])
-            rules = (np.polynomial.legendre.leggauss(count) for count in (across, along))
+            rules = (gauss(count) for count in (across, along))
             points, weight = part.overlap(shift.ravel()[flat], right[:, flat], left[:, flat], *rules)
             shape = (len(which), steps, -1)
             values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
@@ -227,7 +227,7 @@ class PupilStack:
         edges = PupilEdge(self.harmonics)
         nothing = np.zeros(len(self.axes), complex)
         right, left, _ = edges.corners(nothing)
-        rules = (np.polynomial.legendre.leggauss(count) for count in (24, 12))
+        rules = (gauss(count) for count in (24, 12))
         points, weight = edges.overlap(nothing, right, left, *rules)
         return np.asarray(np.sum(self._values(points[:, None])[1][:, 0] ** 2 * weight, axis=-1))
 

@@ -45,7 +45,7 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0) -> PupilNodes:
         inner: radius of a central hole.
     """
     arms = 4 * rings if arms is None else arms
-    s, w = np.polynomial.legendre.leggauss(rings)
+    s, w = gauss(rings)
     low = inner**2
     r2 = low + (1.0 - low) * 0.5 * (s + 1.0)
     angle = 2.0 * np.pi * (np.arange(arms) + 0.5) / arms
@@ -72,7 +72,7 @@ def disk_for(phase: float) -> PupilNodes:
 @cache
 def square(points: int) -> PupilNodes:
     """Gauss-Legendre product quadrature over [-1, 1]^2 with points x points nodes."""
-    s, w = np.polynomial.legendre.leggauss(points)
+    s, w = gauss(points)
     x, y = np.meshgrid(s, s)
     return _frozen(x.ravel(), y.ravel(), np.outer(w, w).ravel())
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from optics.diffraction import Grid
+from optics.quadrature import gauss
 from optics.targets import Target
 from optics.threads import one_blas_thread
 from optics.vector_shape import FiniteShape, HalfPlane
@@ -138,7 +139,7 @@ class _EdgeSampling:
 @lru_cache(maxsize=8)
 def _edge_sampling(cutoff: float, reach: float) -> _EdgeSampling:
     panels = _LEAST_PANELS + int(np.ceil(cutoff * reach))
-    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    node, weight = gauss(_NODES)
     f = (cutoff / panels * (np.arange(panels)[:, None] + 0.5 * (node + 1.0))).ravel()
     share = np.tile(0.5 * cutoff / panels * weight, panels) / (np.pi * f)
     count = int(np.ceil(2.0 * reach * cutoff * _SAMPLES)) + 7

@@ -258,7 +258,7 @@ class _CameraBench:
         self.frequency = self.nyquist * np.eye(2)
         self.spectrum = (spec.wavelength, spec.wavelength) if band is None else band.spectrum
         first, last = self.spectrum
-        node, self.weights = np.polynomial.legendre.leggauss(COLOURS if last > first else 1)
+        node, self.weights = quadrature.gauss(COLOURS if last > first else 1)
         self.colours = 0.5 * (first + last) + 0.5 * (last - first) * node
         x, y = self.frequency.T
         if band is None:

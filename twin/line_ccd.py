@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.noise import NoiseModel
+from optics.quadrature import gauss
 from twin.detector import EmvaDetector, FixedPattern
 
 if TYPE_CHECKING:
@@ -24,9 +25,7 @@ _SIGMAS = 5.0
 def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre wavelengths (K,), metres, and their weights, for light that is evenly spread over the band."""
     first, last = band.spectrum
-    node, weight = np.polynomial.legendre.leggauss(
-        2 + int(np.ceil((last - first) / WIDEST_STEP)) if last > first else 1
-    )
+    node, weight = gauss(2 + int(np.ceil((last - first) / WIDEST_STEP)) if last > first else 1)
     return 0.5 * (first + last) + 0.5 * (last - first) * node, 0.5 * weight
 
 

@@ -56,7 +56,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     shadows, free = (spent[name] for name in ("shadows", "free"))
     return Speed(
         (
-            Number("states_per_s", count / shadows.wall_s, f"image quality with shadows, blocks of {BLOCK}", "states/s"),
+            Number("states_per_s", count / shadows.wall_s, f"image quality with shadows, {BLOCK} at once", "states/s"),
             Number("cpu_ms_per_state", 1e3 * shadows.cpu_s / count, "  processor time of a state", "ms"),
             Number("free_cpu_ms_per_state", 1e3 * free.cpu_s / count, "  of a state without shadows", "ms"),
             Number("ratio_free", shadows.cpu_s / free.cpu_s, "  with shadows over without", "", Limit(LIMIT)),
