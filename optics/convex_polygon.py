@@ -31,19 +31,18 @@ def hull(points: np.ndarray) -> np.ndarray:
     rows = np.arange(len(points))
     start = np.lexsort((y, x), axis=-1)[:, 0]
     order, here, done = [start], start, np.zeros(len(points), bool)
+    way = np.broadcast_to([0.0, -1.0], (len(points), 2))
     for _ in range(points.shape[1] - 1):
         dx, dy = x - x[rows, here][:, None], y - y[rows, here][:, None]
-        far = dx * dx + dy * dy
-        best = np.argmax(far, axis=-1)
-        for k in range(points.shape[1]):
-            # to the right of the way to the best so far, or farther on it: in the end all others lie on the left
-            turn = dx[rows, best] * dy[:, k] - dy[rows, best] * dx[:, k]
-            better = (turn < 0.0) | ((turn == 0.0) & (far[:, k] > far[rows, best]))
-            best = np.where(better & (far[:, k] > 0.0), k, best)
-        done |= (best == start) | (far[rows, best] == 0.0)
+        turn = np.arctan2(way[:, :1] * dy - way[:, 1:] * dx, way[:, :1] * dx + way[:, 1:] * dy)
+        turn[turn < -0.5 * np.pi] = np.pi  # points of the side before, but for rounding
+        turn[(dx == 0.0) & (dy == 0.0)] = np.inf
+        best = np.argmin(turn, axis=-1)
+        done |= (best == start) | np.isinf(turn[rows, best])
         here = np.where(done, here, best)
         if np.all(done):
             break
+        way = np.stack([dx[rows, best], dy[rows, best]], axis=-1)
         order.append(here)
     return np.asarray(points[rows[:, None], np.stack(order, axis=-1)])
 
@@ -183,11 +182,12 @@ def from_boundary(
     half = np.where(half > 0.0, half, 1.0)
     at = (place - middle[:, None]) / half[:, None]
     x, y = _legendre(at[..., 0], count + 1), _legendre(at[..., 1], count)
-    order = np.arange(1, count)[:, None, None]
-    primitive = np.concatenate([x[1:2], (x[2:] - x[:-2]) / (2 * order + 1)])  # of P_0, P_1, ... along x
+    primitive = np.empty((count, *rise.shape))  # of P_0, P_1, ... along x
+    primitive[0] = x[1]
+    np.subtract(x[2:], x[:-2], out=primitive[1:])
+    primitive[1:] /= (2 * np.arange(1, count) + 1)[:, None, None]
     primitive *= rise / half[:, 1:]
-    # some products of few numbers each are quicker so than as matrices
-    moments = np.stack([np.stack([np.einsum("np,np->n", a, b) for b in y], axis=-1) for a in primitive], axis=1)
+    moments = primitive.transpose(1, 0, 2) @ y.transpose(1, 2, 0)
     moments *= (np.sign(moments[:, 0, 0]) * half[:, 0] * half[:, 1])[:, None, None]
     own, to_weights = gauss(count)[0], _lagrange(count)
     weights = to_weights @ moments @ to_weights.T
@@ -210,6 +210,9 @@ def _legendre(x: np.ndarray, count: int) -> np.ndarray:
     out[0] = 1.0
     if count > 1:
         out[1] = x
+    before = np.empty_like(x)
     for n in range(2, count):
-        out[n] = ((2 * n - 1) * x * out[n - 1] - (n - 1) * out[n - 2]) / n
+        np.multiply(x, out[n - 1], out=out[n])
+        out[n] *= (2 * n - 1) / n
+        out[n] -= np.multiply(out[n - 2], (n - 1) / n, out=before)
     return out
