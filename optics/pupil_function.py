@@ -90,7 +90,7 @@ class PupilFunction:
         if self.shadow is None:
             return self.clear_power
         # as the transfer function has it at frequency zero
-        points, weight = self.shadow.overlap(np.zeros(1, int), np.zeros(1, complex), SHADOW_NODES)
+        points, weight = self.shadow.overlap(np.zeros((1, 1), complex), SHADOW_NODES)
         return self.clear_power + float(np.sum(self.values(points)[1] ** 2 * weight) * abs(np.linalg.det(self.axes)))
 
     @property

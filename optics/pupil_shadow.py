@@ -40,6 +40,9 @@ lie outside of the pupil."""
 _ITERATIONS = 3
 """For crossings with an edge that is nearly a circle: each step leaves an error smaller by the edge's harmonics."""
 
+_MOST_ITERATIONS = 40
+"""For the edge's radius, each of them the better the rounder the edge: the least round ones take some 25."""
+
 _TURNED = 1e-12
 """Angle of an arc, radians, below which it is none but for rounding."""
 
@@ -62,12 +65,8 @@ class PupilShadow:
     @classmethod
     def within(cls, polygons: np.ndarray, harmonics: np.ndarray, rim_sides: int = RIM_SIDES) -> PupilShadow:
         """What polygons (B, K, V, 2), which do not overlap, take of pupils with edges of ``harmonics`` (2H + 1, B)."""
-        radius = _radius_terms(harmonics)
-        count, number = polygons.shape[:2]
-        flat = polygons.reshape(count * number, *polygons.shape[2:])
-        flat = np.where((area(flat) < 0.0)[:, None, None], flat[:, ::-1], flat)
-        flat = compact(_cut(flat, np.repeat(radius, number, axis=0), rim_sides))
-        return cls(_tiled(flat.reshape(count, number, *flat.shape[1:])), radius)
+        radius = edge_radius(harmonics)
+        return cls(tiled(cut(polygons, radius, rim_sides)), radius)
 
     @property
     def area(self) -> np.ndarray:
@@ -82,50 +81,100 @@ class PupilShadow:
         """
         return 1 + int(np.ceil(8.0 * float(np.max(np.ptp(self.pieces, axis=-2), initial=0.0))))
 
-    def take(self, which: np.ndarray) -> PupilShadow:
+    def take(self, which: np.ndarray | slice) -> PupilShadow:
         """Those of the given pupils."""
         return PupilShadow(self.pieces[which], self.radius[which])
 
     def whole(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Quadrature over the shadows: points (B, Q), complex, and weights of the area."""
-        pupils = len(self.pieces)
+        """Quadrature over the pieces: points (B, K, count^2), complex, and weights of the area."""
+        number = self.pieces.shape[:2]
         points, weights = quadrature(self.pieces.reshape(-1, *self.pieces.shape[2:]), count)
-        return points.reshape(pupils, -1), weights.reshape(pupils, -1)
+        return points.reshape(*number, -1), weights.reshape(*number, -1)
 
-    def overlap(self, which: np.ndarray, shift: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def overlap(self, shift: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Quadrature over what the shadows take of the overlap of pupils shifted by -s/2 and +s/2.
 
         Args:
-            which: pupils, (S,).
-            shift: s of each, complex, (S,).
+            shift: s, complex, (B, S).
             count: nodes along each side of a region's bounding box.
 
         Returns:
-            Points c, complex, (S, Q), and weights of the area, negative where light is taken once and positive where
+            Points c, complex, (B, S, Q), and weights of the area, negative where light is taken once and positive where
             two shadows have taken it twice: to be added to ``PupilEdge.overlap``.
         """
-        rows, number = len(which), self.pieces.shape[1]
+        parts = self.parts(shift, count)
+        middle = parts.points - 0.5 * (parts.sign * shift[parts.pupil, parts.step])[:, None]
+        rows = parts.pupil * shift.shape[1] + parts.step
+        order, place, most = in_rows(rows, shift.size)
+        points, weights = np.zeros((shift.size, most, count**2), complex), np.zeros((shift.size, most, count**2))
+        points[rows[order], place], weights[rows[order], place] = middle[order], parts.weights[order]
+        return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
+
+    def parts(self, shift: np.ndarray, count: int) -> ShadowParts:
+        """The same as ``overlap``, part by part."""
         moves = np.stack([shift.real, shift.imag], axis=-1)
-        row, slot = (i.ravel() for i in np.indices((rows, number)))
-        full = (area(self.pieces) > SMALLEST)[which[row], slot]
-        row, slot = row[full], slot[full]
-        own = self.pieces[which[row], slot]
-        whole = quadrature(self.pieces.reshape(-1, *self.pieces.shape[2:]), count)
-        whole = tuple(part.reshape(*self.pieces.shape[:2], -1)[which[row], slot] for part in whole)
-        points, weights, owners = [], [], []
-        for sign in (1.0, -1.0):
-            # c + sign s/2 lies in the shadow and c - sign s/2 in the pupil: the shadow within the pupil moved by sign s
-            move = sign * moves[row]
-            found, at, weight = _within(own - move[:, None], self.radius[which[row]], whole, move)
-            points.append(at - 0.5 * sign * shift[row[found], None])
-            weights.append(-weight)
-            owners.append(row[found])
-        for other in range(number):
-            found, at, weight = _shared(own, self.pieces[which[row], other] + moves[row, None], count)
-            points.append(at - 0.5 * shift[row[found], None])
-            weights.append(weight)
-            owners.append(row[found])
-        return _in_rows(np.concatenate(owners), np.concatenate(points), np.concatenate(weights), rows)
+        full = area(self.pieces) > SMALLEST
+        points, weights = self.whole(count)
+        # c + sign s/2 lies in the shadow and c - sign s/2 in the pupil: the shadow within the pupil moved by sign s
+        sign = np.array([1.0, -1.0])
+        away = sign[:, None] * moves[:, :, None]
+        least = _least(self.radius)
+        reach = 2.0 * np.abs(self.radius[:, 0]) - least
+        x, y = (self.pieces[:, None, None, ..., k] - away[..., None, None, k] for k in (0, 1))
+        inside = np.max(x * x + y * y, axis=-1) < least[:, None, None, None] ** 2
+        centre = np.mean(self.pieces, axis=2)
+        size = np.sqrt(np.max(np.sum((self.pieces - centre[:, :, None]) ** 2, axis=-1), axis=-1))
+        near = centre[:, None, None] - away[..., None, :]
+        near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < reach[:, None, None, None]
+        full_at = np.nonzero(inside & full[:, None, None])
+        b, s, g, k = np.nonzero(~inside & near & full[:, None, None])
+        cut_points, cut_weights = _drawn_in(self.pieces[b, k] - away[b, s, g][:, None], self.radius[b], count)
+        cut_points += (sign[g] * shift[b, s])[:, None]
+        pair = self._pairs(moves, full)
+        normal, limit = sides(self.pieces.reshape(-1, *self.pieces.shape[2:]))
+        normal, limit = (a.reshape(*self.pieces.shape[:2], *a.shape[1:]) for a in (normal, limit))
+        normal, limit, move = normal[pair[0], pair[3]], limit[pair[0], pair[3]], moves[pair[0], pair[1]]
+        limit = limit + np.einsum("fwx,fx->fw", normal, move)
+        shared_points, shared_weights = quadrature(intersect(self.pieces[pair[0], pair[2]], normal, limit), count)
+        return ShadowParts(
+            pupil=np.concatenate([full_at[0], b, pair[0]]),
+            step=np.concatenate([full_at[1], s, pair[1]]),
+            sign=np.concatenate([sign[full_at[2]], sign[g], np.ones(len(pair[0]))]),
+            piece=full_at[3],
+            points=np.concatenate([points[full_at[0], full_at[3]], cut_points, shared_points]),
+            weights=np.concatenate([-weights[full_at[0], full_at[3]], -cut_weights, shared_weights]),
+        )
+
+    def _pairs(self, moves: np.ndarray, full: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Pupils, steps and numbers of two pieces of which the second, moved by (B, S, 2), may meet the first."""
+        low, high = self.pieces.min(axis=2), self.pieces.max(axis=2)
+        moved_low, moved_high = (end[:, None, None] + moves[:, :, None, None] for end in (low, high))
+        apart = (high[:, None, :, None] <= moved_low) | (moved_high <= low[:, None, :, None])
+        both = full[:, None, :, None] & full[:, None, None]
+        return np.nonzero(~np.any(apart, axis=-1) & both)
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowParts:
+    """Quadrature over F regions that shadows take of overlaps of B pupils with themselves, for S shifts each.
+
+    A region is told where it lies in a shadow: for light that goes through q there and, in the other pupil, through
+    q - sign s.
+
+    Attributes:
+        pupil, step: which pupil and which of its shifts, (F,).
+        sign: of the shift of the pupil that the shadow belongs to, (F,).
+        piece: of the first W regions, which are whole pieces: their number, (W,).
+        points: q, complex, (F, Q).
+        weights: of the area, as in ``PupilShadow.overlap``, (F, Q).
+    """
+
+    pupil: np.ndarray
+    step: np.ndarray
+    sign: np.ndarray
+    piece: np.ndarray
+    points: np.ndarray
+    weights: np.ndarray
 
 
 def separate(polygons: list[np.ndarray]) -> tuple[np.ndarray, list[int]]:
@@ -159,7 +208,7 @@ def _without(part: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
     return [piece for piece in (whole, *difference(part, before)) if np.any(area(piece) > SMALLEST)]
 
 
-def _tiled(pieces: np.ndarray) -> np.ndarray:
+def tiled(pieces: np.ndarray) -> np.ndarray:
     """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y."""
     for axis in (0, 1):
         done = []
@@ -180,15 +229,22 @@ def _tiled(pieces: np.ndarray) -> np.ndarray:
     return pieces
 
 
-def _radius_terms(harmonics: np.ndarray) -> np.ndarray:
+def edge_radius(harmonics: np.ndarray) -> np.ndarray:
     """Fourier terms c of the radius Re sum c_k exp(ik angle) of edges with ``harmonics`` (2H + 1, B), (B, K)."""
-    count = 4 * len(harmonics)
+    last = len(harmonics) // 2
+    order = np.abs(np.arange(-last, last + 1))
+    used = int(np.max(order[np.max(np.abs(harmonics), axis=1) > _TURNED]))
+    own = harmonics[last - used : last + used + 1]
+    count = 8 * used + 4
     angle = np.broadcast_to(2.0 * np.pi * np.arange(count) / count, (harmonics.shape[1], count))
-    edge, at = PupilEdge(harmonics), angle
-    for _ in range(2 * _ITERATIONS):
+    edge, at, back = PupilEdge(own), angle, np.exp(-1j * angle[0])
+    for _ in range(_MOST_ITERATIONS):
         point = edge.boundary(at)[0]
-        at = at - np.angle(point * np.exp(-1j * angle))
-    terms = np.fft.rfft(np.abs(edge.boundary(at)[0]), axis=-1)[:, : len(harmonics)] / count
+        off = np.angle(point * back)
+        if np.max(np.abs(off), initial=0.0) < _TURNED:
+            break
+        at = at - off
+    terms = np.fft.rfft(np.abs(point), axis=-1)[:, : 2 * used + 1] / count
     terms[:, 1:] *= 2.0
     some = np.flatnonzero(np.max(np.abs(terms), axis=0) > _TURNED)
     return np.asarray(terms[:, : some[-1] + 1])
@@ -203,53 +259,30 @@ def _radius(terms: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.asarray(total.real + terms[:, 0].real[over])
 
 
-def _cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
-    """The part of each polygon (N, V, 2) inside of an edge, for which a polygon of the same area stands."""
-    beyond = np.flatnonzero(np.any(np.hypot(polygons[..., 0], polygons[..., 1]) > _least(radius)[:, None], axis=-1))
-    if not len(beyond):
-        return polygons
-    step = 2.0 * np.pi / rim_sides
-    turn = np.broadcast_to(np.exp(1j * step * np.arange(rim_sides)), (len(beyond), rim_sides))
-    rim = turn * _radius(radius[beyond], turn) * np.sqrt(step / np.sin(step))
-    cut = intersect(polygons[beyond], *sides(np.stack([rim.real, rim.imag], axis=-1)))
-    out = widened(polygons, cut.shape[1]).copy()
-    out[beyond] = widened(cut, out.shape[1])
-    return out
+def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
+    """The part of each polygon (B, K, V, 2) inside of edges with Fourier terms ``radius`` (B, H), for which polygons of
+    the same area with so many sides stand; counterclockwise.
+    """
+    number = polygons.shape[1]
+    flat = polygons.reshape(-1, *polygons.shape[2:])
+    flat = np.where((area(flat) < 0.0)[:, None, None], flat[:, ::-1], flat)
+    reach = np.max(np.hypot(flat[..., 0], flat[..., 1]), axis=-1, initial=0.0)
+    beyond = np.flatnonzero((reach > np.repeat(_least(radius), number)) & (area(flat) > SMALLEST))
+    if len(beyond):
+        step = 2.0 * np.pi / rim_sides
+        turn = np.broadcast_to(np.exp(1j * step * np.arange(rim_sides)), (len(radius), rim_sides))
+        rim = turn * _radius(radius, turn) * np.sqrt(step / np.sin(step))
+        # a polygon has few sides inside of the rim
+        inner = compact(intersect(np.stack([rim.real, rim.imag], axis=-1)[beyond // number], *sides(flat[beyond])))
+        flat = widened(flat, inner.shape[1]).copy()
+        flat[beyond] = widened(inner, flat.shape[1])
+    flat = compact(flat)
+    return flat.reshape(*polygons.shape[:2], *flat.shape[1:])
 
 
 def _least(radius: np.ndarray) -> np.ndarray:
     """A bound below each edge's radius, (N,)."""
     return np.asarray(np.abs(radius[:, 0]) - np.sum(np.abs(radius[:, 1:]), axis=-1))
-
-
-def _within(
-    polygons: np.ndarray, radius: np.ndarray, whole: tuple[np.ndarray, np.ndarray], move: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quadrature over the part of each polygon (N, V, 2) inside of an edge with Fourier terms ``radius`` (N, K).
-
-    Args:
-        polygons: as seen from the edge's middle.
-        radius: of the edges.
-        whole: quadrature over the polygons where they stand, points and weights, (N, Q) each.
-        move: of the edge's middle from there, (N, 2).
-
-    Returns:
-        Which polygons have such a part, (F,), points where they stand (F, Q) and weights (F, Q).
-    """
-    least = _least(radius)
-    reach = 2.0 * np.abs(radius[:, 0]) - least
-    centre = np.mean(polygons, axis=1)
-    size = np.sqrt(np.max(np.sum((polygons - centre[:, None]) ** 2, axis=-1), axis=-1))
-    inside = np.max(np.sum(polygons**2, axis=-1), axis=-1) < least**2
-    crossed = ~inside & (np.hypot(*centre.T) - size < reach)
-    full, part = np.flatnonzero(inside), np.flatnonzero(crossed)
-    points, weights = (array[full] for array in whole)
-    if not len(part):
-        return full, points, weights
-    count = int(np.sqrt(whole[0].shape[1]))
-    more, other = _drawn_in(polygons[part], radius[part], count)
-    more = more + (move[part, 0] + 1j * move[part, 1])[:, None]
-    return np.concatenate([full, part]), np.concatenate([points, more]), np.concatenate([weights, other])
 
 
 def _drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -290,9 +323,10 @@ def _drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.
     size, slope = _radius_and_slope(radius, turn)
     arc = turn * size
     arc_rise = 0.5 * weight * angle[..., None] * (turn * (slope + 1j * size)).imag
-    rows = len(polygons)
-    every = np.concatenate([place.reshape(rows, -1), arc.reshape(rows, -1)], axis=1)
-    rises = np.concatenate([rise.reshape(rows, -1), arc_rise.reshape(rows, -1)], axis=1)
+    every, rises = (
+        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
+        for both in ((place, arc), (rise, arc_rise))
+    )
     used = np.where(rises != 0.0, every, first[:, :1])
     corners = np.concatenate([used, low, high], axis=1)
     low, high = (np.stack([f(corners.real, axis=1), f(corners.imag, axis=1)], axis=-1) for f in (np.min, np.max))
@@ -323,20 +357,9 @@ def _radius_and_slope(terms: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, 
     return total.real + terms[:, 0].real[over], (slope * turn).real
 
 
-def _shared(polygons: np.ndarray, others: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quadrature over the intersections of pairs of polygons (N, V, 2); returns as ``_within``."""
-    apart = (polygons.max(axis=1) <= others.min(axis=1)) | (others.max(axis=1) <= polygons.min(axis=1))
-    found = np.flatnonzero(~np.any(apart, axis=-1) & (area(others) > SMALLEST))
-    return found, *quadrature(intersect(polygons[found], *sides(others[found])), count)
-
-
-def _in_rows(owner: np.ndarray, points: np.ndarray, weights: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """The nodes (F, Q) of every row (F,), in rows of equal length."""
+def in_rows(owner: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """How to pack things (F,) of given owners in rows: their order, the place of each in its row, and rows' length."""
     order = np.argsort(owner, kind="stable")
-    owner, count = owner[order], points.shape[1]
     many = np.bincount(owner, minlength=rows)
     place = np.arange(len(owner)) - np.repeat(np.cumsum(many) - many, many)
-    most = int(np.max(many, initial=0))
-    all_points, all_weights = np.zeros((rows, most, count), complex), np.zeros((rows, most, count))
-    all_points[owner, place], all_weights[owner, place] = points[order], weights[order]
-    return all_points.reshape(rows, -1), all_weights.reshape(rows, -1)
+    return order, place, int(np.max(many, initial=0))

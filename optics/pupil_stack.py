@@ -15,7 +15,7 @@ from numpy.polynomial import chebyshev
 
 from optics.pupil_edge import PupilEdge
 from optics.pupil_function import DEGREE
-from optics.pupil_shadow import FEW_SIDES, PupilShadow
+from optics.pupil_shadow import FEW_SIDES, PupilShadow, in_rows
 from optics.quadrature import PupilNodes, gauss
 from optics.threads import one_blas_thread
 from optics.transfer import nodes_for
@@ -112,7 +112,7 @@ class PupilStack:
         last = len(self.harmonics) // 2
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
 
-    def take(self, which: np.ndarray) -> PupilStack:
+    def take(self, which: np.ndarray | slice) -> PupilStack:
         """The pupils of the given indices."""
         return PupilStack(
             self.axes[which],
@@ -173,11 +173,25 @@ class PupilStack:
         """What the shadows add to ``_clear``."""
         shift, wave = self._shifts(frequency, wavelengths)
         values = np.zeros(shift.shape, complex)
-        for which, _, along in self._pieces(float(np.max(wave)), shift.shape[1], _SHADOWS_AT_ONCE):
-            pupils = np.repeat(which, shift.shape[1])
-            points, weight = shadow.overlap(pupils, shift[which].ravel(), LEAST_SHADOW + along - LEAST_ALONG)
-            shape = (len(which), shift.shape[1], -1)
-            values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
+        for which, _, along in self._pieces(float(np.max(wave)), 1, _SHADOWS_AT_ONCE):
+            some, moved = self.take(which), shift[which]
+            parts = shadow.take(which).parts(moved, LEAST_SHADOW + along - LEAST_ALONG)
+            whole = len(parts.piece)
+            # light of whole pieces once for all shifts, of others and in the other pupil for every region by itself
+            points, _ = shadow.take(which).whole(LEAST_SHADOW + along - LEAST_ALONG)
+            other = parts.points - (parts.sign * moved[parts.pupil, parts.step])[:, None]
+            owner = np.concatenate([np.indices(points.shape[:2])[0].ravel(), parts.pupil, parts.pupil[whole:]])
+            every = np.concatenate([points.reshape(-1, points.shape[-1]), other, parts.points[whole:]])
+            path, light = some._values_at(owner, every)
+            first, last = points.shape[0] * points.shape[1], len(owner) - len(parts.points) + whole
+            own = np.concatenate([parts.pupil[:whole] * points.shape[1] + parts.piece, np.arange(last, len(owner))])
+            phase = (parts.sign * wave[parts.step])[:, None] * (path[own] - path[first:last])
+            light = light[own] * light[first:last] * parts.weights
+            at = parts.pupil * shift.shape[1] + parts.step
+            real, imaginary = (
+                np.bincount(at, np.einsum("fq,fq->f", part(phase), light), moved.size) for part in (np.cos, np.sin)
+            )
+            values[which] = (real + 1j * imaginary).reshape(moved.shape)
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
     def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
@@ -209,6 +223,18 @@ class PupilStack:
         )
         return eikonal, amplitude
 
+    def _values_at(self, owner: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same at p (F, Q) in pupils (F,)."""
+        order, place, most = in_rows(owner, len(self.axes))
+        points = np.zeros((len(self.axes), most, p.shape[1]), complex)
+        points[owner[order], place] = p[order]
+        back = np.empty_like(order)
+        back[order] = place
+        step = max(1, _AT_ONCE // (most * p.shape[1]))
+        parts = [slice(k, k + step) for k in range(0, len(points), step)]
+        path, light = (np.concatenate(a) for a in zip(*(self.take(s)._values(points[s]) for s in parts), strict=True))
+        return path[owner, back], light[owner, back]
+
     @property
     def light(self) -> np.ndarray:
         """Share of the clear pupils' light that the shadows leave, (B,)."""
@@ -219,7 +245,7 @@ class PupilStack:
         """Integral of the amplitude's square over each pupil in p, (B,)."""
         if self.shadow is None:
             return self._clear_power
-        points, weight = self.shadow.whole(LEAST_SHADOW + 2)
+        points, weight = (a.reshape(len(self.axes), -1) for a in self.shadow.whole(LEAST_SHADOW + 2))
         return np.asarray(self._clear_power - np.sum(self._values(points[:, None])[1][:, 0] ** 2 * weight, axis=-1))
 
     @cached_property

@@ -135,7 +135,8 @@ def _correlate(
             own.append(pupil.edge.overlap(s, right[:, which], left[:, which], gauss(across), gauss(along)))
         if pupil.shadow is not None and part != "clear":
             nodes = pupil.shadow.least_nodes + max(across - LEAST_ACROSS, along - LEAST_ALONG)
-            own.append(pupil.shadow.overlap(np.zeros(len(s), int), s, nodes))
+            taken, area = pupil.shadow.overlap(s[None], nodes)
+            own.append((taken[0], area[0]))
         points, weight = (np.concatenate(arrays, axis=1) for arrays in zip(*own, strict=True))
         light, path, focus = _products(pupil, points, s)
         light *= weight

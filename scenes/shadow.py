@@ -24,7 +24,7 @@ from optics.assembly import Assembly, points_to_world
 from optics.backend import Backend
 from optics.convex_polygon import area, hull, intersect
 from optics.imaging import ImagingRays
-from optics.pupil_shadow import FEW_SIDES, SMALLEST, PupilShadow, separate
+from optics.pupil_shadow import FEW_SIDES, SMALLEST, PupilShadow, cut, separate, tiled
 from optics.pupil_stack import products, to_terms
 from optics.quadrature import PupilNodes
 from optics.system import SystemBatch
@@ -93,12 +93,10 @@ class Shadows:
         lit = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
         pieces, numbers = separate([outline for _, outline in lit])
         pieces = pieces if lit else np.zeros((count, 0, 3, 2))
-        circle = np.zeros((3, count), complex)
-        circle[2] = 1.0
-        areas = np.zeros(pieces.shape[:2])
-        for k in range(pieces.shape[1]):
-            areas[:, k] = PupilShadow.within(pieces[:, k : k + 1], circle, FEW_SIDES).area
-        return cls(pieces, tuple(lit[k][0] for k in numbers), PupilShadow.within(pieces, circle, FEW_SIDES), areas)
+        circle = np.ones((count, 1), complex)
+        inner = cut(pieces, circle, FEW_SIDES)
+        on_disk = PupilShadow(tiled(inner), circle)
+        return cls(pieces, tuple(lit[k][0] for k in numbers), on_disk, np.asarray(area(inner)))
 
     def shares(self) -> dict[str, np.ndarray]:
         """Share of the stop's area that each body takes, (B,)."""

@@ -366,8 +366,9 @@ class _CameraBench:
             smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - DARKEST))
             if len(good):
-                found = pupils.take(good).transfer(self.frequency, self.colours, self.weights)
-                mtf[:, lit[good]] = (np.abs(found) * self.detector).T
+                smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
+                otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
+                mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
             self._note(pupils, lit, which)
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
@@ -398,8 +399,8 @@ class _Mean:
         self._added: np.ndarray | None = None
         if shadows is None:
             return
-        points, weight = shadows.on_disk.whole(SHADOW_NODES)
-        count = len(points)
+        count = len(shadows.pieces)
+        points, weight = (a.reshape(count, -1) for a in shadows.on_disk.whole(SHADOW_NODES))
         all_weights = np.concatenate([np.broadcast_to(bench.nodes.weight, (count, bench.nodes.count)), -weight], axis=1)
         self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
         own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)

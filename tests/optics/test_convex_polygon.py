@@ -72,12 +72,12 @@ def test_a_disk_in_a_disk_by_its_parts() -> None:
     for s in (0.3, 0.9, 1.6):
         # shifted along the cut the upper half disk overlaps itself in half the lens, square to it in less
         lens = 2.0 * np.arccos(0.5 * s) - 0.5 * s * np.sqrt(4.0 - s * s)
-        _, weights = shadow.overlap(np.zeros(2, int), np.array([s, -1j * s]), 3)
+        _, weights = shadow.overlap(np.array([[s, -1j * s]]), 3)
         # up to the polygon of the rim, which has the circle's area as a whole
-        assert lens + weights[0].sum() == pytest.approx(0.5 * lens, abs=1e-4)
+        assert lens + weights[0, 0].sum() == pytest.approx(0.5 * lens, abs=1e-4)
         # moved up by s: the segment of the lower circle above y = s/2 + s/2 ...
         segment = np.arccos(min(s, 1.0)) - s * np.sqrt(max(1.0 - s * s, 0.0))
-        assert lens + weights[1].sum() == pytest.approx(segment if s < 1.0 else 0.0, abs=2e-4)
+        assert lens + weights[0, 1].sum() == pytest.approx(segment if s < 1.0 else 0.0, abs=2e-4)
 
 
 def test_rounding_in_corners_cuts_nothing_off() -> None:
@@ -102,7 +102,7 @@ def test_an_edge_that_is_no_circle() -> None:
     # curvature is another by a sixth along an arc of 0.55: 7e-5
     assert shadow.area[0] == pytest.approx(want, abs=7e-5)
     shift = np.array([0.4 + 0.2j])
-    _, weights = shadow.overlap(np.zeros(1, int), shift, 3)
+    _, weights = shadow.overlap(shift[None], 3)
     move = np.array([0.4, 0.2])
     own = intersect(fine, *sides(box[0]))
     far = [intersect(own, *sides(fine + sign * move)) for sign in (1.0, -1.0)]
