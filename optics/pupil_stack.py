@@ -17,7 +17,6 @@ from optics.pupil_edge import PupilEdge
 from optics.pupil_function import DEGREE
 from optics.pupil_shadow import FEW_SIDES, PupilShadow, in_rows
 from optics.quadrature import PupilNodes, gauss
-from optics.threads import one_blas_thread
 from optics.transfer import nodes_for
 
 LEAST_ALONG = 6
@@ -81,20 +80,19 @@ class PupilStack:
         """
         root = np.sqrt(nodes.weight)
         i, j = _orders(degree)
-        with one_blas_thread():
-            solve = to_terms(nodes, degree)
-            terms = np.stack([u, v], axis=1) @ solve.T
-            centre, axes, harmonics = _edges(terms, degree)
-            (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in _slopes(nodes, degree))
-            density = amplitude / (nodes.weight * np.abs(ux * vy - uy * vx))
-            place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
-            design = products(place[:, 0], place[:, 1], degree) * root[:, None]
-            both = np.stack([eikonal, density], axis=-1) * root[:, None]
-            turned = np.swapaxes(design, 1, 2)
-            solution = np.linalg.solve(turned @ design, turned @ both)
-            rest = both[..., 0] - (design @ solution[..., :1])[..., 0]
-            level = i + j < 2
-            plane = (design[..., level] @ solution[:, level, :1])[..., 0]
+        solve = to_terms(nodes, degree)
+        terms = np.stack([u, v], axis=1) @ solve.T
+        centre, axes, harmonics = _edges(terms, degree)
+        (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in _slopes(nodes, degree))
+        density = amplitude / (nodes.weight * np.abs(ux * vy - uy * vx))
+        place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
+        design = products(place[:, 0], place[:, 1], degree) * root[:, None]
+        both = np.stack([eikonal, density], axis=-1) * root[:, None]
+        turned = np.swapaxes(design, 1, 2)
+        solution = np.linalg.solve(turned @ design, turned @ both)
+        rest = both[..., 0] - (design @ solution[..., :1])[..., 0]
+        level = i + j < 2
+        plane = (design[..., level] @ solution[:, level, :1])[..., 0]
         bent = (both[..., 0] - plane) / root
         table = np.zeros((2, len(u), degree + 1, degree + 1))
         table[:, :, i, j] = np.moveaxis(solution, -1, 0)
@@ -138,11 +136,10 @@ class PupilStack:
         Raises:
             ValueError: an edge that is far from an ellipse.
         """
-        with one_blas_thread():
-            total = self._clear(frequency, wavelengths, weights / np.sum(weights))
-            if self.shadow is not None:
-                total = total + self._shadowed(self.shadow, frequency, wavelengths, weights / np.sum(weights))
-            return np.asarray(total / self.power[:, None])
+        total = self._clear(frequency, wavelengths, weights / np.sum(weights))
+        if self.shadow is not None:
+            total = total + self._shadowed(self.shadow, frequency, wavelengths, weights / np.sum(weights))
+        return np.asarray(total / self.power[:, None])
 
     def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normalised shifts, complex (B, K * M), and the wave numbers of each, (K * M,)."""

@@ -31,6 +31,7 @@ from optics.pupil_edge import WORST_BEND
 from optics.pupil_function import DEGREE, WORST_RESIDUAL
 from optics.pupil_stack import PupilStack, products, to_terms
 from optics.system import assemble
+from optics.threads import one_blas_thread
 from optics.trace import BeamMissedError
 from optics.tree import State
 from optics.wavefront import eikonal, path_to_sphere
@@ -167,6 +168,7 @@ def _known(value: float | np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+@one_blas_thread()  # of small matrices: threads would only wait for each other
 def image_quality(
     instrument: Instrument,
     backend: Backend,
