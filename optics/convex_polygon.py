@@ -15,6 +15,9 @@ from optics.quadrature import gauss
 _NO_LIMIT = 1e30
 """Of a side without length: finite, so that it can be multiplied."""
 
+_AT_ONCE = 2**13
+"""Nodes on boundaries worked on together: their polynomials stay in the cache."""
+
 _SAME = 1e-13
 """Distance below which two corners are one."""
 
@@ -121,8 +124,9 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
         (N, U, D).
     """
     height = np.einsum("nvx,nwx->nwv", polygons[..., :2], normal)
-    needed = np.any(height > limit[..., None], axis=-1)
-    for w in np.flatnonzero(np.any(needed, axis=0)):
+    beyond = np.sum(height > limit[..., None], axis=-1)
+    needed, total = beyond > 0, np.sum(beyond, axis=0)
+    for w in np.argsort(-total, kind="stable")[: np.count_nonzero(total)]:  # those that leave the fewest corners first
         some = np.flatnonzero(needed[:, w])
         cut = clip(polygons[some], normal[some, w], limit[some, w])
         polygons = widened(polygons, cut.shape[1]).copy()
@@ -181,18 +185,32 @@ def from_boundary(
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     half = np.where(half > 0.0, half, 1.0)
     at = (place - middle[:, None]) / half[:, None]
-    x, y = _legendre(at[..., 0], count + 1), _legendre(at[..., 1], count)
-    primitive = np.empty((count, *rise.shape))  # of P_0, P_1, ... along x
-    primitive[0] = x[1]
-    np.subtract(x[2:], x[:-2], out=primitive[1:])
-    primitive[1:] /= (2 * np.arange(1, count) + 1)[:, None, None]
-    primitive *= rise / half[:, 1:]
-    moments = primitive.transpose(1, 0, 2) @ y.transpose(1, 2, 0)
+    rise = rise / half[:, 1:]
+    step = max(1, _AT_ONCE // max(place.shape[1], 1))
+    some = [slice(k, k + step) for k in range(0, rows, step)]
+    moments = np.concatenate([np.zeros((0, count, count)), *(_moments(at[s], rise[s], count) for s in some)])
     moments *= (np.sign(moments[:, 0, 0]) * half[:, 0] * half[:, 1])[:, None, None]
     own, to_weights = gauss(count)[0], _lagrange(count)
     weights = to_weights @ moments @ to_weights.T
     points = (middle[:, :1] + half[:, :1] * own)[:, :, None] + 1j * (middle[:, 1:] + half[:, 1:] * own)[:, None]
     return points.reshape(rows, count**2), weights.reshape(rows, count**2)
+
+
+def _moments(at: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
+    """Integrals of Legendre's P_i(x) P_j(y) over N regions with nodes (N, P, 2) on their boundaries, (N, count, count).
+
+    Args:
+        at: the nodes.
+        rise: their weights in integrals over dy, (N, P).
+        count: of polynomials.
+    """
+    x, y = _legendre(at[..., 0], count + 1), _legendre(at[..., 1], count)
+    primitive = np.empty((count, *rise.shape))  # of P_0, P_1, ... along x
+    primitive[0] = x[1]
+    np.subtract(x[2:], x[:-2], out=primitive[1:])
+    primitive[1:] /= (2 * np.arange(1, count) + 1)[:, None, None]
+    primitive *= rise
+    return np.asarray(primitive.transpose(1, 0, 2) @ y.transpose(1, 2, 0))
 
 
 @cache

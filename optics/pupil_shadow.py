@@ -46,6 +46,9 @@ _MOST_ITERATIONS = 40
 _TURNED = 1e-12
 """Angle of an arc, radians, below which it is none but for rounding."""
 
+_ROUND = 1e-10
+"""Term of an edge's radius, below which it is none."""
+
 SMALLEST = 1e-9
 """Area of a piece, of a pupil of radius 1, below which it is nothing."""
 
@@ -66,7 +69,7 @@ class PupilShadow:
     def within(cls, polygons: np.ndarray, harmonics: np.ndarray, rim_sides: int = RIM_SIDES) -> PupilShadow:
         """What polygons (B, K, V, 2), which do not overlap, take of pupils with edges of ``harmonics`` (2H + 1, B)."""
         radius = edge_radius(harmonics)
-        return cls(tiled(cut(polygons, radius, rim_sides)), radius)
+        return cls(tiled(cut(polygons, radius, rim_sides))[0], radius)
 
     @property
     def area(self) -> np.ndarray:
@@ -118,17 +121,16 @@ class PupilShadow:
         # c + sign s/2 lies in the shadow and c - sign s/2 in the pupil: the shadow within the pupil moved by sign s
         sign = np.array([1.0, -1.0])
         away = sign[:, None] * moves[:, :, None]
-        least = _least(self.radius)
-        reach = 2.0 * np.abs(self.radius[:, 0]) - least
+        least, most = _least(self.radius), _most(self.radius)
         x, y = (self.pieces[:, None, None, ..., k] - away[..., None, None, k] for k in (0, 1))
         inside = np.max(x * x + y * y, axis=-1) < least[:, None, None, None] ** 2
         centre = np.mean(self.pieces, axis=2)
         size = np.sqrt(np.max(np.sum((self.pieces - centre[:, :, None]) ** 2, axis=-1), axis=-1))
         near = centre[:, None, None] - away[..., None, :]
-        near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < reach[:, None, None, None]
+        near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < most[:, None, None, None]
         full_at = np.nonzero(inside & full[:, None, None])
         b, s, g, k = np.nonzero(~inside & near & full[:, None, None])
-        cut_points, cut_weights = _drawn_in(self.pieces[b, k] - away[b, s, g][:, None], self.radius[b], count)
+        cut_points, cut_weights = drawn_in(self.pieces[b, k] - away[b, s, g][:, None], self.radius[b], count)
         cut_points += (sign[g] * shift[b, s])[:, None]
         pair = self._pairs(moves, full)
         normal, limit = sides(self.pieces.reshape(-1, *self.pieces.shape[2:]))
@@ -141,6 +143,7 @@ class PupilShadow:
             step=np.concatenate([full_at[1], s, pair[1]]),
             sign=np.concatenate([sign[full_at[2]], sign[g], np.ones(len(pair[0]))]),
             piece=full_at[3],
+            whole=points,
             points=np.concatenate([points[full_at[0], full_at[3]], cut_points, shared_points]),
             weights=np.concatenate([-weights[full_at[0], full_at[3]], -cut_weights, shared_weights]),
         )
@@ -165,6 +168,7 @@ class ShadowParts:
         pupil, step: which pupil and which of its shifts, (F,).
         sign: of the shift of the pupil that the shadow belongs to, (F,).
         piece: of the first W regions, which are whole pieces: their number, (W,).
+        whole: nodes of all pieces, complex, (B, K, Q).
         points: q, complex, (F, Q).
         weights: of the area, as in ``PupilShadow.overlap``, (F, Q).
     """
@@ -173,6 +177,7 @@ class ShadowParts:
     step: np.ndarray
     sign: np.ndarray
     piece: np.ndarray
+    whole: np.ndarray
     points: np.ndarray
     weights: np.ndarray
 
@@ -208,11 +213,14 @@ def _without(part: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
     return [piece for piece in (whole, *difference(part, before)) if np.any(area(piece) > SMALLEST)]
 
 
-def tiled(pieces: np.ndarray) -> np.ndarray:
-    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y."""
+def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
+    of the K each is, (L,).
+    """
+    owners = np.arange(pieces.shape[1])
     for axis in (0, 1):
-        done = []
-        for piece in np.moveaxis(pieces, 1, 0):
+        done, numbers = [], []
+        for owner, piece in zip(owners, np.moveaxis(pieces, 1, 0), strict=True):
             low = piece[..., axis].min(axis=1)
             size = piece[..., axis].max(axis=1) - low
             parts = max(int(np.ceil(np.max(size, initial=0.0) / LARGEST)), 1)
@@ -223,10 +231,11 @@ def tiled(pieces: np.ndarray) -> np.ndarray:
                 done.append(clip(piece, normal, limit))
                 piece = clip(piece, -normal, -limit)
             done.append(piece)
+            numbers += [owner] * parts
         width = max((part.shape[1] for part in done), default=pieces.shape[2])
         if done:
-            pieces = np.stack([widened(part, width) for part in done], axis=1)
-    return pieces
+            pieces, owners = np.stack([widened(part, width) for part in done], axis=1), np.array(numbers)
+    return pieces, owners
 
 
 def edge_radius(harmonics: np.ndarray) -> np.ndarray:
@@ -246,7 +255,7 @@ def edge_radius(harmonics: np.ndarray) -> np.ndarray:
         at = at - off
     terms = np.fft.rfft(np.abs(point), axis=-1)[:, : 2 * used + 1] / count
     terms[:, 1:] *= 2.0
-    some = np.flatnonzero(np.max(np.abs(terms), axis=0) > _TURNED)
+    some = np.flatnonzero(np.max(np.abs(terms), axis=0) > _ROUND)
     return np.asarray(terms[:, : some[-1] + 1])
 
 
@@ -285,7 +294,12 @@ def _least(radius: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(radius[:, 0]) - np.sum(np.abs(radius[:, 1:]), axis=-1))
 
 
-def _drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _most(radius: np.ndarray) -> np.ndarray:
+    """A bound above each edge's radius, (N,)."""
+    return np.asarray(np.sum(np.abs(radius), axis=-1))
+
+
+def drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Quadrature over the intersection of polygons with the inside of edges.
 
     Whatever of a polygon's boundary lies outside of the edge is drawn in along the radius. That changes no winding
@@ -298,26 +312,30 @@ def _drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.
     length = np.abs(way)
     unit = way / np.where(length > 0.0, length, 1.0)
     nearest = -(start * np.conj(unit)).real  # of the whole line, as a distance from the start
-    foot = start + nearest * unit
+    within = np.abs(start) < _least(radius)[:, None]
+    within &= np.roll(within, -1, axis=1)
+    beyond = np.abs(start + np.clip(nearest, 0.0, length) * unit) > _most(radius)[:, None]
+    ends = np.zeros(length.shape), np.where(within, length, 0.0)
+    crossed = np.nonzero(~within & ~beyond)
+    own, direction, nearest = radius[crossed[0]], unit[crossed], nearest[crossed]
+    foot = start[crossed] + nearest * direction
     off = np.abs(foot) ** 2
-    ends = []
-    for sign in (-1.0, 1.0):
-        size = radius[:, :1].real
+    for sign, end in zip((-1.0, 1.0), ends, strict=True):
+        size = own[:, 0].real
         for _ in range(_ITERATIONS):
             half = np.sqrt(np.maximum(size**2 - off, 0.0))
-            size = _radius(radius, _direction(foot + sign * half * unit))
-        ends.append(np.clip(nearest + sign * np.sqrt(np.maximum(size**2 - off, 0.0)), 0.0, length))
+            size = _radius(own, _direction(foot + sign * half * direction))
+        place = nearest + sign * np.sqrt(np.maximum(size**2 - off, 0.0))
+        end[crossed] = np.clip(place, 0.0, length[crossed])
     enter, leave = (start + end * unit for end in ends)
     node, weight = gauss(count + 1)
     share = 0.5 * (node + 1.0)
-    first, last = _some(np.stack([enter, leave]), ends[1] - ends[0] > _TURNED)
+    (first, last), straight = _some(np.stack([enter, leave]), ends[1] - ends[0] > _TURNED)
     place = first[..., None] + (last - first)[..., None] * share
     rise = 0.5 * weight * (last - first).imag[..., None]
-    high = np.maximum(first.real, last.real) + 1j * np.maximum(first.imag, last.imag)
-    low = np.minimum(first.real, last.real) + 1j * np.minimum(first.imag, last.imag)
     outside = np.concatenate([ends[0] > _TURNED, length - ends[1] > _TURNED], axis=1)
     pairs = np.stack([np.concatenate([start, leave], axis=1), np.concatenate([enter, after], axis=1)])
-    begin, end = _some(pairs, outside)
+    (begin, end), bent = _some(pairs, outside)
     angle = np.angle(end * np.conj(begin))
     turn = _direction(begin)[..., None] * np.exp(1j * angle[..., None] * share)
     size, slope = _radius_and_slope(radius, turn)
@@ -327,19 +345,28 @@ def _drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.
         np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
         for both in ((place, arc), (rise, arc_rise))
     )
-    used = np.where(rises != 0.0, every, first[:, :1])
-    corners = np.concatenate([used, low, high], axis=1)
-    low, high = (np.stack([f(corners.real, axis=1), f(corners.imag, axis=1)], axis=-1) for f in (np.min, np.max))
+    # the region's box: of both ends of straight pieces, and of nodes on arcs
+    corners = np.concatenate([first, last, arc.reshape(len(arc), arc.shape[1] * arc.shape[2])], axis=1)
+    counted = np.concatenate([straight, straight, np.repeat(bent, len(share), axis=1)], axis=1)
+    low, high = (
+        np.stack([f(c, axis=1, where=counted, initial=limit) for c in (corners.real, corners.imag)], axis=-1)
+        for f, limit in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    none = ~np.any(counted, axis=1)
+    low[none], high[none] = 0.0, 0.0
     return from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
 
 
-def _some(pairs: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Those of pairs of points (2, N, V) that are kept, (N, V), as (2, N, W); others begin and end at one place."""
+def _some(pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of pairs of points (2, N, V) that are kept, (N, V), as (2, N, W), and which of these are, (N, W); others
+    begin and end at one place.
+    """
     many = np.sum(kept, axis=1)
     width = max(int(np.max(many, initial=0)), 1)
     order = np.argsort(~kept, axis=1, kind="stable")[:, :width]
     first, last = (np.take_along_axis(points, order, axis=1) for points in pairs)
-    return np.stack([first, np.where(np.arange(width) < many[:, None], last, first)])
+    some = np.arange(width) < many[:, None]
+    return np.stack([first, np.where(some, last, first)]), some
 
 
 def _direction(point: np.ndarray) -> np.ndarray:

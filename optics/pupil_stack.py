@@ -173,15 +173,14 @@ class PupilStack:
         for which, _, along in self._pieces(float(np.max(wave)), 1, _SHADOWS_AT_ONCE):
             some, moved = self.take(which), shift[which]
             parts = shadow.take(which).parts(moved, LEAST_SHADOW + along - LEAST_ALONG)
-            whole = len(parts.piece)
             # light of whole pieces once for all shifts, of others and in the other pupil for every region by itself
-            points, _ = shadow.take(which).whole(LEAST_SHADOW + along - LEAST_ALONG)
+            pieces, count = parts.whole.shape[1], len(parts.piece)
             other = parts.points - (parts.sign * moved[parts.pupil, parts.step])[:, None]
-            owner = np.concatenate([np.indices(points.shape[:2])[0].ravel(), parts.pupil, parts.pupil[whole:]])
-            every = np.concatenate([points.reshape(-1, points.shape[-1]), other, parts.points[whole:]])
+            owner = np.concatenate([np.repeat(np.arange(len(which)), pieces), parts.pupil, parts.pupil[count:]])
+            every = np.concatenate([parts.whole.reshape(-1, other.shape[1]), other, parts.points[count:]])
             path, light = some._values_at(owner, every)
-            first, last = points.shape[0] * points.shape[1], len(owner) - len(parts.points) + whole
-            own = np.concatenate([parts.pupil[:whole] * points.shape[1] + parts.piece, np.arange(last, len(owner))])
+            first, last = len(which) * pieces, len(which) * pieces + len(other)
+            own = np.concatenate([parts.pupil[:count] * pieces + parts.piece, np.arange(last, len(owner))])
             phase = (parts.sign * wave[parts.step])[:, None] * (path[own] - path[first:last])
             light = light[own] * light[first:last] * parts.weights
             at = parts.pupil * shift.shape[1] + parts.step

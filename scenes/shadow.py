@@ -24,7 +24,7 @@ from optics.assembly import Assembly, points_to_world
 from optics.backend import Backend
 from optics.convex_polygon import area, hull, intersect
 from optics.imaging import ImagingRays
-from optics.pupil_shadow import FEW_SIDES, SMALLEST, PupilShadow, cut, separate, tiled
+from optics.pupil_shadow import SMALLEST, drawn_in, separate, tiled
 from optics.pupil_stack import products, to_terms
 from optics.quadrature import PupilNodes
 from optics.system import SystemBatch
@@ -55,6 +55,9 @@ _WINDOW, _WINDOW_SIDES = 1.05, 8
 
 _STEPS = 4
 
+_NODES = 5
+"""Along each side of a shadow's box, for squares of wavefronts."""
+
 
 @dataclass(frozen=True, eq=False)
 class Caster:
@@ -78,13 +81,15 @@ class Shadows:
     Attributes:
         pieces: convex polygons that do not overlap, (B, K, V, 2); K may be 0. They reach a little beyond the disk.
         owners: the body that throws each piece; of several the one that was found first.
-        on_disk: the same within the disk.
+        points: nodes of a quadrature over all of them within the disk, complex, (B, Q).
+        weights: of the area, (B, Q).
         areas: of each within the disk, (B, K).
     """
 
     pieces: np.ndarray
     owners: tuple[str, ...]
-    on_disk: PupilShadow
+    points: np.ndarray
+    weights: np.ndarray
     areas: np.ndarray
 
     @classmethod
@@ -93,10 +98,14 @@ class Shadows:
         lit = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
         pieces, numbers = separate([outline for _, outline in lit])
         pieces = pieces if lit else np.zeros((count, 0, 3, 2))
-        circle = np.ones((count, 1), complex)
-        inner = cut(pieces, circle, FEW_SIDES)
-        on_disk = PupilShadow(tiled(inner), circle)
-        return cls(pieces, tuple(lit[k][0] for k in numbers), on_disk, np.asarray(area(inner)))
+        tiles, tiled_from = tiled(pieces)
+        flat = tiles.reshape(-1, *tiles.shape[2:])
+        points, weights = (
+            a.reshape(*tiles.shape[:2], _NODES**2) for a in drawn_in(flat, np.ones((len(flat), 1), complex), _NODES)
+        )
+        areas = np.sum(weights, axis=-1) @ (tiled_from[:, None] == np.arange(pieces.shape[1]))
+        points, weights = (a.reshape(count, -1) if pieces.shape[1] else np.zeros((count, 0)) for a in (points, weights))
+        return cls(pieces, tuple(lit[k][0] for k in numbers), points, weights, areas)
 
     def shares(self) -> dict[str, np.ndarray]:
         """Share of the stop's area that each body takes, (B,)."""
@@ -147,6 +156,12 @@ class ImagingShadows:
     def __init__(self, instrument: Instrument, camera: str, backend: Backend) -> None:
         self.camera, self.backend = camera, backend
         self.casters = casters(instrument, camera)
+        bodies = [caster.body for caster in self.casters]
+        self._on = {body: np.flatnonzero([body == other for other in bodies]) for body in dict.fromkeys(bodies)}
+        self._middles = np.array([np.mean(caster.corners, axis=0) for caster in self.casters]).reshape(-1, 3)
+        self._sizes = np.array(
+            [np.max(np.linalg.norm(c.corners - m, axis=-1)) for c, m in zip(self.casters, self._middles, strict=True)]
+        )
         model = instrument.cameras[camera]
         self._first = f"{BASE}/{camera}/{model.mirrors[0]}"
         self._centre = instrument.assembly.tree[self._first].pivots["centre"]
@@ -178,10 +193,10 @@ class ImagingShadows:
         found: list[tuple[str, np.ndarray]] = []
         heading = np.broadcast_to(heading, (len(owner), 3))
         bundle = _Bundle.parallel(rays.launched, heading, self._end(placed, owner, rays.launched, heading), nodes)
-        for caster in self.casters:
-            place = _corners(caster, placed, owner)
-            if bundle.may_meet(place):
-                found.append((caster.name, bundle.outline(place)))
+        centre, size = self._spheres(placed)
+        for k in np.flatnonzero(bundle.may_meet(centre[owner], size[owner])):
+            caster = self.casters[k]
+            found.append((caster.name, bundle.outline(_corners(caster, placed, owner))))
         if self._inner:
             places = self._hits(assembly, placed, owner, systems, chain, rays.launched, heading)
             for k, (start, end) in enumerate(pairwise(places)):
@@ -189,6 +204,15 @@ class ImagingShadows:
                 for caster in self._inner.get(k, ()):
                     found.append((caster.name, bundle.outline(_corners(caster, placed, owner))))
         return Shadows.of(found, len(owner))
+
+    def _spheres(self, placed: PlacedBodies) -> tuple[np.ndarray, np.ndarray]:
+        """Middles (S, C, 3) and radii (S, C) of spheres about all C casters, world."""
+        count = len(placed.scale)
+        centre, size = np.empty((count, len(self.casters), 3)), np.empty((count, len(self.casters)))
+        for body, which in self._on.items():
+            centre[:, which] = points_to_world(placed, body, self._middles[which]).real
+            size[:, which] = placed.scale[:, [placed.index[body]]].real * self._sizes[which]
+        return centre, size
 
     def _end(self, placed: PlacedBodies, owner: np.ndarray, launched: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """How far it is from the launch points to the first mirror's middle, (B,)."""
@@ -284,18 +308,16 @@ class _Bundle:
         far = launched - _FAR * heading[:, None]
         return cls.between(far, launched + (end[:, None] * heading)[:, None], nodes)
 
-    def may_meet(self, corners: np.ndarray) -> bool:
-        """Whether the sphere about a body (B, C, 3) meets any of the beams, which are parallel."""
-        centre = corners.mean(axis=1)
-        size = np.max(np.linalg.norm(corners - centre[:, None], axis=-1), axis=-1)
-        off = np.einsum("bix,bx->bi", self.axes, centre - self.middle[:, 0])
-        radius = np.linalg.norm(np.einsum("bix,bxj->bij", self.axes, self.spread[:, 0]), axis=(1, 2))
-        return bool(np.any(np.linalg.norm(off, axis=-1) < 1.1 * radius + size))
+    def may_meet(self, centre: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Which of the spheres with middles (B, C, 3) and radii (B, C) meet any of the beams, which are parallel."""
+        off = (centre - self.middle[:, :1]) @ self.axes.swapaxes(1, 2)
+        radius = np.linalg.norm(self.axes @ self.spread[:, 0], axis=(1, 2))
+        return np.asarray(np.any(np.hypot(off[..., 0], off[..., 1]) < 1.1 * radius[:, None] + size, axis=0))
 
     def outline(self, corners: np.ndarray) -> np.ndarray:
         """Outline of a convex body (B, C, 3) on the stop's unit disk, (B, V, 2); empty where it takes nothing."""
         corners = self._inside(corners)
-        packed = np.concatenate([np.squeeze(self._guess(corners)[0], -1), corners], axis=-1)
+        packed = np.concatenate([self._guess(corners)[0], corners], axis=-1)
         angle = 2.0 * np.pi * (np.arange(_WINDOW_SIDES) + 0.5) / _WINDOW_SIDES
         normal = np.broadcast_to(np.stack([np.cos(angle), np.sin(angle)], axis=-1), (len(packed), _WINDOW_SIDES, 2))
         cut = intersect(hull(packed), normal, np.full(normal.shape[:2], _WINDOW))
@@ -311,17 +333,17 @@ class _Bundle:
             arm = place - start
             ahead = np.einsum("bvx,bx->bv", arm, self.along) / np.einsum("bvx,bx->bv", way, self.along)
             miss = np.einsum("bix,bvx->bvi", self.axes, arm - ahead[..., None] * way)
-            out = out + np.squeeze(np.linalg.solve(slope, miss[..., None]), -1)
+            out = out + _solved(slope, miss)
         return np.where(empty[:, None, None], out[:, :1], out)
 
     def _guess(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Stop coordinates (B, C, 2, 1) of rays through points in the mean, and d(transverse)/d(stop), (B, C, 2, 2)."""
+        """Stop coordinates (B, C, 2) of rays through points in the mean, and d(transverse)/d(stop), (B, C, 2, 2)."""
         first, way = self.middle[:, :1], (self.middle[:, 1:] - self.middle[:, :1])
         ahead = self._ahead(place)[..., None]
         off = np.einsum("bix,bcx->bci", self.axes, place - first - ahead * way)
         near, far = (np.einsum("bix,bxj->bij", self.axes, self.spread[:, k])[:, None] for k in (0, 1))
         slope = near + ahead[..., None] * (far - near)
-        return np.linalg.solve(slope, off[..., None]), slope
+        return _solved(slope, off), slope
 
     def _ahead(self, place: np.ndarray) -> np.ndarray:
         """Share of the way at which points lie, (B, C)."""
@@ -345,6 +367,13 @@ class _Bundle:
             cut = np.where(crossing[..., None], cut, inside)
             corners = np.concatenate([kept, cut], axis=1)
         return corners
+
+
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions of systems (..., 2, 2) for (..., 2); many at once are quicker so than one by one."""
+    (a, b), (c, d) = (np.moveaxis(row, -1, 0) for row in np.moveaxis(matrix, -2, 0))
+    x, y = np.moveaxis(right, -1, 0)
+    return np.asarray(np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None])
 
 
 _FAR = 100.0

@@ -56,9 +56,6 @@ WAVELENGTH = 650e-9
 RINGS = 7
 """Of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
-SHADOW_NODES = 5
-"""Along each side of a shadow's box, for squares of wavefronts."""
-
 DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
 
@@ -401,8 +398,8 @@ class _Mean:
         self._added: np.ndarray | None = None
         if shadows is None:
             return
-        count = len(shadows.pieces)
-        points, weight = (a.reshape(count, -1) for a in shadows.on_disk.whole(SHADOW_NODES))
+        points, weight = shadows.points, shadows.weights
+        count = len(points)
         all_weights = np.concatenate([np.broadcast_to(bench.nodes.weight, (count, bench.nodes.count)), -weight], axis=1)
         self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
         own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)

@@ -99,8 +99,8 @@ def test_share_of_the_prisms_against_rays_and_triangles(gf7_pair, backend, state
         np.testing.assert_allclose(shares.get(solid.path, 0.0), taken.mean(axis=-1), atol=1.5e-4)
         total |= taken
     assert set(shares) == {PRISM, PRISM.replace("left", "right")}
-    np.testing.assert_allclose(shadows.on_disk.area / np.pi, total.mean(axis=-1), atol=1.5e-4)
-    assert np.all(shadows.on_disk.area / np.pi > 0.05)
+    np.testing.assert_allclose(np.sum(shadows.areas, axis=-1) / np.pi, total.mean(axis=-1), atol=1.5e-4)
+    assert np.all(np.sum(shadows.areas, axis=-1) / np.pi > 0.05)
 
 
 def test_a_moved_prism_moves_its_shadow(gf7_pair, backend) -> None:
@@ -249,7 +249,7 @@ def test_a_round_plate_before_the_first_mirror(gf7_pair, backend) -> None:
     x /= np.linalg.norm(x)
     turn = np.stack([x, np.cross(z, x), z], axis=-1)
     cross_section = float(np.sum(rays.launch_area))
-    base = shadows_of(path, {}, directions).on_disk.area[0] / np.pi
+    base = np.sum(shadows_of(path, {}, directions).areas[0]) / np.pi
 
     def light(outline) -> float:
         own = path_of(with_plate(gf7_pair, Plate("disk", "base", Pose(turn, middle), outline)), backend)
