@@ -144,6 +144,29 @@ def _plate(plate: Plate) -> list[Caster]:
     return [Caster(plate.name, plate.body, plate.pose.apply(part)) for part in flat]
 
 
+@dataclass(frozen=True, eq=False)
+class TracedBeams:
+    """Beams of B images, as traced.
+
+    Attributes:
+        assembly: with the camera's elements.
+        placed: bodies in all states.
+        owner: which state each image belongs to, (B,).
+        systems: on the way to the image, B.
+        rays: of the images.
+        heading: of their light, world, unit, (3,) or (B, 3).
+        nodes: at which the rays meet the stop.
+    """
+
+    assembly: Assembly
+    placed: PlacedBodies
+    owner: np.ndarray
+    systems: SystemBatch
+    rays: ImagingRays
+    heading: np.ndarray
+    nodes: PupilNodes
+
+
 class ImagingShadows:
     """What throws shadows into the imaging beams of one camera.
 
@@ -167,43 +190,21 @@ class ImagingShadows:
         self._centre = instrument.assembly.tree[self._first].pivots["centre"]
         self._inner = _between_mirrors(self.casters, instrument, backend, camera)
 
-    def cast(
-        self,
-        assembly: Assembly,
-        placed: PlacedBodies,
-        owner: np.ndarray,
-        systems: SystemBatch,
-        chain: Sequence[str],
-        rays: ImagingRays,
-        heading: np.ndarray,
-        nodes: PupilNodes,
-    ) -> Shadows:
-        """Shadows in B pupils.
-
-        Args:
-            assembly: whose elements ``chain`` names.
-            placed: bodies in all states.
-            owner: which state each image belongs to, (B,).
-            systems: on the way to the image, B.
-            chain: names of their elements.
-            rays: of the images, as traced.
-            heading: of their light, world, (B, 3).
-            nodes: at which the rays meet the stop.
-        """
+    def cast(self, beams: TracedBeams) -> Shadows:
+        """Shadows in B pupils."""
         found: list[tuple[str, np.ndarray]] = []
-        heading = np.broadcast_to(heading, (len(owner), 3))
-        bundle = _Bundle.parallel(rays.launched, heading, self._end(placed, owner, rays.launched, heading), nodes)
-        centre, size = self._spheres(placed)
-        for k in np.flatnonzero(bundle.may_meet(centre[owner], size[owner])):
-            caster = self.casters[k]
-            found.append((caster.name, bundle.outline(_corners(caster, placed, owner))))
+        launched = beams.rays.launched
+        bundle = _Bundle.parallel(launched, beams.heading, self._end(beams), beams.nodes)
+        centre, size = self._spheres(beams.placed)
+        for near in np.flatnonzero(bundle.may_meet(centre[beams.owner], size[beams.owner])):
+            caster = self.casters[near]
+            found.append((caster.name, bundle.outline(_corners(caster, beams))))
         if self._inner:
-            places = self._hits(assembly, placed, owner, systems, chain, rays.launched, heading)
-            for k, (start, end) in enumerate(pairwise(places)):
-                bundle = _Bundle.between(start, end, nodes)
+            for k, (start, end) in enumerate(pairwise(self._hits(beams))):
+                bundle = _Bundle.between(start, end, beams.nodes)
                 for caster in self._inner.get(k, ()):
-                    found.append((caster.name, bundle.outline(_corners(caster, placed, owner))))
-        return Shadows.of(found, len(owner))
+                    found.append((caster.name, bundle.outline(_corners(caster, beams))))
+        return Shadows.of(found, len(launched))
 
     def _spheres(self, placed: PlacedBodies) -> tuple[np.ndarray, np.ndarray]:
         """Middles (S, C, 3) and radii (S, C) of spheres about all C casters, world."""
@@ -214,28 +215,21 @@ class ImagingShadows:
             size[:, which] = placed.scale[:, [placed.index[body]]].real * self._sizes[which]
         return centre, size
 
-    def _end(self, placed: PlacedBodies, owner: np.ndarray, launched: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    def _end(self, beams: TracedBeams) -> np.ndarray:
         """How far it is from the launch points to the first mirror's middle, (B,)."""
-        middle = points_to_world(placed, self._first, np.array([self._centre])).real[:, 0]
-        return np.asarray(np.sum((middle[owner] - launched.mean(axis=1)) * heading, axis=-1))
+        middle = points_to_world(beams.placed, self._first, np.array([self._centre])).real[:, 0]
+        return np.asarray(np.sum((middle[beams.owner] - beams.rays.launched.mean(axis=1)) * beams.heading, axis=-1))
 
-    def _hits(
-        self,
-        assembly: Assembly,
-        placed: PlacedBodies,
-        owner: np.ndarray,
-        systems: SystemBatch,
-        chain: Sequence[str],
-        launched: np.ndarray,
-        heading: np.ndarray,
-    ) -> list[np.ndarray]:
+    def _hits(self, beams: TracedBeams) -> list[np.ndarray]:
         """Where the rays meet every element, world, (B, N, 3) each."""
-        way = np.broadcast_to(heading[:, None], launched.shape)
-        traced = trace(self.backend, systems, make_rays(self.backend, launched, way), keep=range(len(chain)))
+        placed, launched = beams.placed, beams.rays.launched
+        chain = beams.assembly.sequences[f"{self.camera}/imaging"]
+        way = np.broadcast_to(np.broadcast_to(beams.heading, (len(launched), 3))[:, None], launched.shape)
+        traced = trace(self.backend, beams.systems, make_rays(self.backend, launched, way), keep=range(len(chain)))
         out = []
         for k, name in enumerate(chain):
-            body = placed.index[assembly.elements[name].body]
-            turn, shift = placed.rotation[owner, body].real, placed.translation[owner, body].real
+            body = placed.index[beams.assembly.elements[name].body]
+            turn, shift = placed.rotation[beams.owner, body].real, placed.translation[beams.owner, body].real
             out.append(traced.hit(k) @ np.swapaxes(turn, 1, 2) + shift[:, None])
         return out
 
@@ -264,9 +258,9 @@ def _between_mirrors(
     return out
 
 
-def _corners(caster: Caster, placed: PlacedBodies, owner: np.ndarray) -> np.ndarray:
+def _corners(caster: Caster, beams: TracedBeams) -> np.ndarray:
     """Corners of a body for every image, world, (B, C, 3)."""
-    return np.asarray(points_to_world(placed, caster.body, caster.corners).real[owner])
+    return np.asarray(points_to_world(beams.placed, caster.body, caster.corners).real[beams.owner])
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,6 +299,7 @@ class _Bundle:
     @classmethod
     def parallel(cls, launched: np.ndarray, heading: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
         """Light from far away up to a distance (B,) beyond the points (B, N, 3) of a wavefront."""
+        heading = np.broadcast_to(heading, (len(launched), 3))
         far = launched - _FAR * heading[:, None]
         return cls.between(far, launched + (end[:, None] * heading)[:, None], nodes)
 

@@ -41,7 +41,7 @@ from scenes.camera_model import LAUNCH_DISTANCE
 from scenes.channel import BASE
 from scenes.instrument_model import Instrument
 from scenes.resolved import target_band
-from scenes.shadow import ImagingShadows, Shadows, imaging_shadows
+from scenes.shadow import ImagingShadows, Shadows, TracedBeams, imaging_shadows
 from twin.line_ccd import band_factors
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
@@ -332,9 +332,8 @@ class _CameraBench:
         rays = imaging_rays(self.backend, imaging, forward, heading, launch, self.stop, self.nodes, first=axis)
         if self.shadows is None:
             return rays, imaging.size, None
-        chain = assembly.sequences[f"{name}/imaging"]
-        shadows = self.shadows.cast(assembly, placed, every, imaging, chain, rays, heading, self.nodes)
-        return rays, imaging.size, shadows
+        beams = TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
+        return rays, imaging.size, self.shadows.cast(beams)
 
     def _numbers(
         self, rays: ImagingRays, size: np.ndarray, shadows: Shadows | None, which: np.ndarray

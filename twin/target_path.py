@@ -26,7 +26,7 @@ from optics.trace import make_rays, require_some, trace
 from optics.tree import PlacedBodies, State
 from scenes.camera_assembly import line_body
 from scenes.camera_model import LAUNCH_DISTANCE, CameraModel
-from scenes.shadow import ImagingShadows
+from scenes.shadow import ImagingShadows, TracedBeams
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
@@ -179,9 +179,8 @@ class TargetPath:
         taken = None
         if self.shadows is not None:
             owner = np.zeros(len(directions), dtype=int)
-            chain = self.assembly.sequences[f"{self.name}/imaging"]
-            cast = self.shadows.cast(self.assembly, placed, owner, systems, chain, rays, directions, self.nodes)
-            taken = cast.pieces
+            beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
+            taken = self.shadows.cast(beams).pieces
         return fit_pupils(turned.in_lengths_of(systems.size), self.nodes, shadows=taken)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:

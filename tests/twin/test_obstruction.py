@@ -19,7 +19,7 @@ from optics.tree import Motion
 from optics.wavefront import path_to_sphere
 from scenes.baffle import Plate
 from scenes.load import load_band_detectors
-from scenes.shadow import ImagingShadows
+from scenes.shadow import ImagingShadows, TracedBeams
 from tests.twin.commands import invoke
 from twin.image_quality import _CameraBench, image_quality
 from twin.line_ccd import LineCcd, band_wavelengths
@@ -54,9 +54,8 @@ def rays_of(path: TargetPath, state, directions: np.ndarray, nodes):
 
 def shadows_of(path: TargetPath, state, directions: np.ndarray):
     placed, systems, rays = rays_of(path, state, directions, path.nodes)
-    chain = path.assembly.sequences[f"{CAMERA}/imaging"]
     owner = np.zeros(len(directions), int)
-    return path.shadows.cast(path.assembly, placed, owner, systems, chain, rays, directions, path.nodes)
+    return path.shadows.cast(TracedBeams(path.assembly, placed, owner, systems, rays, directions, path.nodes))
 
 
 def spiral() -> quadrature.PupilNodes:
