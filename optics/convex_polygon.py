@@ -125,12 +125,16 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
     """
     height = np.einsum("nvx,nwx->nwv", polygons[..., :2], normal)
     beyond = np.sum(height > limit[..., None], axis=-1)
-    needed, total = beyond > 0, np.sum(beyond, axis=0)
-    for w in np.argsort(-total, kind="stable")[: np.count_nonzero(total)]:  # those that leave the fewest corners first
-        some = np.flatnonzero(needed[:, w])
-        cut = clip(polygons[some], normal[some, w], limit[some, w])
-        polygons = widened(polygons, cut.shape[1]).copy()
-        polygons[some] = widened(cut, polygons.shape[1])
+    # of each polygon first what leaves it the fewest corners
+    order = np.argsort(-beyond, axis=1, kind="stable")[:, : np.max(np.count_nonzero(beyond, axis=1), initial=0)]
+    for column in order.T:
+        some = np.flatnonzero(np.take_along_axis(beyond, column[:, None], axis=1)[:, 0])
+        cut = clip(polygons[some], normal[some, column[some]], limit[some, column[some]])
+        if len(some) == len(polygons):
+            polygons = cut
+        else:
+            polygons = widened(polygons, cut.shape[1]).copy()
+            polygons[some] = widened(cut, polygons.shape[1])
     return polygons
 
 
