@@ -26,12 +26,13 @@ in the covariance: what pulls all points alike (an error of the reference's geor
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.matching.checks import checked_image, checked_places, checked_templates
+from analysis.matching.joined import joined
 from analysis.matching.options import MatchOptions
 from analysis.matching.reason import Reason
 from analysis.matching.residual_correlation import ResidualCorrelation, residual_correlation
@@ -143,16 +144,7 @@ def least_squares(
     parts = [
         _fit(plane, patch[k : k + _CHUNK], first[k : k + _CHUNK], chosen) for k in range(0, max(len(patch), 1), _CHUNK)
     ]
-    columns = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in fields(Fits)
-        if field.name not in ("spread", "relief")
-    }
-    return Fits(
-        **columns,
-        spread=ResidualCorrelation.joined([part.spread for part in parts]),
-        relief=WindowRelief.joined([part.relief for part in parts]),
-    )
+    return joined(parts)
 
 
 def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:

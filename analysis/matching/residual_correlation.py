@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +36,6 @@ class ResidualCorrelation:
     correlation: Array
     pixels: NDArray[np.intp]
     unknowns: NDArray[np.intp]
-
-    @staticmethod
-    def joined(parts: Sequence[ResidualCorrelation]) -> ResidualCorrelation:
-        """One after the other."""
-        columns = ([getattr(part, name) for part in parts] for name in ResidualCorrelation.__annotations__)
-        return ResidualCorrelation(*(np.concatenate(column) for column in columns))
 
     @property
     def plain(self) -> Array:

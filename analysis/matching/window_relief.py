@@ -17,7 +17,6 @@ mean of what it may be without being negative; those that stand out have their o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,12 +52,6 @@ class WindowRelief:
     second: Array
     redundancy: Array
     effect: Array
-
-    @staticmethod
-    def joined(parts: Sequence[WindowRelief]) -> WindowRelief:
-        """One after the other."""
-        columns = ([getattr(part, name) for part in parts] for name in WindowRelief.__annotations__)
-        return WindowRelief(*(np.concatenate(column) for column in columns))
 
     def covariance(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> Array:
         """What relief adds to the covariance of places.
