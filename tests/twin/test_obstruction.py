@@ -19,7 +19,7 @@ from optics.tree import Motion
 from optics.wavefront import path_to_sphere
 from scenes.baffle import Plate
 from scenes.load import load_band_detectors
-from scenes.shadow import ImagingShadows, TracedBeams
+from scenes.shadow import ImagingShadows, Shadows, TracedBeams
 from tests.twin.commands import invoke
 from twin.image_quality import _CameraBench, image_quality
 from twin.line_ccd import LineCcd, band_wavelengths
@@ -109,6 +109,33 @@ def test_a_moved_prism_moves_its_shadow(gf7_pair, backend) -> None:
     right = PRISM.replace("left", "right")
     np.testing.assert_allclose(moved[right], still[right], atol=2e-5)  # only the beam has moved, by micrometres
     assert np.max(np.abs(moved[PRISM] - still[PRISM])) > 1e-3
+
+
+@pytest.mark.parametrize("chord", [-0.5, 0.1, 0.62, 0.97])
+def test_shadows_on_the_stop_end_at_its_edge(chord: float) -> None:
+    """A straight body that reaches over the edge takes the segment beyond its chord: area and moment about x = 0."""
+    outline = np.array([[[chord, -1.2], [1.2, -1.2], [1.2, 1.2], [chord, 1.2]]])
+    angle = np.arccos(chord)
+    area, moment = angle - np.sin(angle) * np.cos(angle), 2.0 / 3.0 * np.sin(angle) ** 3
+    for turn in np.exp(1j * np.array([0.0, 0.3, 2.0])):
+        corners = (outline[..., 0] + 1j * outline[..., 1]) * turn
+        shadows = Shadows.of([("plate", np.stack([corners.real, corners.imag], axis=-1))], 1)
+        assert shadows.shares()["plate"][0] == pytest.approx(area / np.pi, abs=1e-8)  # arcs by Gauss' rule
+        assert np.sum(shadows.weights * (shadows.points / turn).real) == pytest.approx(moment, abs=1e-8)
+
+
+def test_a_state_with_shadows_is_the_same_alone_and_among_others(gf7_pair, backend) -> None:
+    """Others have other shadows or none. Pieces are made small alike for a whole batch; integrals over them, small or
+    not, are right to 2e-7.
+    """
+    gone = {PRISM: Motion(shift=(0.0, 1.0, 0.0))}
+    large = {PRISM: Motion(scale=1.1, rotate=(0.0, 0.0, 0.5))}
+    defocused = {f"{ROOT}/M2": Motion(shift=(0.0, 0.0, 3e-4))}
+    several = image_quality(gf7_pair, backend, [gone, {}, large, MOVED, defocused]).cameras[CAMERA]
+    for k, state in ((1, {}), (3, MOVED)):
+        alone = image_quality(gf7_pair, backend, [state]).cameras[CAMERA]
+        for key in ("wfe", "wfe_refocused", "mtf_along_line", "mtf_along_track", "light_lost"):
+            np.testing.assert_allclose(getattr(several, key)[k], getattr(alone, key)[0], rtol=0, atol=5e-7)
 
 
 def raster(pupil, size: int, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
