@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,8 @@ Part = TypeVar("Part")
 
 def joined(parts: Sequence[Part]) -> Part:
     """One after the other: dataclasses of arrays (n, ...) and of such dataclasses; at least one."""
-    first = parts[0]
-    if not is_dataclass(first) or isinstance(first, type):
-        return np.concatenate(parts)  # type: ignore[call-overload, no-any-return]
-    return type(first)(**{f.name: joined([getattr(part, f.name) for part in parts]) for f in fields(first)})
+    columns: dict[str, Any] = {}
+    for field in fields(parts[0]):  # type: ignore[arg-type]
+        column = [getattr(part, field.name) for part in parts]
+        columns[field.name] = joined(column) if is_dataclass(column[0]) else np.concatenate(column)
+    return type(parts[0])(**columns)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitoring import ARCSEC
+from analysis.units import ARCSEC
 from optics.tree import Motion, State
 from scenes.channel import BASE
 from tests.benchmarks.number import Limit, Number, Speed
