@@ -19,8 +19,8 @@ in the residuals. Assumed: over one window they are stationary, with a variance 
 redundancy) and with a correlation of neighbours up to three pixels that all points share. It is the median over
 the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel)
 the covariance is B C B', and more where smoothing leaves few residuals to tell it by. To it comes what residuals tell
-of displacements that differ within the window (`analysis.matching.window_relief`) and the error of interpolation. Not
-in the covariance: what pulls all points alike (an error of the reference's georeference) and aliasing of the image.
+of displacements that differ within the window (`analysis.matching.window_relief`) and the error of interpolation; steps
+of it are tested for (`analysis.matching.window_halves`). Not in the covariance: what pulls all points alike (an error of the reference's georeference) and aliasing of the image.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from analysis.matching.options import MatchOptions
 from analysis.matching.reason import Reason
 from analysis.matching.residual_correlation import ResidualCorrelation, residual_correlation
 from analysis.matching.spline import SplineStack, low_passed
+from analysis.matching.window_halves import WindowHalves, window_halves
 from analysis.matching.window_relief import WindowRelief, window_relief
 
 __all__ = ["Fits", "least_squares"]
@@ -75,6 +76,7 @@ class Fits:
             DISTORTED.
         spread: what the covariance of the noise is made of.
         relief: what is seen of displacements within the windows.
+        halves: how far apart halves of the windows put the places.
     """
 
     place: Array
@@ -88,6 +90,7 @@ class Fits:
     reason: NDArray[np.int8]
     spread: ResidualCorrelation
     relief: WindowRelief
+    halves: WindowHalves
 
     def covariance(self, good: NDArray[np.bool_] | None = None) -> Array:
         """(n, 2, 2) px^2 of places, with what points good (n,) have in common; None: the converged."""
@@ -96,12 +99,27 @@ class Fits:
 
     def covariances(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
         """The two parts of `covariance`: of noise and interpolation, and of displacements within the window."""
+        noise, hidden, tau, _shared = self._parts(good)
+        relief = tau[:, None, None] * self.relief.effect
+        return noise * hidden[:, None, None] + _INTERPOLATION**2 * np.eye(2), relief
+
+    def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
+        """(n,) chance that halves of windows without a step of the displacement are so far apart, and the power of that
+        test; see `WindowHalves.judged`.
+        """
+        noise, hidden, _tau, shared = self._parts(good)
+        return self.halves.judged(self.spread.variance * self._coloured(noise) * hidden, shared)
+
+    def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
+        """Covariance of visible noise, factor of the hidden, tau^2 of each point and what they share of it."""
         common = self.reason == Reason.ACCEPTED if good is None else good
         noise = self.spread.covariance(common)
+        return noise, self._hidden(), *self.relief.square(self.spread.variance, self._coloured(noise), common)
+
+    def _coloured(self, noise: Array) -> Array:
+        """(n,) by how much the correlation of residuals raises the variance of the place."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            coloured = np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2)
-        relief = self.relief.covariance(self.spread.variance, coloured, common)
-        return noise * self._hidden()[:, None, None] + _INTERPOLATION**2 * np.eye(2), relief
+            return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
     def _hidden(self) -> Array:
         """(n,) by how much more noise there is where the slopes are than the residuals show; NaN if they show none.
@@ -146,12 +164,13 @@ def least_squares(
     columns = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in fields(Fits)
-        if field.name not in ("spread", "relief")
+        if field.name not in ("spread", "relief", "halves")
     }
     return Fits(
         **columns,
         spread=ResidualCorrelation.joined([part.spread for part in parts]),
         relief=WindowRelief.joined([part.relief for part in parts]),
+        halves=WindowHalves.joined([part.halves for part in parts]),
     )
 
 
@@ -350,4 +369,5 @@ def _summary(
         reason,
         residual_correlation(*fitted, side),
         window_relief(*fitted, side),
+        window_halves(*fitted, side),
     )

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-__all__ = ["WindowRelief", "window_relief"]
+__all__ = ["WindowRelief", "relief_field", "window_relief"]
 
 Array = NDArray[np.float64]
 _BLOCKS = 5
@@ -60,8 +60,8 @@ class WindowRelief:
         columns = ([getattr(part, name) for part in parts] for name in WindowRelief.__annotations__)
         return WindowRelief(*(np.concatenate(column) for column in columns))
 
-    def covariance(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> Array:
-        """What relief adds to the covariance of places.
+    def square(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> tuple[Array, float]:
+        """tau^2 of each point, and what they share.
 
         Args:
             variance: (n,) of the residuals, DN^2, by redundancy.
@@ -70,7 +70,7 @@ class WindowRelief:
             good: (n,) points that share what they have in common.
 
         Returns:
-            (n, 2, 2) px^2.
+            (n,) px^2, and px^2.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             # relief is in the residuals' variance, too, which sets the noise that is taken off the score
@@ -87,7 +87,7 @@ class WindowRelief:
         total = float(weight.sum())
         shared = _not_negative(float(weight @ held) / total, total**-0.5) if common.any() else 0.0
         tau = np.where(apart, np.maximum(np.where(known, found, 0.0), shared), shared)
-        return np.asarray(tau[:, None, None] * self.effect)
+        return tau, shared
 
 
 def _not_negative(value: float, error: float) -> float:
@@ -105,7 +105,7 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
     used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all(scale > 0, axis=1))
     if not used.size:
         return WindowRelief(score, first, second, redundancy, effect)
-    share, field, middle = _field(side)
+    share, field, middle = relief_field(side)
     scaled = design[used] / scale[used, :, None]
     inverse = np.linalg.pinv(scaled @ np.swapaxes(scaled, 1, 2), rcond=1e-11, hermitian=True)
     slope = design[used, :2]
@@ -132,7 +132,7 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
     return WindowRelief(score, first, second, redundancy, effect)
 
 
-def _field(side: int) -> tuple[Array, Array, Array]:
+def relief_field(side: int) -> tuple[Array, Array, Array]:
     """Blocks of the pixels (p, b), correlation of the blocks (b, b) and of the window's middle with them (1, b)."""
     line = np.arange(side) - side // 2
     part = np.arange(side) * _BLOCKS // side
