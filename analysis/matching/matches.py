@@ -109,9 +109,7 @@ def match(
     )
 
 
-def _without_steps(
-    reason: NDArray[np.int8], chance: Array, power: Array, options: MatchOptions
-) -> NDArray[np.int8]:
+def _without_steps(reason: NDArray[np.int8], chance: Array, power: Array, options: MatchOptions) -> NDArray[np.int8]:
     """Verdicts after the test for steps of the displacement within windows."""
     tested = reason == Reason.ACCEPTED
     # NaN compares false

@@ -1,8 +1,8 @@
 """Do the two halves of a window put the point at the same place? A test of the model: one displacement field.
 
 A window over an edge of depth is fitted by the layer with more texture, and its covariance, which assumes one
-displacement and stationary residuals, does not know. So each window is cut into halves in four ways, along rows, columns
-and both diagonals; each half is fitted by itself in one linear step, and the places differ by
+displacement and stationary residuals, does not know. So each window is cut into halves in four ways, along rows,
+columns and both diagonals; each half is fitted by itself in one linear step, and the places differ by
 
     place_A - place_B = J_A D_A r_A - J_B D_B r_B,   J = (D D')^-1,
 
@@ -62,7 +62,7 @@ class WindowHalves:
 
         Args:
             variance: (n,) of the noise, DN^2, with its colour.
-            relief: tau^2 of all windows, px^2.
+            relief: tau^2 of a window that is like most, px^2.
 
         Returns:
             (n,) chance that halves of one displacement field are so far apart; (n,) power: chance that the split with
@@ -86,7 +86,7 @@ def risk(share: float, power: Array) -> Array:
 
 def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
     """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit."""
-    count, unknowns, _pixels = design.shape
+    count = len(design)
     apart = np.full((count, SPLITS, 2), np.nan)
     white, effect = np.full((2, count, SPLITS, 2, 2), np.nan)
     scale = np.sqrt(np.einsum("nqp,nqp->nq", design, design))
@@ -107,8 +107,8 @@ def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
             place = (inverse[:, :2] @ part) / first[:, :, None]
             found += sign * np.einsum("nip,np->ni", place, residual[used][:, half])
             noise += inverse[:, :2, :2] / (first[:, :, None] * first[:, None])
-            for a in range(2):
-                taken[:, :, a * len(field) : (a + 1) * len(field)] += sign * (place * slope[:, a][:, None, half]) @ share[half]
+            parts = [(place * slope[:, a][:, None, half]) @ share[half] for a in range(2)]
+            taken += sign * np.concatenate(parts, axis=2)
         apart[used, k], white[used, k] = found, noise
         effect[used, k] = taken @ both @ np.swapaxes(taken, 1, 2)
     return WindowHalves(apart, white, effect)

@@ -61,7 +61,7 @@ class WindowRelief:
         return WindowRelief(*(np.concatenate(column) for column in columns))
 
     def square(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> tuple[Array, float]:
-        """tau^2 of each point, and what they share.
+        """tau^2 of each point, and of one that is like most.
 
         Args:
             variance: (n,) of the residuals, DN^2, by redundancy.
@@ -87,7 +87,8 @@ class WindowRelief:
         total = float(weight.sum())
         shared = _not_negative(float(weight @ held) / total, total**-0.5) if common.any() else 0.0
         tau = np.where(apart, np.maximum(np.where(known, found, 0.0), shared), shared)
-        return tau, shared
+        # where noise is low, windows differ by the chance of their fields, and what is held is less than what most have
+        return tau, max(shared, float(np.median(found[common]))) if common.any() else shared
 
 
 def _not_negative(value: float, error: float) -> float:
