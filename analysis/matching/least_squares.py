@@ -19,8 +19,9 @@ in the residuals. Assumed: over one window they are stationary, with a variance 
 redundancy) and with a correlation of neighbours up to three pixels that all points share. It is the median over
 the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel)
 the covariance is B C B', and more where smoothing leaves few residuals to tell it by. To it comes what residuals tell
-of displacements that differ within the window (`analysis.matching.window_relief`) and the error of interpolation. Not
-in the covariance: what pulls all points alike (an error of the reference's georeference) and aliasing of the image.
+of displacements that differ within the window (`analysis.matching.window_relief`) and the error of interpolation; steps
+of them are tested for (`analysis.matching.window_halves`). Not in the covariance: what pulls all points alike (an error
+of the reference's georeference) and aliasing of the image.
 """
 
 from __future__ import annotations
@@ -37,14 +38,15 @@ from analysis.matching.options import MatchOptions
 from analysis.matching.reason import Reason
 from analysis.matching.residual_correlation import ResidualCorrelation, residual_correlation
 from analysis.matching.spline import SplineStack, low_passed
+from analysis.matching.window_halves import WindowHalves, window_halves
 from analysis.matching.window_relief import WindowRelief, window_relief
 
 __all__ = ["Fits", "least_squares"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-# Points that are fitted together; bounds memory to some 100 MB.
-_CHUNK = 128
+# Points that are fitted together: so few that what is computed of them stays in a processor's cache.
+_CHUNK = 32
 # Last step of the place, px, and of the affine change at the window's side, px. The next is an order smaller.
 _REST = 2e-4
 _LONGEST_STEP = 0.7
@@ -76,6 +78,7 @@ class Fits:
             DISTORTED.
         spread: what the covariance of the noise is made of.
         relief: what is seen of displacements within the windows.
+        halves: how far apart halves of the windows put the places.
     """
 
     place: Array
@@ -89,6 +92,7 @@ class Fits:
     reason: NDArray[np.int8]
     spread: ResidualCorrelation
     relief: WindowRelief
+    halves: WindowHalves
 
     def covariance(self, good: NDArray[np.bool_] | None = None) -> Array:
         """(n, 2, 2) px^2 of places, with what points good (n,) have in common; None: the converged."""
@@ -97,12 +101,27 @@ class Fits:
 
     def covariances(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
         """The two parts of `covariance`: of noise and interpolation, and of displacements within the window."""
+        noise, hidden, tau, _usual = self._parts(good)
+        relief = tau[:, None, None] * self.relief.effect
+        return noise * hidden[:, None, None] + _INTERPOLATION**2 * np.eye(2), relief
+
+    def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
+        """(n,) chance that halves of windows without a step of the displacement are so far apart, and the power of that
+        test; see `WindowHalves.judged`.
+        """
+        noise, hidden, _tau, usual = self._parts(good)
+        return self.halves.judged(self.spread.variance * self._coloured(noise) * hidden, usual)
+
+    def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
+        """Covariance of visible noise, factor of the hidden, tau^2 of each point and of one that is like most."""
         common = self.reason == Reason.ACCEPTED if good is None else good
         noise = self.spread.covariance(common)
+        return noise, self._hidden(), *self.relief.square(self.spread.variance, self._coloured(noise), common)
+
+    def _coloured(self, noise: Array) -> Array:
+        """(n,) by how much the correlation of residuals raises the variance of the place."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            coloured = np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2)
-        relief = self.relief.covariance(self.spread.variance, coloured, common)
-        return noise * self._hidden()[:, None, None] + _INTERPOLATION**2 * np.eye(2), relief
+            return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
     def _hidden(self) -> Array:
         """(n,) by how much more noise there is where the slopes are than the residuals show; NaN if they show none.
@@ -161,21 +180,23 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
     design = np.zeros((count, options.parameters, row.size))
     residual = np.full((count, row.size), np.nan)
     patch = np.where((reason == 0)[:, None, None], templates, 0.0)
-    smoothing = np.zeros(count)
+    some = [smoothing for smoothing in _SMOOTHINGS if smoothing <= math.sqrt(row.size) / 9.0]
+    # template i, smoothed by the k-th, is number k count + i
+    stack = SplineStack(np.concatenate([low_passed(patch, smoothing) for smoothing in some]))
+    level = np.zeros(count, np.intp)
     # at the start a template that is not yet in place seems to need more smoothing than at the end
     for turn in range(2):
         going = np.flatnonzero(reason == 0)
-        most = float(smoothing.max(initial=0.0)) if turn else math.inf
-        chosen = _best_smoothing(patch, going, grey, (row, column), shift, affine, most, options)
-        going = going[(chosen != smoothing)[going] | (turn == 0)]
-        smoothing = chosen
-        stack = SplineStack(low_passed(patch, smoothing))
+        most = int(level.max(initial=0)) + 1 if turn else len(some)
+        chosen = _best_smoothing(stack, most, going, grey, (row, column), shift, affine, options)
+        going = going[(chosen != level)[going] | (turn == 0)]
+        level = chosen
         for iteration in range(options.iterations + 1):
             if not going.size:
                 break
             step, design[going], residual[going] = _step(
                 stack,
-                going,
+                level[going] * count + going,
                 grey[going],
                 (row, column),
                 shift[going],
@@ -200,6 +221,7 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
             reason[going[far]] = Reason.MOVED
             going = going[~((rest & moved) | far | bent)]
         reason[going] = Reason.DIVERGED
+    smoothing = np.array(some)[level]
     return _summary(grey, anchor + shift, affine, linear, design, residual, smoothing, iterations, reason, reach)
 
 
@@ -231,34 +253,32 @@ def _windows(
 
 
 def _best_smoothing(
-    templates: Array,
+    stack: SplineStack,
+    most: int,
     which: Index,
     grey: Array,
     window: tuple[Array, Array],
     shift: Array,
     affine: Array,
-    most: float,
     options: MatchOptions,
-) -> Array:
-    """(n,) px, most at most: the strongest with which templates predict the image as well as with the best, after one
-    linear step. 0 for those that are not which.
+) -> Index:
+    """(n,) number, below most, of the strongest with which templates predict the image as well as with the best, after
+    one linear step. 0 for those that are not which.
     """
-    best = np.zeros(len(templates))
+    best = np.zeros(len(grey), np.intp)
     if not which.size:
         return best
     # the gain of the first guess only scales columns, which residuals do not feel
     linear = np.zeros((which.size, options.parameters - 3 - 4 * options.affine))
     linear[:, :1] = 1.0
-    most = min(most, math.sqrt(grey.shape[1]) / 9.0)
-    some = np.array([smoothing for smoothing in _SMOOTHINGS if smoothing <= most])
-    square = np.zeros((len(some), which.size))
-    for k, smoothing in enumerate(some):
-        stack = SplineStack(low_passed(templates, np.full(len(templates), smoothing)))
-        residual = _step(stack, which, grey[which], window, shift[which], affine[which], linear, 1, options)[2]
+    square = np.zeros((most, which.size))
+    for k in range(most):
+        number = k * len(grey) + which
+        residual = _step(stack, number, grey[which], window, shift[which], affine[which], linear, 1, options)[2]
         square[k] = np.einsum("np,np->n", residual, residual)
     # too little smoothing claims too much, too much loses a little
     alike = square <= square.min(axis=0) * (1.0 + _CHANCE / grey.shape[1])
-    best[which] = some[len(some) - 1 - np.argmax(alike[::-1], axis=0)]
+    best[which] = most - 1 - np.argmax(alike[::-1], axis=0)
     return best
 
 
@@ -342,4 +362,5 @@ def _summary(
         reason,
         residual_correlation(*fitted, side),
         window_relief(*fitted, side),
+        window_halves(*fitted, side),
     )

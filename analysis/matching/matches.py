@@ -14,6 +14,7 @@ from analysis.matching.least_squares import least_squares
 from analysis.matching.options import MatchOptions
 from analysis.matching.reason import Reason
 from analysis.matching.spline import resampled
+from analysis.matching.window_halves import FALSE_ALARM, risk
 
 __all__ = ["MatchOptions", "Matches", "Reason", "match", "resampled"]
 
@@ -90,11 +91,13 @@ def match(
     weak = np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value) < chosen.least_correlation
     reason[_open(reason) & weak] = Reason.WEAK
     reason[(reason == 0) & (peaks.ratio > chosen.largest_ratio)] = Reason.AMBIGUOUS
-    noise, relief = fits.covariances(reason == Reason.ACCEPTED)
+    good = reason == Reason.ACCEPTED
+    noise, relief = fits.covariances(good)
     covariance = noise + relief
     # NaN compares false
     reason[(reason == 0) & ~(_worst(noise) <= chosen.largest_sigma)] = Reason.UNCERTAIN
     reason[(reason == 0) & ~(_worst(covariance) <= chosen.largest_sigma)] = Reason.RELIEF
+    reason = _without_steps(reason, *fits.steps(good), chosen)
     reason[_open(reason) & (reason != 0) & (fits.contrast < chosen.least_contrast)] = Reason.FLAT
     return Matches(
         place=fits.place,
@@ -104,6 +107,16 @@ def match(
         accepted=reason == Reason.ACCEPTED,
         reason=reason,
     )
+
+
+def _without_steps(reason: NDArray[np.int8], chance: Array, power: Array, options: MatchOptions) -> NDArray[np.int8]:
+    """Verdicts after the test for steps of the displacement within windows."""
+    tested = reason == Reason.ACCEPTED
+    # NaN compares false
+    step = tested & ~(chance >= FALSE_ALARM)
+    share = float(step.sum()) / max(int(tested.sum()), 1)
+    weak = tested & ~step & ~(risk(share, power) <= options.largest_risk)
+    return np.where(step, Reason.RELIEF, np.where(weak, Reason.UNTESTED, reason)).astype(np.int8)
 
 
 def _open(reason: NDArray[np.int8]) -> NDArray[np.bool_]:

@@ -28,6 +28,8 @@ class MatchOptions:
         largest_distortion: of any element of the affine matrix from the unit matrix.
         largest_sigma: of the place along its worst direction, px; above it UNCERTAIN, or RELIEF where only
             displacements within the window bring it there.
+        largest_risk: chance of a step of displacement within a window that passes the test for one; above it UNTESTED.
+            The share of windows that fail the test and its power give it (`analysis.matching.window_halves`).
         least_contrast: standard deviation of the image under the template over that of one pixel's noise; a point that
             fails otherwise is called FLAT below it.
         saturation: DN from which a pixel counts as saturated; None: the largest value of an integer type.
@@ -42,6 +44,7 @@ class MatchOptions:
     largest_move: float = 1.5
     largest_distortion: float = 0.2
     largest_sigma: float = 0.2
+    largest_risk: float = 0.01
     least_contrast: float = 2.0
     saturation: float | None = None
 
@@ -49,14 +52,14 @@ class MatchOptions:
         """Check the ranges.
 
         Raises:
-            ValueError: a value that is not positive and finite, correlation or ratio above 1, a margin
+            ValueError: a value that is not positive and finite, correlation, ratio or risk above 1, a margin
                 below 2 px or too small for the largest move.
         """
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name not in ("affine", "sharpness", "saturation") and not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"match options: {field.name} must be positive and finite, found {value}")
-        for name in ("least_correlation", "largest_ratio"):
+        for name in ("least_correlation", "largest_ratio", "largest_risk"):
             if getattr(self, name) > 1.0:
                 raise ValueError(f"match options: {name} must not exceed 1, found {getattr(self, name)}")
         if self.margin < 2 or self.largest_move > self.margin - 0.5:

@@ -24,6 +24,7 @@ class Reason(IntEnum):
     DISTORTED = 11
     UNCERTAIN = 12
     RELIEF = 13
+    UNTESTED = 14
 
     @property
     def text(self) -> str:
@@ -46,4 +47,5 @@ _TEXTS = {
     Reason.DISTORTED: "the affine change is too large",
     Reason.UNCERTAIN: "the standard deviation is too large",
     Reason.RELIEF: "parts of the window are displaced against each other",
+    Reason.UNTESTED: "windows have steps of displacement here, and this one is too weak to show one",
 }

@@ -86,16 +86,14 @@ def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, 
     sample[inside] = value
 
 
-def low_passed(templates: Array, smoothing: Array) -> Array:
-    """Templates (n, k, k) after Gaussians of rms smoothing (n,), px; beyond their rim they go on with their slope."""
-    out = templates.copy()
-    for rms in np.unique(smoothing[smoothing > 0]):
-        which = smoothing == rms
-        reach = int(np.ceil(4.0 * rms))
-        wide = np.pad(templates[which], ((0, 0), (reach, reach), (reach, reach)), mode="reflect", reflect_type="odd")
-        wide = ndimage.gaussian_filter(wide, (0.0, rms, rms), truncate=4.0)
-        out[which] = wide[:, reach:-reach, reach:-reach]
-    return out
+def low_passed(templates: Array, smoothing: float) -> Array:
+    """Templates (n, k, k) after a Gaussian of rms smoothing, px; beyond their rim they go on with their slope."""
+    if not smoothing:
+        return templates
+    reach = int(np.ceil(4.0 * smoothing))
+    wide = np.pad(templates, ((0, 0), (reach, reach), (reach, reach)), mode="reflect", reflect_type="odd")
+    wide = ndimage.gaussian_filter(wide, (0.0, smoothing, smoothing), truncate=4.0)
+    return np.asarray(wide[:, reach:-reach, reach:-reach])
 
 
 class SplineStack:
@@ -147,8 +145,12 @@ class SplineStack:
 
 def _weights(fraction: Array, orders: int) -> Array:
     """(orders + 1, 6, ...) weights of the knots from -2 to +3 about a place, and their derivatives by it."""
-    powers = fraction[None] ** np.arange(_DEGREE + 1).reshape(-1, *(1,) * fraction.ndim)
-    return np.stack([np.tensordot(_PIECES[order], powers, axes=1) for order in range(orders + 1)])
+    powers = np.ones((_DEGREE + 1, *fraction.shape))
+    for k in range(_DEGREE):
+        np.multiply(powers[k], fraction, out=powers[k + 1])
+    pieces = _PIECES[: orders + 1]
+    flat = pieces.reshape(-1, _DEGREE + 1) @ powers.reshape(_DEGREE + 1, -1)
+    return np.asarray(flat.reshape(*pieces.shape[:2], *fraction.shape))
 
 
 def _pieces() -> Array:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-__all__ = ["WindowRelief", "window_relief"]
+__all__ = ["WindowRelief", "relief_field", "window_relief"]
 
 Array = NDArray[np.float64]
 _BLOCKS = 5
@@ -53,8 +53,8 @@ class WindowRelief:
     redundancy: Array
     effect: Array
 
-    def covariance(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> Array:
-        """What relief adds to the covariance of places.
+    def square(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> tuple[Array, float]:
+        """tau^2 of each point, and of one that is like most.
 
         Args:
             variance: (n,) of the residuals, DN^2, by redundancy.
@@ -63,7 +63,7 @@ class WindowRelief:
             good: (n,) points that share what they have in common.
 
         Returns:
-            (n, 2, 2) px^2.
+            (n,) px^2, and px^2.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             # relief is in the residuals' variance, too, which sets the noise that is taken off the score
@@ -80,7 +80,8 @@ class WindowRelief:
         total = float(weight.sum())
         shared = _not_negative(float(weight @ held) / total, total**-0.5) if common.any() else 0.0
         tau = np.where(apart, np.maximum(np.where(known, found, 0.0), shared), shared)
-        return np.asarray(tau[:, None, None] * self.effect)
+        # where noise is low, windows differ by the chance of their fields, and what is held is less than what most have
+        return tau, max(shared, float(np.median(found[common]))) if common.any() else shared
 
 
 def _not_negative(value: float, error: float) -> float:
@@ -98,7 +99,7 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
     used = np.flatnonzero(np.isfinite(residual).all(axis=1) & np.all(scale > 0, axis=1))
     if not used.size:
         return WindowRelief(score, first, second, redundancy, effect)
-    share, field, middle = _field(side)
+    share, field, middle = relief_field(side)
     scaled = design[used] / scale[used, :, None]
     inverse = np.linalg.pinv(scaled @ np.swapaxes(scaled, 1, 2), rcond=1e-11, hermitian=True)
     slope = design[used, :2]
@@ -125,7 +126,7 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
     return WindowRelief(score, first, second, redundancy, effect)
 
 
-def _field(side: int) -> tuple[Array, Array, Array]:
+def relief_field(side: int) -> tuple[Array, Array, Array]:
     """Blocks of the pixels (p, b), correlation of the blocks (b, b) and of the window's middle with them (1, b)."""
     line = np.arange(side) - side // 2
     part = np.arange(side) * _BLOCKS // side

@@ -8,7 +8,7 @@ from scipy import ndimage
 from sklearn.datasets import load_sample_image
 
 from analysis.matching.correlation import search
-from analysis.matching.matches import Matches, match, resampled
+from analysis.matching.matches import Matches, MatchOptions, match, resampled
 from tests.analysis.texture_image import Texture, lattice
 
 HALF = 15
@@ -34,8 +34,8 @@ class Pair:
         """Up to 2 px off."""
         return self.true + np.random.default_rng(9).uniform(-2.0, 2.0, self.true.shape)
 
-    def matched(self) -> Matches:
-        return match(self.second, self.templates(), self.predicted(), reach=4)
+    def matched(self, options: MatchOptions | None = None) -> Matches:
+        return match(self.second, self.templates(), self.predicted(), reach=4, options=options)
 
 
 def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry="same", seed=0) -> Pair:
@@ -81,6 +81,44 @@ def photographed(*, noise=0.0, relief=1.0, step=0.0, seed=0) -> Pair:
         "same",
         seed,
     )
+
+
+def layered(side, *, step=2.0, noise=0.05, faint=1.0, seed=0) -> tuple[Pair, np.ndarray]:
+    """Textures in two layers, the near one with winding edges before the far one and hiding what is behind it.
+
+    step: px along columns by which the near layer is displaced against the far one; faint: contrast of the far layer
+    over that of the near one, which is 1.
+
+    Returns:
+        The pair, and (n,) which windows of 25 px hold an edge; what is hidden in the second image is among them.
+    """
+    size = 47 * (side - 1) + 57
+    grid = np.arange(-24.0, size + 24.0, 0.5)
+    far, near = (
+        ndimage.spline_filter(contrast * (Texture(seed + k).grid(grid, grid) - 800.0) / 120.0, 5)
+        for k, contrast in ((1, faint), (2, 1.0))
+    )
+    wave = ndimage.gaussian_filter(np.random.default_rng(seed + 5).standard_normal((size + 60,) * 2), 25.0, mode="wrap")
+    # zero on the edge; about the distance from it, px
+    slope = np.hypot(*np.gradient(wave))
+    front = ndimage.spline_filter(wave / np.median(slope[np.abs(wave) < 0.3 * wave.std()]), 5)
+
+    def shown(row, column, by):
+        # the edge is as soft as a camera's: a pixel wide
+        share = 1.0 / (1.0 + np.exp(-4.0 * _at(front, row + 30.0, column + by + 30.0)))
+        front_grey = _at(near, 2.0 * (row + 24.0), 2.0 * (column + by + 24.0))
+        return share * front_grey + (1.0 - share) * (1.0 + _at(far, 2.0 * (row + 24.0), 2.0 * (column + 24.0)))
+
+    row, column = np.mgrid[:size, :size].astype(float)
+    rng = np.random.default_rng(seed + 11)
+    first = shown(row, column, 0.0) + noise * rng.standard_normal(row.shape)
+    second = shown(row + SHIFT[0], column + SHIFT[1], step) + noise * rng.standard_normal(row.shape)
+    places = lattice(side, 47, 28, seed + 3)
+    is_near = _at(front, *(places.T + 30.0)) > 0
+    inside = (_at(front, row + 30.0, column + 30.0) > 0).astype(float)
+    edge = ndimage.maximum_filter(inside, 25) > ndimage.minimum_filter(inside, 25)
+    true = places - SHIFT - step * is_near[:, None] * [0.0, 1.0]
+    return Pair(first, second, places, true), edge[tuple(np.rint(places).astype(int).T)]
 
 
 def _at(surface, row, column):
