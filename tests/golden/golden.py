@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import tempfile
 import time
@@ -38,9 +37,6 @@ PACKAGES = (
 )
 """Those that numbers, pictures or files come from."""
 
-FORCED = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
-"""Variables with which libraries take this processor for another one."""
-
 
 class NotComparable(Exception):
     """The golden file says nothing about a run here; the message says why."""
@@ -60,7 +56,7 @@ def machine() -> dict[str, Any]:
     processor = {key: told.get(key, "") for key in kinds}
     processor |= {"architecture": platform.machine(), "flags": hashlib.sha256(flags.encode()).hexdigest()[:16]}
     return {
-        "processor": processor | {name: os.environ[name] for name in FORCED if name in os.environ},
+        "processor": processor,
         "packages": {name: _version(name) for name in PACKAGES},
     }
 

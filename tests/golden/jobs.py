@@ -68,6 +68,9 @@ PROMISED = {
     "images/": 0.0,
 }
 RUN = "{jobs}/%s.yaml --out {out}"
+SET = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1", "OPENBLAS_CORETYPE": "Haswell"}
+UNSET = ("FORCE_COLOR", "TTY_COMPATIBLE", "NPY_DISABLE_CPU_FEATURES")
+"""Of the environment: linear algebra sums as on a processor with AVX2, whatever the machine has set."""
 CHECKS = "000.fig3,001.eq2.cos2,001.eq8,003.equations,004.eq2.solution,004.eq3.solution,004.turntable.range,004.fig1"
 ALL = (
     _job("render", f"twin.render {RUN % 'perturb'} --json --seed 5", promised=PROMISED),
@@ -142,8 +145,7 @@ def run(job: Job, here: Path) -> Done:
     places = {"jobs": JOBS, "out": str(out), "here": str(here)}
     words = [word.format(**places) for word in job.words]
     # a terminal's width and colours are no part of the result
-    environment = {key: value for key, value in os.environ.items() if key not in ("FORCE_COLOR", "TTY_COMPATIBLE")}
-    environment |= {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", "PYTHONUTF8": "1"}
+    environment = {key: value for key, value in os.environ.items() if key not in UNSET} | SET
     done = subprocess.run(
         [sys.executable, "-m", *words],
         cwd=ROOT,
