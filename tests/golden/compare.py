@@ -89,14 +89,15 @@ def _summaries_close(old: dict[str, Any], new: dict[str, Any], tolerance: float)
     )
 
 
-def compare(old: Any, new: Any, tolerance: float = TOLERANCE) -> Comparison:
-    """All differences of two snapshots."""
+def compare(old: Any, new: Any, tolerance: float = TOLERANCE, scale: float = 0.0) -> Comparison:
+    """All differences of two snapshots; numbers below the scale are measured against it."""
     found = Comparison()
-    _walk(old, new, "", tolerance, found.differences)
+    _walk(old, new, "", (tolerance, scale), found.differences)
     return found
 
 
-def _walk(old: Any, new: Any, place: str, tolerance: float, found: list[Difference]) -> None:
+def _walk(old: Any, new: Any, place: str, limits: tuple[float, float], found: list[Difference]) -> None:
+    tolerance, scale = limits
     if isinstance(old, dict) and isinstance(new, dict):
         if "bytes" in old and "bytes" in new:
             if old != new:
@@ -107,18 +108,18 @@ def _walk(old: Any, new: Any, place: str, tolerance: float, found: list[Differen
             if key not in old or key not in new:
                 found.append(Difference(below, old.get(key, ABSENT), new.get(key, ABSENT)))
             else:
-                _walk(old[key], new[key], below, tolerance, found)
+                _walk(old[key], new[key], below, limits, found)
     elif isinstance(old, list) and isinstance(new, list):
         for k in range(max(len(old), len(new))):
             below = f"{place}[{k}]"
             if k >= len(old) or k >= len(new):
                 found.append(Difference(below, old[k] if k < len(old) else ABSENT, new[k] if k < len(new) else ABSENT))
             else:
-                _walk(old[k], new[k], below, tolerance, found)
+                _walk(old[k], new[k], below, limits, found)
     elif _number(old) and _number(new):
         same_bits = old == new and math.copysign(1.0, old) == math.copysign(1.0, new)
         if not same_bits and not (math.isnan(old) and math.isnan(new)):
-            found.append(Difference(place, old, new, close(old, new, 0.0, tolerance)))
+            found.append(Difference(place, old, new, close(old, new, scale, tolerance)))
     elif type(old) is not type(new) or old != new:
         found.append(Difference(place, old, new))
 
@@ -139,10 +140,13 @@ def promised(snapshot: dict[str, Any], files: dict[str, float]) -> list[tuple[st
 
 
 def compare_elsewhere(old: dict[str, Any], new: dict[str, Any], files: dict[str, float]) -> Comparison:
-    """The comparison on another processor: exit code, names of files, and what is promised there."""
+    """The comparison on another processor: exit code, names of files, and what is promised there.
+
+    Numbers below 1 of their unit (arc seconds, micrometres) are measured against 1: a truth that is zero is rounding.
+    """
     found = compare({key: old[key] for key in ("exit", "files")}, {key: new[key] for key in ("exit", "files")})
     for (_, before, tolerance), (_, after, _) in zip(promised(old, files), promised(new, files), strict=True):
         found.differences += [
-            one for one in compare(before, after, tolerance).differences if not (one.close and tolerance)
+            one for one in compare(before, after, tolerance, 1.0).differences if not (one.close and tolerance)
         ]
     return found

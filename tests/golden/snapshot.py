@@ -39,7 +39,7 @@ LONG = 80
 """Characters of a text in such a file; of a longer one the beginning and a checksum are kept."""
 SAMPLES = 8
 LEFT_OUT = {
-    "": {"versions", "started_unix_s", "wall_time_s", "seconds"},
+    "": {"versions", "started_unix_s", "wall_time_s", "seconds", "worker_seconds", "states_per_second"},
     "manifest.json": {"workers"},
     "study_state.json": {"fingerprint", "content", "sources"},
 }
@@ -49,8 +49,12 @@ with the one file in which they do not.
 SKIPPED = re.compile(r"^chunks/")
 TAGS = ("DateTime", "Software")
 """Of a TIFF, left out."""
-DURATIONS = (re.compile(r"(?<=float64; )[\d.]+ (s|min)\b"), re.compile(r"(?<=--out again` in )\d+ (s|min)\b"))
-"""In a report's last table, and in the validation's summary."""
+DURATIONS = (
+    re.compile(r"(?<=float64; )[\d.]+ (s|min)\b"),
+    re.compile(r"(?<=--out again` in )\d+ (s|min)\b"),
+    re.compile(r"(?<=\d checks, )\d+ (s|min)\b"),
+)
+"""In a report's last table, in the validation's summary and in the lead of its report."""
 PACE = re.compile(r"^(\d+ runs .*; about .* a run|\d+ of \d+ runs, .* left)$")
 """Lines on stderr by which a study tells its pace."""
 
