@@ -6,7 +6,7 @@ This package knows nothing of YAML, commands or Mitsuba scenes.
 
 from contextlib import suppress
 
-from optics.llvm import LibraryMissing, ensure_llvm
+from optics.numerics.llvm import LibraryMissing, ensure_llvm
 
 # Before anything can import drjit: it looks for LLVM once, and on many systems finds one that kills the process. What
 # is missing is said by `load_backend`, where a command can tell its user, and not in the middle of an import.

@@ -15,24 +15,23 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
-from scenes.camera import CameraSpec
-from scenes.camera_design_spec import CameraDesignSpec
-from scenes.detector import DetectorSpec
-from scenes.distortion_test import DistortionTestSpec
-from scenes.dividing_error import TurntableTestSpec
-from scenes.error_budget import ErrorBudgetSpec
-from scenes.focus_test import FocusTestSpec
-from scenes.instrument import InstrumentSpec
-from scenes.job import JobSpec
-from scenes.orbit_angle import OrbitAngleSpec
-from scenes.orbit_calibration import OrbitCalibrationSpec
-from scenes.orbit_monitor import OrbitMonitorSpec
-from scenes.orbit_simulate import OrbitSimulateSpec
-from scenes.spec import Spec
-from scenes.standard_output import to_stdout
-from scenes.study import StudySpec
-from scenes.three_line_camera import ThreeLineCameraSpec
-from scenes.turntable import PrincipleExperimentSpec
+from scenes.specs.camera import CameraDesignSpec, CameraSpec
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.distortion_test import DistortionTestSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.focus_test import FocusTestSpec
+from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.job import JobSpec
+from scenes.specs.orbit_angle import OrbitAngleSpec
+from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+from scenes.specs.orbit_monitor import OrbitMonitorSpec
+from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.principle_experiment import PrincipleExperimentSpec
+from scenes.specs.study import StudySpec
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.yaml.spec import Spec
+from scenes.yaml.standard_output import to_stdout
 
 MODELS: dict[str, type[Spec]] = {
     "job": JobSpec,

@@ -7,15 +7,15 @@ from functools import cache
 import pytest
 from hypothesis import HealthCheck, settings
 
-from optics.backend import Backend, load_backend
-from optics.threads import cores
-from scenes.camera_model import CameraModel, derive_camera
-from scenes.instrument_builder import build_instrument
-from scenes.instrument_model import Instrument
-from scenes.job import JobSpec
-from scenes.load import load_camera, load_instrument
-from scenes.resolved import resolve_job
-from twin.experiment import MonitorExperiment
+from optics.numerics.backend import Backend, load_backend
+from optics.numerics.threads import cores
+from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.specs.job import JobSpec
+from scenes.specs.load import load_camera, load_instrument
+from scenes.specs.resolved import resolve_job
+from twin.monitor.monitor_experiment import MonitorExperiment
 
 # Properties are tried on the same examples every time, on every machine. Kernels compile with the first of them.
 settings.register_profile(

@@ -1,7 +1,12 @@
 """Imports go one way: optics <- scenes <- twin, and analysis stands alone. Any other arrow fails here."""
 
 import ast
+import re
 import sys
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -25,6 +30,14 @@ ANALYSIS_MAY: dict[str, set[str]] = {
     "mtf/image_file.py": {"tifffile"},
 }
 LONGEST_FILE = 500
+MOST_FILES = 28
+ROOMS = [
+    *re.findall(
+        r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M
+    ),
+    *(name for name in PACKAGES if name != "analysis"),
+]
+"""As the page lists them, which is the order in which they may know each other; the packages' own files come last."""
 
 
 def source_files() -> list[Path]:
@@ -48,6 +61,41 @@ def imported_modules(path: Path) -> set[str]:
             if isinstance(first, ast.Constant) and isinstance(first.value, str):
                 names.add(first.value)
     return names
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the project by its dotted name -> its file, from the root."""
+    files = [path.relative_to(ROOT) for path in source_files()]
+    return {".".join(path.with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+@cache
+def project_imports() -> tuple[tuple[str, str], ...]:
+    """(importer, imported) for modules of the project, wherever in the file the import stands."""
+    return tuple(
+        (importer, name)
+        for importer, path in modules().items()
+        for name in _finest(imported_modules(ROOT / path))
+        if name != importer
+    )
+
+
+def _finest(names: set[str]) -> Iterator[str]:
+    """The modules among names; a package counts only where nothing below it was meant, and one at the top never: every
+    import of what is in it runs it.
+    """
+    known = {name for name in names if name in modules() and name not in PACKAGES}
+    for name in known:
+        is_package = modules()[name].name == "__init__.py"
+        if not (is_package and any(other.startswith(name + ".") for other in known)):
+            yield name
+
+
+def room_of(module: str) -> str:
+    """The room that a module stands in: the longest folder in the list that holds it."""
+    folder = modules()[module].parent
+    return next(place.as_posix() for place in (folder, *folder.parents) if place.as_posix() in ROOMS)
 
 
 def imported(path: Path) -> set[str]:
@@ -85,12 +133,12 @@ def test_files_can_be_read_in_one_sitting(path: Path) -> None:
 @pytest.mark.parametrize(
     ("package", "line"),
     [
-        ("optics", "import scenes.load"),
+        ("optics", "import scenes.specs.load"),
         ("optics", "def f():\n    from twin import render"),
         ("optics", "import ruamel.yaml"),
-        ("scenes", "from analysis.centroid import x"),
+        ("scenes", "from analysis.spots.centroid import x"),
         ("analysis", "import drjit"),
-        ("analysis", "import importlib\nimportlib.import_module('optics.trace')"),
+        ("analysis", "import importlib\nimportlib.import_module('optics.raytrace.trace')"),
     ],
 )
 def test_a_wrong_arrow_is_found(package: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,5 +153,48 @@ def test_a_right_arrow_is_not_complained_about(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
     path = tmp_path / "twin" / "module.py"
     path.parent.mkdir()
-    path.write_text("import numpy\nfrom analysis import centroid\nfrom scenes.load import load_job\nimport optics")
+    path.write_text(
+        "import numpy\nfrom analysis import centroid\nfrom scenes.specs.load import load_job\nimport optics"
+    )
     assert forbidden(path) == set()
+
+
+def test_source_knows_rooms_that_stand_above_its_own() -> None:
+    """docs/architecture.md lists the rooms; an import goes to a room further up, or stays in its own."""
+    wrong = []
+    for importer, module in project_imports():
+        here, there = room_of(importer), room_of(module)
+        if here != there and ROOMS.index(there) > ROOMS.index(here):
+            wrong.append(f"{importer} ({here}) imports {module} ({there})")
+    assert wrong == []
+
+
+def test_every_folder_of_the_source_is_in_a_room() -> None:
+    assert {room_of(module) for module in modules()} | {"scenes/library"} == set(ROOMS)
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    """Also not inside a function or for type checkers alone."""
+    graph: dict[str, set[str]] = {module: set() for module in modules()}
+    for importer, module in project_imports():
+        graph[importer].add(module)
+    TopologicalSorter(graph).prepare()
+
+
+def test_no_folder_imports_itself_by_way_of_others() -> None:
+    graph: dict[str, set[str]] = {}
+    for importer, module in project_imports():
+        here, there = (modules()[name].parent.as_posix() for name in (importer, module))
+        if here != there:
+            graph.setdefault(here, set()).add(there)
+    TopologicalSorter(graph).prepare()
+
+
+def test_a_cycle_would_be_found() -> None:
+    with pytest.raises(CycleError):
+        TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()
+
+
+def test_folders_are_small_enough_to_look_through() -> None:
+    count = Counter(path.parent.as_posix() for path in modules().values())
+    assert {folder: number for folder, number in count.items() if number > MOST_FILES} == {}

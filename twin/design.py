@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import typer
 
-from optics.aim import AimError
-from optics.backend import Backend
-from optics.design import Design, DesignError, optimise
-from optics.design_merit import Goals, Judge, Judgement
-from optics.trace import BeamMissedError
-from scenes.camera_design import (
+from optics.design.merit_function import Goals, Judge, Judgement
+from optics.design.optimiser import Design, DesignError, optimise
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.models.camera_design import (
     CameraDesignSetup,
     beams_of,
     camera_file,
@@ -24,14 +24,12 @@ from scenes.camera_design import (
     resolve_design,
     variables_of,
 )
-from scenes.camera_model import derive_camera
-from twin.artefact import Data, SvgFigure, Table
-from twin.design_figure import error_figure, layout_figure
-from twin.report.svg import look, to_svg
-from twin.trial.bench_error import BenchError
-from twin.trial.command import AsJson, BackendName, File, Force, Options, Out, Quiet, run_test
-from twin.trial.result import Advance, LabResult, silent
-from twin.trial.section import Section
+from scenes.models.camera_model import derive_camera
+from twin.pictures.design_figures import error_figure, layout_figure
+from twin.run.artefact import Data, SvgFigure, Table
+from twin.run.command import AsJson, BackendName, File, Force, Options, Out, Quiet, run_test
+from twin.run.result import Advance, BenchError, LabResult, Section, silent
+from twin.run.svg import look, to_svg
 
 PROGRAM = "twin.design"
 REMARK = """Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
@@ -147,7 +145,10 @@ def _result(setup: CameraDesignSetup, found: Design, text: str) -> LabResult:
         Section(
             "Prescription",
             (f"{found.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
-            (changed, CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/cameras.", text)),
+            (
+                changed,
+                CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/library/cameras.", text),
+            ),
         ),
     )
     data = {

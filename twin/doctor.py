@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from scenes.standard_output import Terminal, print_json, to_stdout
+from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 
 DISTRIBUTION = "space-camera-twin"
 OLDEST_PYTHON = (3, 11)
@@ -46,7 +46,7 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
     """Run Python with these arguments in a child process and return the JSON object on its last line of stdout.
 
     Args:
-        arguments: what follows the interpreter, for instance ["-m", "twin.probe", "kernel"].
+        arguments: what follows the interpreter, for instance ["-m", "twin.run.probe", "kernel"].
         timeout_s: the child is killed after this many seconds.
 
     Raises:
@@ -117,7 +117,7 @@ def _system() -> Check:
 
 def _libatomic() -> Check:
     try:
-        from optics.llvm import check_libatomic
+        from optics.numerics.llvm import check_libatomic
 
         check_libatomic()
     except ImportError as error:
@@ -128,7 +128,7 @@ def _libatomic() -> Check:
 def _llvm() -> Check:
     chosen = "named by DRJIT_LIBLLVM_PATH" if os.environ.get("DRJIT_LIBLLVM_PATH") else "from karellen-llvm-core"
     try:
-        from optics.llvm import ensure_llvm, find_llvm
+        from optics.numerics.llvm import ensure_llvm, find_llvm
 
         library = ensure_llvm()
     except ImportError as error:
@@ -142,14 +142,14 @@ def _llvm() -> Check:
 
 def _probe(name: str, arguments: list[str], describe: Any) -> Check:
     try:
-        return Check(name, "ok", describe(run_probe(["-m", "twin.probe", *arguments])))
+        return Check(name, "ok", describe(run_probe(["-m", "twin.run.probe", *arguments])))
     except RuntimeError as error:
         return Check(name, "failed", str(error))
 
 
 def _gpu() -> Check:
     try:
-        result = run_probe(["-m", "twin.probe", "gpu"])
+        result = run_probe(["-m", "twin.run.probe", "gpu"])
     except RuntimeError as error:
         return Check("GPU", "note", f"--backend cuda does not work: {error}")
     if not result["available"]:

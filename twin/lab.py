@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.laboratory.distortion_sections import run_distortion
-from twin.laboratory.focus_result import run_focus
-from twin.laboratory.turntable_result import run_turntable_test
-from twin.trial.command import add_test
+from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
+from twin.laboratory.distortion_report import run_distortion
+from twin.laboratory.focus_report import run_focus
+from twin.laboratory.turntable_report import run_turntable_test
+from twin.run.command import add_test
 
 PROGRAM = "twin.lab"
 

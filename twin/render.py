@@ -14,12 +14,17 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from analysis.recovery import ESTIMATORS
-from optics.backend import load_backend
-from scenes.course import moment
-from scenes.resolved import ResolvedJob, resolve
-from scenes.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.cli import (
+from analysis.monitor.recovery import ESTIMATORS
+from optics.numerics.backend import load_backend
+from scenes.specs.course import moment
+from scenes.specs.resolved import ResolvedJob, resolve
+from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from twin.main_job.render_files import write_run
+from twin.main_job.render_job import STAGES, render_job
+from twin.main_job.render_results import RenderRun, stated
+from twin.pictures.picture import write_pictures
+from twin.pictures.picture_light import PictureError
+from twin.run.cli import (
     BACKEND_HELP,
     LARGEST_SEED,
     check_backend,
@@ -29,16 +34,11 @@ from twin.cli import (
     print_whole,
     progress_columns,
 )
-from twin.edge_images import DIRECTIONS
-from twin.output import write_run
-from twin.picture import write_pictures
-from twin.picture_light import PictureError
-from twin.reference_frames import described
-from twin.render_job import STAGES, render_job
-from twin.results import RenderRun, stated
-from twin.run_folder import RunFolder, chosen
-from twin.target_images import PLACES
-from twin.target_result import EdgeReading, TargetRun
+from twin.run.reference_frames import described
+from twin.run.run_folder import RunFolder, chosen
+from twin.targets.edge_images import DIRECTIONS
+from twin.targets.target_images import PLACES
+from twin.targets.target_result import EdgeReading, TargetRun
 
 WRITE = "write the run folder"
 LABELS = {

@@ -13,9 +13,9 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.table import Column, Table
 from rich.text import Text
 
-from optics.backend import load_backend
-from scenes.standard_output import FAILURE, Terminal, print_json, to_stdout
-from twin.cli import (
+from optics.numerics.backend import load_backend
+from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
+from twin.run.cli import (
     BACKEND_HELP,
     LARGEST_SEED,
     InputErrorText,
@@ -24,9 +24,9 @@ from twin.cli import (
     explained,
     print_whole,
 )
-from twin.run_folder import RunFolder
+from twin.run.run_folder import RunFolder
 from twin.validation import registry
-from twin.validation.check import (
+from twin.validation.checks.check import (
     CONFIRMED,
     CONSISTENT,
     CORRECTED,
@@ -38,10 +38,9 @@ from twin.validation.check import (
     VERDICTS,
     Verdict,
 )
-from twin.validation.output import write_validation
 from twin.validation.registry import Selection, UnknownCheck, select
-from twin.validation.report import claim_text, measured_text, sigma_text
 from twin.validation.runner import Validation, rough_seconds, run_checks
+from twin.validation.validation_report import claim_text, measured_text, sigma_text, write_validation
 
 STYLES: dict[Verdict, str] = {
     CONFIRMED: "green",

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from analysis.focal_plane.rigid_motion import RigidMotion
+from analysis.focal_plane.plane_fit import RigidMotion
 
 __all__ = ["Mount", "ShimError", "ShimPlan", "shim_plan"]
 

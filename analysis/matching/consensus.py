@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.matching.checks import checked_places
+from analysis.matching.options import checked_places
 
 __all__ = ["Consensus", "DisplacementField", "consensus"]
 

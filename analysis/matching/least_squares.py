@@ -32,14 +32,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.matching.checks import checked_image, checked_places, checked_templates
-from analysis.matching.joined import joined
-from analysis.matching.options import MatchOptions
-from analysis.matching.reason import Reason
-from analysis.matching.residual_correlation import ResidualCorrelation, residual_correlation
+from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
 from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.window_halves import WindowHalves, window_halves
-from analysis.matching.window_relief import WindowRelief, window_relief
+from analysis.matching.window_relief import ResidualCorrelation, WindowRelief, residual_correlation, window_relief
 
 __all__ = ["Fits", "least_squares"]
 

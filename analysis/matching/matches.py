@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.matching.checks import checked_image, checked_places, checked_templates
 from analysis.matching.correlation import search
 from analysis.matching.least_squares import least_squares
-from analysis.matching.options import MatchOptions
-from analysis.matching.reason import Reason
+from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates
 from analysis.matching.spline import resampled
 from analysis.matching.window_halves import FALSE_ALARM, risk
 

@@ -1,9 +1,131 @@
-"""Thresholds and model of a match."""
+"""Thresholds and model of a match, checks of what it is given, why a point was not matched, results put together."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from enum import IntEnum
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["checked_image", "checked_places", "checked_templates"]
+
+Array = NDArray[np.float64]
+# A parabola and a 5 x 5 window within the margins need that much.
+_LEAST_TEMPLATE = 11
+
+
+def checked_image(image: ArrayLike, what: str) -> NDArray[np.generic]:
+    """The image as an array (rows, columns) of real numbers; not copied.
+
+    Raises:
+        ValueError: not a plane of real grey values, or empty.
+    """
+    array = np.asarray(image)
+    if array.ndim != 2 or array.dtype.kind not in "uif" or array.size == 0:
+        raise ValueError(
+            f"{what}: the image must be a plane of real grey values (rows, columns), found {array.dtype} "
+            f"{array.shape}; give one band, without colour"
+        )
+    return array
+
+
+def checked_places(places: ArrayLike, count: int | None, what: str) -> Array:
+    """Places (n, 2) row and column as float64; they may be NaN.
+
+    Raises:
+        ValueError: another shape, or another number than count.
+    """
+    array = np.asarray(places, np.float64)
+    if array.ndim != 2 or array.shape[1] != 2 or (count is not None and len(array) != count):
+        wanted = "(n, 2)" if count is None else f"({count}, 2)"
+        raise ValueError(f"{what}: need {wanted} places (row, column), found {array.shape}; give one row a point")
+    return array
+
+
+def checked_templates(templates: ArrayLike, what: str) -> Array:
+    """Templates (n, k, k) as float64.
+
+    Raises:
+        ValueError: not square, k even or below 11.
+    """
+    array = np.asarray(templates, np.float64)
+    if (
+        array.ndim != 3
+        or array.shape[1] != array.shape[2]
+        or array.shape[1] % 2 == 0
+        or array.shape[1] < _LEAST_TEMPLATE
+    ):
+        raise ValueError(
+            f"{what}: need templates (n, k, k) with k odd and {_LEAST_TEMPLATE} or more, so that they have a middle "
+            f"pixel; found {array.shape}"
+        )
+    return array
+
+
+__all__ = ["Reason"]
+
+
+class Reason(IntEnum):
+    """Code of a verdict; `text` says it in words."""
+
+    ACCEPTED = 0
+    TEMPLATE = 1
+    OUTSIDE = 2
+    IMAGE = 3
+    SATURATED = 4
+    FLAT = 5
+    BORDER = 6
+    WEAK = 7
+    AMBIGUOUS = 8
+    DIVERGED = 9
+    MOVED = 10
+    DISTORTED = 11
+    UNCERTAIN = 12
+    RELIEF = 13
+    UNTESTED = 14
+
+    @property
+    def text(self) -> str:
+        """Reason in words."""
+        return _TEXTS[self]
+
+
+_TEXTS = {
+    Reason.ACCEPTED: "accepted",
+    Reason.TEMPLATE: "the template or its predicted place is not finite",
+    Reason.OUTSIDE: "the template does not fit into the image at its predicted place",
+    Reason.IMAGE: "pixels of the image under the template are not finite",
+    Reason.SATURATED: "pixels of the image under the template are saturated",
+    Reason.FLAT: "too little texture",
+    Reason.BORDER: "the best correlation lies on the border of the search window",
+    Reason.WEAK: "the correlation is too low",
+    Reason.AMBIGUOUS: "another place correlates nearly as well",
+    Reason.DIVERGED: "least squares matching did not converge",
+    Reason.MOVED: "least squares matching left the correlation's peak",
+    Reason.DISTORTED: "the affine change is too large",
+    Reason.UNCERTAIN: "the standard deviation is too large",
+    Reason.RELIEF: "parts of the window are displaced against each other",
+    Reason.UNTESTED: "windows have steps of displacement here, and this one is too weak to show one",
+}
+
+
+__all__ = ["joined"]
+
+Part = TypeVar("Part")
+
+
+def joined(parts: Sequence[Part]) -> Part:
+    """One after the other: dataclasses of arrays (n, ...) and of such dataclasses; at least one."""
+    columns: dict[str, Any] = {}
+    for field in fields(parts[0]):  # type: ignore[arg-type]
+        column = [getattr(part, field.name) for part in parts]
+        columns[field.name] = joined(column) if is_dataclass(column[0]) else np.concatenate(column)
+    return type(parts[0])(**columns)
+
 
 __all__ = ["MatchOptions"]
 

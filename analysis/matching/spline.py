@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.interpolate import BSpline, PPoly
 
-from analysis.matching.checks import checked_image
+from analysis.matching.options import checked_image
 
 __all__ = ["SplineStack", "low_passed", "resampled"]
 

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
-from analysis.noise import NoiseModel
+from analysis.spots.noise import NoiseModel
 
 __all__ = ["BarError", "BarMtf", "measure_bars"]
 

@@ -28,7 +28,7 @@ from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, loca
 from analysis.mtf.edge_mtf import EdgeMtf
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
-from analysis.noise import NoiseModel
+from analysis.spots.noise import NoiseModel
 
 __all__ = ["EdgeError", "EdgeMtf", "measure_edge"]
 

@@ -34,7 +34,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.model_fit import RankError
+from analysis.monitor.model_fit import RankError
 
 __all__ = [
     "TERMS",

@@ -1,4 +1,7 @@
-"""Interior orientation of a line camera from (angle, spot position) pairs, with all that is known of their noise.
+"""Interior orientation of a line camera from (angle, position) pairs, and whether its principal point is observable.
+
+Over a narrow field tan^2 W is tiny: an error of 1 um at the edge of +-1.25 deg is 2 mm of p. Paper 004 solves for p all
+the same (eq. 2) and remarks that p is about a pixel; this says with numbers when p = 0 (eq. 3) is the better choice.
 
 `fit_interior_orientation` fits the model of `distortion_model` (paper 004, eqs. 1-4, with a constant and
 radial terms). Errors of a turntable are common to many points (eccentricity, graduation, the zero), so the noise is a
@@ -19,13 +22,170 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from analysis.orientation.algebra import condition_number, gain, noise_matrix, noise_root
-from analysis.orientation.distortion_model import OrientationError, design, readings, slope
-from analysis.orientation.principal_point import PointReport, point_report
+from analysis.orientation.distortion_model import InseparableTermsError, OrientationError, design, readings, slope
+
+__all__ = ["condition_number", "gain", "noise_matrix", "noise_root"]
+
+Array = NDArray[np.float64]
+# With columns of length one, the worst combination of terms has this many times the sigma of the best. Five terms over
+# half a field have 270; f and a constant reach 1000 when the angles lie within 1 % of each other.
+_WORST_CONDITION = 1e3
+
+
+def gain(columns: Array, root: Array | None = None) -> Array:
+    """Least-squares inverse (P, N) of columns (N, P): all points alike, or generalised least squares.
+
+    root: (N, N) from `noise_root`. Columns are scaled to length one, for powers of tan W differ by magnitudes.
+    """
+    white = columns if root is None else np.linalg.solve(root, columns)
+    length = np.linalg.norm(white, axis=0)
+    inverse = np.linalg.pinv(white / length) / length[:, None]
+    return np.asarray(inverse if root is None else inverse @ np.linalg.inv(root), dtype=np.float64)
+
+
+def condition_number(columns: Array, names: tuple[str, ...], angle: Array) -> float:
+    """Condition number of columns (N, P) of these terms at angles (N,), rad, scaled to length one.
+
+    Raises InseparableTermsError, naming the terms that take part in the worst combination, when it is too large.
+    """
+    length = np.linalg.norm(columns, axis=0)
+    _, values, vt = np.linalg.svd(columns / np.where(length > 0, length, 1.0))
+    condition = float(values[0] / max(values[-1], 1e-300))
+    if condition <= _WORST_CONDITION:
+        return condition
+    part = np.abs(vt[-1]) / np.max(np.abs(vt[-1]))
+    mixed = tuple(name for name, share in zip(names, part, strict=True) if share > 0.1)
+    null = vt[-1:] / np.where(length > 0, length, 1.0)
+    low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
+    side = ", all on one side of zero" if low * high > 0 else ""
+    raise InseparableTermsError(
+        f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)}"
+        f" (condition number {condition:.2g}); measure at more angles over both halves of the"
+        " field, or leave a term out",
+        null / np.max(np.abs(null)),
+        mixed,
+    )
+
+
+def noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
+    """Covariance (N, N) from a covariance (N, N) or sigmas (N,) or ().
+
+    Raises OrientationError, with the given name, for another shape, values that are not finite, negative sigmas.
+    """
+    noise = np.asarray(given, dtype=np.float64)
+    if not np.all(np.isfinite(noise)):
+        raise OrientationError(f"interior orientation: {name} is not finite")
+    if noise.shape in ((), (count,)):
+        if np.any(noise < 0):
+            raise OrientationError(f"interior orientation: {name} holds negative sigmas")
+        return np.diag(np.broadcast_to(noise, (count,)) ** 2)
+    if noise.shape != (count, count):
+        raise OrientationError(
+            f"interior orientation: {name} is {noise.shape}; {count} points need ({count}, {count}), or {count} sigmas"
+        )
+    if np.max(np.abs(noise - noise.T)) > 1e-9 * np.max(np.abs(noise)):
+        raise OrientationError(f"interior orientation: {name} is not symmetric")
+    return 0.5 * (noise + noise.T)
+
+
+def noise_root(noise: Array) -> Array:
+    """Cholesky factor of a covariance (N, N): solve(root, x) has unit covariance.
+
+    Raises OrientationError when the covariance is not positive definite.
+    """
+    sigma = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
+    least = np.min(np.linalg.eigvalsh(noise / np.outer(sigma, sigma))) if np.all(sigma > 0) else 0.0
+    # eigenvalues below the rounding of a matrix of this size are not known to be positive
+    if least <= 1e-14 * len(noise):
+        raise OrientationError(
+            "interior orientation: the noise is zero or fully common in some combination of points (its covariance is"
+            " not positive definite); add the sigmas of the single spots"
+        )
+    return np.asarray(np.linalg.cholesky(noise))
+
+
+__all__ = ["PointReport", "point_report"]
+
+# Significance in sigmas: false alarm 0.3 %.
+_SIGNIFICANT = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class PointReport:
+    """What the test can say of the principal point p.
+
+    value: m; zero when p was not fitted. sigma: m, of p, or of the p that could have been fitted beside the other
+    terms; infinite when it could not.
+    fitted: whether p is one of the terms. observable: sigma is no larger than the tolerance that was asked for.
+    significant: |value| exceeds 3 sigma. edge_effect: sigma tan^2 W at the widest angle, m. noise: median sigma of a
+    point, m. statement: all this in a sentence.
+    """
+
+    value: float
+    sigma: float
+    fitted: bool
+    observable: bool
+    significant: bool
+    edge_effect: float
+    noise: float
+    statement: str
+
+
+def point_report(
+    names: tuple[str, ...], values: Array, angle: Array, noise: Array, weighted: bool, tolerance: float
+) -> PointReport:
+    """What a fit of these terms says of p, or would say with p beside them.
+
+    names, values: P terms and their values, m. angle: (N,) rad. noise: (N, N) m^2. weighted: generalised least squares.
+    tolerance: m, largest sigma of an observable p.
+    """
+    fitted = "principal_point" in names
+    asked = names if fitted or "decentring" in names else (*names, "principal_point")
+    k = asked.index("principal_point" if "principal_point" in asked else "decentring")
+    columns = design(angle, asked)
+    try:
+        if len(columns) < len(asked):
+            raise OrientationError("interior orientation: no point is left for p")
+        condition_number(columns, asked, angle)
+        row = gain(columns, noise_root(noise) if weighted else None)[k]
+        sigma = float(np.sqrt(row @ noise @ row))
+    except OrientationError:
+        sigma = np.inf
+    value = float(values[k]) if fitted else 0.0
+    widest = float(np.max(np.abs(angle)))
+    edge = sigma * np.tan(widest) ** 2
+    typical = float(np.median(np.sqrt(np.diagonal(noise))))
+    observable, significant = sigma <= tolerance, abs(value) > _SIGNIFICANT * sigma
+    low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
+    even = abs(low + high) < 0.01 * (high - low)
+    field = f"+-{0.5 * (high - low):.4g} deg" if even else f"{low:.4g} to {high:.4g} deg"
+    same = "A decentring distortion would be the same tan^2 term."
+    size = f"p = {1e3 * value:.2g} +- {1e3 * sigma:.2g} mm"
+    effect = (
+        f"one sigma of it moves the edge of the field by {1e6 * edge:.2g} um against {1e6 * typical:.2g} um of noise"
+    )
+    if not fitted:
+        if "decentring" in names:
+            text = f"p is taken as zero: the tan^2 term was fitted as decentring, +- {1e3 * sigma:.2g} mm. {same}"
+        elif np.isfinite(sigma):
+            able = "observable" if observable else "not observable"
+            text = f"p is taken as zero; fitted, it would be known to +- {1e3 * sigma:.2g} mm: {able} over {field}."
+        else:
+            text = f"p is taken as zero; the angles, {field}, could not separate it from the other terms."
+    elif observable:
+        text = f"{size}: observable over {field}" + (". " if significant else ", and not different from zero. ") + same
+    elif significant:
+        text = (
+            f"{size}: a tan^2 term is there, but as a place of the principal point it is not observable over {field} to"
+            f" {1e6 * tolerance:.3g} um. {same}"
+        )
+    else:
+        text = f"{size}: not observable over {field}; {effect}; take p = 0 (paper 004, eq. 3). {same}"
+    return PointReport(value, sigma, fitted, observable, significant, edge, typical, text)
+
 
 __all__ = ["InteriorOrientation", "PrintedDistortion", "fit_interior_orientation"]
 
-Array = NDArray[np.float64]
 _CALIBRATION = ("constant", "principal_distance", "principal_point")
 # A principal distance with a larger relative sigma is no result; the angles are then nearly constant.
 _WORST_DISTANCE = 0.1

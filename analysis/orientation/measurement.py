@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
-from analysis.centroid import energy_centroid, mean_frames
-from analysis.noise import NoiseModel
 from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
+from analysis.spots.centroid import energy_centroid, mean_frames
+from analysis.spots.noise import NoiseModel
 from analysis.turntable.dividing_error import CalibrationSeries
 
 __all__ = ["CALIBRATED", "SMOOTH", "Distortion", "PointMeans", "Spots", "locate_spots", "reduce_sets"]

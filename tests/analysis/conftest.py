@@ -2,7 +2,7 @@
 
 import pytest
 
-from optics.threads import one_blas_thread
+from optics.numerics.threads import one_blas_thread
 
 
 @pytest.fixture(autouse=True, scope="package")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.autocollimator import (
+from analysis.monitor.autocollimator import (
     ReadingMap,
     column_component,
     exact_reading,
@@ -14,7 +14,7 @@ from analysis.autocollimator import (
     reading_of_normal,
     relation_factor,
 )
-from twin import principle_printed as printed
+from twin.validation.paper_001 import principle_rows as printed
 
 ARCSEC = math.pi / 648000
 TWO_OVER_ROOT_3 = 2.0 / math.sqrt(3.0)

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from analysis.mtf.bar_contrast import BarError, measure_bars
-from analysis.noise import NoiseModel
+from analysis.spots.noise import NoiseModel
 
 FALSE_ALARM = 1e-6
 PAN, MULTISPECTRAL = 7e-6, 28e-6

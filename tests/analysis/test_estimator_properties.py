@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.centroid import energy_centroid, gaussian_fit
 from analysis.focal_plane.plane_fit import fit_focal_plane
-from analysis.intersection_angle import exact, first_order
 from analysis.matching.least_squares import least_squares
-from analysis.monitoring import CameraParameters, MonitorGeometry, derived, paper_joint, paper_single
-from analysis.noise import NoiseModel
+from analysis.monitor.intersection_angle import exact, first_order
+from analysis.monitor.monitoring import CameraParameters, MonitorGeometry, derived, paper_joint, paper_single
 from analysis.orbit.angles import angles_between
 from analysis.orbit.planes import Station, Strip, fit_plane
 from analysis.orientation.interior import fit_interior_orientation
-from optics.rotation import rotation_matrix
+from analysis.spots.centroid import energy_centroid, gaussian_fit
+from analysis.spots.noise import NoiseModel
+from optics.geometry.pose import rotation_matrix
 from tests.analysis.texture_image import Texture
 
 NOISE = NoiseModel(0.06, 16.0, 0.0, 64.0, 0.01, 5.0, 4095.0)

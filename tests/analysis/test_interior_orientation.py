@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.model_fit import RankError
+from analysis.monitor.model_fit import RankError
 from analysis.orientation.distortion_model import (
     InseparableTermsError,
     OrientationError,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.intersection_angle import exact, first_order
-from analysis.monitoring import CameraParameters
+from analysis.monitor.intersection_angle import exact, first_order
+from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC
 
 FORWARD, BACKWARD = np.deg2rad(26.0), np.deg2rad(-5.0)

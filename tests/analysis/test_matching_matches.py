@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.matching.consensus import consensus
-from analysis.matching.correlation import search
-from analysis.matching.distinct_points import distinct_points
+from analysis.matching.correlation import distinct_points, search
 from analysis.matching.matches import Matches, MatchOptions, Reason, match
 from tests.analysis.texture_image import Texture, detected
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.model_fit import RankError, fit, observability
+from analysis.monitor.model_fit import RankError, fit, observability
 
 FALSE_ALARM = 1e-6
 NAMES = ["shift x", "shift y", "turn z", "scale"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.monitoring import (
+from analysis.monitor.monitoring import (
     CameraParameters,
     MonitorGeometry,
     coefficients,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.noise import NoiseModel
+from analysis.spots.noise import NoiseModel
 
 NOISE = NoiseModel(
     gain_dn_per_e=0.5,

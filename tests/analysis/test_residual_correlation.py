@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.matching.residual_correlation import LAG, residual_correlation
+from analysis.matching.window_relief import LAG, residual_correlation
 
 SIDE = 15
 LAGS = [(r, c) for r in range(LAG + 1) for c in range(-LAG, LAG + 1) if r > 0 or c > 0]

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.focal_plane.plane_fit import fit_focal_plane, line_level
-from analysis.focal_plane.rigid_motion import RigidMotion
+from analysis.focal_plane.plane_fit import RigidMotion, fit_focal_plane, line_level
 from analysis.focal_plane.shims import Mount, ShimError, shim_plan
 
 FALSE_ALARM = 1e-6

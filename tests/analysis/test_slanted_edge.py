@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from analysis.mtf.rice import rice_bias
 from analysis.mtf.slanted_edge import EdgeError, measure_edge
-from analysis.noise import NoiseModel
+from analysis.spots.noise import NoiseModel
 
 FALSE_ALARM = 1e-6
 WAVELENGTH, F_NUMBER = 650e-9, 9.2

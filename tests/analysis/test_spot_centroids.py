@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from scipy.special import j1
 
-from analysis.centroid import (
+from analysis.spots.centroid import (
     SpotError,
     cramer_rao_bound,
     difference_covariance,
@@ -20,8 +20,8 @@ from analysis.centroid import (
     maximum_likelihood_fit,
     mean_frames,
 )
-from analysis.noise import NoiseModel
-from analysis.spot_template import SpotTemplate
+from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_template import SpotTemplate
 
 FALSE_ALARM = 1e-6
 SHAPE = (96, 96)

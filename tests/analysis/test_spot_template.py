@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from analysis.spot_template import SpotTemplate, TemplateRangeError
+from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
 
 FIRST_ZERO_PX = 7.0
 

@@ -11,18 +11,22 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise
 from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.three_line_model import LineModel, Rays, bias_rotation, misclosure, partials
-from scenes.load import load_three_line_camera
+from scenes.specs.load import load_three_line_camera
 from tests.twin.orbit_bench import CirclePlatform
-from twin.orbit.earth import Earth
-from twin.orbit.light_effects import NO_EFFECTS
-from twin.orbit.line_camera import line_cameras
-from twin.orbit.sensor import Sensor
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.sensor import Sensor
 
 ARCSEC = np.pi / 648000
 PITCH = 6.5e-6
 RADIUS, RATE, EARTH_RATE, INCLINATION = 6378137.0 + 500e3, 1.1068e-3, 7.292115e-5, np.radians(97.4)
 LOOKS = {"forward": 25.0, "nadir": 0.0, "aft": -25.0}
-MOUNTED = {"forward": (12, -20, 35), "nadir": (-8, 15, -10), "aft": (5, 18, -28)}  # arcsec, as scenes/payloads/th1.yaml
+MOUNTED = {
+    "forward": (12, -20, 35),
+    "nadir": (-8, 15, -10),
+    "aft": (5, 18, -28),
+}  # arcsec, as scenes/library/payloads/th1.yaml
 DISTORTION = {"forward": 0.045, "nadir": 0.040, "aft": -0.038}
 INTERIOR = {"forward": (0.65, 8e-6, -13e-6), "nadir": (0.65, -5e-6, 10e-6), "aft": (0.65, 12e-6, 6e-6)}
 POSITION = (0.3, -0.1, 0.2)
@@ -71,7 +75,7 @@ def orbit(node, time):
 
 
 def look(line, y, camera):
-    """Directions in the body frame from image places, with the signs of twin/orbit/line_camera.py."""
+    """Directions in the body frame from image places, with the signs of twin/orbit/flight/line_camera.py."""
     f, x0, y0 = camera.interior
     x, y = np.full_like(y, -x0), y - y0
     grown = 1 + camera.k1 * (x**2 + y**2)

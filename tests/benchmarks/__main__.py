@@ -10,13 +10,13 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from scenes.standard_output import FAILURE
+from scenes.yaml.standard_output import FAILURE
 from tests.benchmarks.machine import Machine
 from tests.benchmarks.number import Speed
 from tests.benchmarks.page import Page
 from tests.benchmarks.registry import BENCHMARKS, Benchmark, running_order
 from tests.benchmarks.workbench import Workbench
-from twin.cli import InputErrorText, exit_on_terminate, explained, progress_columns
+from twin.run.cli import InputErrorText, exit_on_terminate, explained, progress_columns
 
 HELP = """Measure how fast everything is, in one run, and hold it against its limits.
 

@@ -7,16 +7,15 @@ import time
 
 import numpy as np
 
-from scenes.load import load_three_line_camera
-from scenes.orbit_spec import OrbitSpec
+from scenes.specs.load import load_three_line_camera
+from scenes.specs.orbit_spec import OrbitSpec
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
-from twin.orbit.earth import Earth
-from twin.orbit.geolocation import GeolocationGrid
-from twin.orbit.line_camera import line_cameras
-from twin.orbit.orbit import propagate
-from twin.orbit.sensor import Sensor
-from twin.orbit.trajectory import Trajectory
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import GeolocationGrid, Sensor
+from twin.orbit.flight.trajectory import Trajectory
 
 LINES, QUICK_LINES, PIXELS = 10_000, 400, 12_000
 LIMIT_S = 10.0

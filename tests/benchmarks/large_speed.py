@@ -16,11 +16,11 @@ import psutil
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.study_bench import write_study
-from twin.study.chunk_store import ChunkStore
-from twin.study.cluster import local_workers
-from twin.study.engine import Engine, Progress
-from twin.study.plan import Plan
-from twin.study.setup import resolve_study
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.cluster import local_workers
+from twin.study.runs.engine import Engine, Progress
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
 
 RUNS, QUICK_RUNS = 10_000, 200
 LIMIT_S, LIMIT_GIB = 200.0, 4.0

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from optics.threads import cores
+from optics.numerics.threads import cores
 
 PACKAGES = ("drjit", "mitsuba", "karellen-llvm-core", "numpy", "scipy", "dask", "batoid", "optiland", "poppy")
 BUSY_SHARE = 0.25

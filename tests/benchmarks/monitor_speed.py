@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from analysis.units import ARCSEC
-from optics.tree import Motion, State
-from scenes.channel import BASE
+from optics.geometry.tree import Motion, State
+from scenes.specs.channel import BASE
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from tests.benchmarks.machine import Machine
 from tests.benchmarks.number import Number, Speed
-from twin.cli import print_whole
+from twin.run.cli import print_whole
 
 
 @dataclass(frozen=True)

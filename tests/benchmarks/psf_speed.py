@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from optics import quadrature
-from optics.diffraction import Grid, image
+from optics.numerics import quadrature
+from optics.waves.diffraction import Grid, image
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench, absent, installed

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from analysis.units import ARCSEC
-from optics.tree import Motion, State
-from scenes.channel import BASE
+from optics.geometry.tree import Motion, State
+from scenes.specs.channel import BASE
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
-from twin.image_quality import quality_dicts
-from twin.study.render_base import BLOCK
+from twin.monitor.image_quality import quality_dicts
+from twin.study.runs.render_base import BLOCK
 
 BLOCKS, QUICK_BLOCKS = 4, 1
 ROUNDS = 5

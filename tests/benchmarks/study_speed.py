@@ -9,14 +9,14 @@ from pathlib import Path
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.study_bench import write_study
-from twin.study.chunk_store import ChunkStore
-from twin.study.cluster import Workers, local_workers
-from twin.study.engine import Engine, Progress
-from twin.study.plan import Plan
-from twin.study.render_base import BLOCK
-from twin.study.setup import resolve_study
-from twin.study.task import Task, evaluate
-from twin.versions import source_digest
+from twin.run.versions import source_digest
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.cluster import Workers, local_workers
+from twin.study.runs.engine import Engine, Progress
+from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import BLOCK
+from twin.study.runs.setup import resolve_study
+from twin.study.runs.task import Task, evaluate
 
 RUNS, QUICK_RUNS = 1825, 125
 OVERHEAD_MS = 1.0

@@ -6,7 +6,7 @@ import drjit as dr
 
 from tests.benchmarks.geolocation_speed import forward_sensor, whole_image
 from tests.benchmarks.monitor_speed import random_states
-from twin.truth import trace_truth
+from twin.monitor.truth import trace_truth
 
 
 def test_other_numbers_compile_no_new_kernel(experiment, backend) -> None:

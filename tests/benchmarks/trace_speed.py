@@ -14,10 +14,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from optics.system import assemble
-from optics.threads import cores
-from optics.trace import make_rays, trace
-from scenes.camera_model import LINE_AXIS, CameraModel, collimated, field_direction
+from optics.numerics.threads import cores
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, field_direction
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench, absent, installed

@@ -5,14 +5,14 @@ from __future__ import annotations
 from functools import cache, cached_property
 from importlib.util import find_spec
 
-from optics.backend import Backend, load_backend
-from scenes.camera_model import CameraModel, derive_camera
-from scenes.instrument_builder import build_instrument
-from scenes.instrument_model import Instrument
-from scenes.job import JobSpec
-from scenes.load import load_camera, load_instrument
-from scenes.resolved import resolve_job
-from twin.experiment import MonitorExperiment
+from optics.numerics.backend import Backend, load_backend
+from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.specs.job import JobSpec
+from scenes.specs.load import load_camera, load_instrument
+from scenes.specs.resolved import resolve_job
+from twin.monitor.monitor_experiment import MonitorExperiment
 
 
 class Workbench:

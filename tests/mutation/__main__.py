@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from scenes.yaml_file import read_yaml
+from scenes.yaml.yaml_file import read_yaml
 from tests.mutation.campaign import Verdict, read_verdicts, run_campaign
 from tests.mutation.coverage_map import measure, read_map
 from tests.mutation.mutants import Mutant, mutants_below
@@ -29,7 +29,13 @@ Examples:
 
 Exit code: 0 at least 90 % of the faults that are not equivalent were found, 1 fewer, 2 bad input.
 """
-PLACES = ("optics", "analysis", "twin/monitor.py", "twin/monitor_derivative.py", "twin/detector.py")
+PLACES = (
+    "optics",
+    "analysis",
+    "twin/monitor/monitor_path.py",
+    "twin/monitor/monitor_derivative.py",
+    "twin/sensors/area_detector.py",
+)
 TESTS = ("optics", "analysis", "oracles", "scenes", "twin")
 """Folders of tests that take part; those of the commands' robustness, of the papers' verdicts and of speed do not."""
 LIMIT = 0.90

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.aperture import Aperture
-from optics.assembly import Assembly
-from optics.backend import Backend
-from optics.element import Element, Interaction
-from optics.pose import Pose
-from optics.surface import Surface
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Body, RigidTree, State
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface
+from optics.geometry.tree import Body, RigidTree, State
+from optics.numerics.backend import Backend
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
 
 REFLECT, REFRACT, PASS = Interaction.REFLECT, Interaction.REFRACT, Interaction.PASS
 

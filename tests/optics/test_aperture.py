@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from optics.aperture import Aperture, Circle, Ellipse, Rectangle
-from optics.backend import Backend
-from optics.surface import plane
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.surface import plane
+from optics.numerics.backend import Backend
 from tests.optics.bench import PASS, Stage, beam, build, run
 
 

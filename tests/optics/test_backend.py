@@ -2,7 +2,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from optics.backend import BackendUnavailable, load_backend
+from optics.numerics.backend import BackendUnavailable, load_backend
 
 
 def test_uploaded_numbers_are_a_copy(backend) -> None:

@@ -4,14 +4,14 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from optics import quadrature
-from optics.aim import AimError, RayFan, aim, transverse_axes
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion, State
-from scenes.camera_model import field_direction
-from twin.monitor import MonitorPath
-from twin.truth import trace_truth
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.raytrace.aim import AimError, RayFan, aim, transverse_axes
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_model import field_direction
+from twin.monitor.monitor_path import MonitorPath
+from twin.monitor.truth import trace_truth
 
 ARCSEC = np.pi / 180 / 3600
 

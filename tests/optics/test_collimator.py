@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from optics import quadrature, zernike
-from optics.backend import Backend
-from optics.collimator import Collimator, TooNarrowError
-from optics.pupil_function import PupilFunction
-from optics.transfer import transfer
-from optics.tree import Motion
-from scenes.camera_under_test import ROOT, build_camera_under_test
-from scenes.collimator import CameraUnderTestSpec
-from scenes.load import load_camera
-from twin.target_path import TargetPath
+from optics.geometry import zernike
+from optics.geometry.tree import Motion
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.targets.collimator import Collimator, TooNarrowError
+from optics.waves.pupil_function import PupilFunction
+from optics.waves.transfer import transfer
+from scenes.models.camera_assembly import ROOT, build_camera_under_test
+from scenes.specs.focus_test import CameraUnderTestSpec
+from scenes.specs.load import load_camera
+from twin.targets.target_path import TargetPath
 
 LONG = 20.0
 RADIUS = 0.302

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from optics.convex_polygon import area, clip, compact, difference, hull, intersect, quadrature, sides
-from optics.pupil_edge import PupilEdge
-from optics.pupil_shadow import FEW_SIDES, PupilShadow, separate
+from optics.geometry.polygon import area, clip, compact, difference, hull, intersect, quadrature, sides
+from optics.waves.pupil_edge import PupilEdge
+from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, separate
 
 RNG = np.random.default_rng(7)
 SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))

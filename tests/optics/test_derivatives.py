@@ -6,12 +6,12 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from optics.assembly import Assembly
-from optics.first_order import first_order, ray_matrix
-from optics.system import SystemBatch, assemble
-from optics.trace import Traced, make_rays, trace
-from optics.tree import Motion, State
-from scenes.camera_model import IMAGE, collimated, field_direction
+from optics.geometry.tree import Motion, State
+from optics.raytrace.assembly import Assembly
+from optics.raytrace.first_order import first_order, ray_matrix
+from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import Traced, make_rays, trace
+from scenes.models.camera_model import IMAGE, collimated, field_direction
 
 MOTIONS = [
     (body, kind, axis)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.design import DesignError, optimise
-from optics.design_merit import Goals, Judge
-from optics.design_rays import beam_axes
-from optics.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
-from scenes.camera_design import beams_of, camera_of, prescription_of
+from optics.design.design_rays import beam_axes
+from optics.design.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
+from optics.design.merit_function import Goals, Judge
+from optics.design.optimiser import DesignError, optimise
+from scenes.models.camera_design import beams_of, camera_of, prescription_of
 
 MIRRORS = ("M1", "M2", "M3")
 EVERY = (

@@ -5,9 +5,9 @@ import pytest
 from scipy.integrate import simpson
 from scipy.special import j0, j1
 
-from optics import quadrature
-from optics.diffraction import Grid, PupilField, airy, image
-from optics.quadrature import PupilNodes
+from optics.numerics import quadrature
+from optics.numerics.quadrature import PupilNodes
+from optics.waves.diffraction import Grid, PupilField, airy, image
 
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
 APERTURE = 0.5 / F_NUMBER

@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 
-from optics.aperture import Circle
-from optics.figure import GridFigure, ZernikeFigure
-from optics.surface import Surface, plane
-from optics.tree import Motion
-from optics.zernike import zernike
+from optics.geometry.aperture import Circle
+from optics.geometry.surface import GridFigure, Surface, ZernikeFigure, plane
+from optics.geometry.tree import Motion
+from optics.geometry.zernike import zernike
 from tests.optics.bench import Stage, beam, build, disk_points, run, unit
 
 Z = np.array([0.0, 0.0, 1.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optics.fresnel import cosine_after, reflectance
+from optics.materials.finish import cosine_after, reflectance
 
 INDICES = [(1.0, 1.5), (1.5, 1.0), (1.0, 4.0), (1.33, 1.52)]
 

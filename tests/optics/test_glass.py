@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from optics.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
+from optics.materials.glass import FUSED_SILICA, GLASSES, N_BK7, ZERODUR, air_index, glass
 
 D_LINE, E_LINE, F_LINE, C_LINE = 587.5618e-9, 546.074e-9, 486.1327e-9, 656.2725e-9
 

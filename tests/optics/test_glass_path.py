@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from optics.aperture import Ellipse
-from optics.assembly import Assembly
-from optics.element import Element, Interaction
-from optics.pose import Pose
-from optics.rotation import about_axis
-from optics.surface import plane
-from optics.system import Medium, assemble, media_along
-from optics.trace import make_rays, trace
-from optics.tree import Body, Motion, RigidTree
+from optics.geometry.aperture import Ellipse
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, Motion, RigidTree
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.system import Medium, assemble, media_along
+from optics.raytrace.trace import make_rays, trace
 
 N = 1.52
 REFRACT, TOTAL, PASS, REFLECT = Interaction.REFRACT, Interaction.TOTAL, Interaction.PASS, Interaction.REFLECT

@@ -5,15 +5,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from optics.assembly import Assembly
-from optics.element import Element, Interaction
-from optics.graded_ray import GradedRay, truncation_bound
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.surface import Surface, plane
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Body, Motion, RigidTree
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.surface import Surface, plane
+from optics.geometry.tree import Body, Motion, RigidTree
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.graded_ray import GradedRay, truncation_bound
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
 
 N0 = 1.5
 START, HEADING = np.array([0.03, -0.02, 0.01]), np.array([0.2, -0.1, 1.0]) / np.sqrt(1.05)

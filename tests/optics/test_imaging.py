@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
-from optics import quadrature, zernike
-from optics.assembly import Assembly
-from optics.diffraction import Grid, PupilField, huygens, image
-from optics.imaging import aim_collimated, imaging_field
-from optics.quadrature import PupilNodes
-from optics.system import assemble
-from optics.trace import BeamMissedError, make_rays, trace
-from optics.tree import Motion, State
-from scenes.camera_model import IMAGE, field_direction
-from twin.monitor import MonitorPath
+from optics.geometry import zernike
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.assembly import Assembly
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from optics.waves.diffraction import Grid, PupilField, huygens, image
+from optics.waves.imaging import aim_collimated, imaging_field
+from scenes.models.camera_model import IMAGE, field_direction
+from twin.monitor.monitor_path import MonitorPath
 
 ARCSEC = np.pi / 180 / 3600
 WAVELENGTH = 650e-9

@@ -1,7 +1,7 @@
 import pytest
 
-from optics.glass import GLASSES
-from optics.material import MATERIALS, Material, material
+from optics.materials.glass import GLASSES
+from optics.materials.material import MATERIALS, Material, material
 
 # name: range of CTE 1e-6/K, density, E GPa that handbooks give
 PLAUSIBLE = {

@@ -4,10 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optics.pose import Pose
-from optics.rotation import rotation_matrix, rotation_vector
-from optics.solid import Coating, Face, Solid, solid_mesh
-from optics.tree import COMPLEX_STEP, Body, Motion, RigidTree, compose
+from optics.geometry.pose import Pose, rotation_matrix, rotation_vector
+from optics.geometry.solid import Coating, Face, Solid, solid_mesh
+from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, compose
 
 ROUNDING = 1e-14
 """Some ten roundings of numbers near 1."""

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from optics.diffraction import airy
-from optics.pixel_response import PixelResponse
+from optics.waves.diffraction import airy
+from optics.waves.pixel_response import PixelResponse
 
 PITCH, WAVELENGTH, F_NUMBER = 12e-6, 650e-9, 110.4
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from optics.polyhedron import MERGED, REACH, EmptyBodyError, OpenBodyError, Polyhedron, enclosed
-from optics.rotation import rotation_matrix
+from optics.geometry.pose import rotation_matrix
+from optics.geometry.solid import MERGED, REACH, EmptyBodyError, OpenBodyError, Polyhedron, enclosed
 
 ROUNDING = 1e-15
 """Of heights over a plane: corners of bodies of a metre, in doubles."""

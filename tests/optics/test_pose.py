@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
+from optics.geometry.pose import Pose, rotation_matrix
 
 
 def some_pose(seed: int) -> Pose:

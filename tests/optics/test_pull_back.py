@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from optics.pull_back import pull_back
-from optics.push_forward import push_forward
-from optics.system import assemble
-from optics.tree import Motion
-from scenes.camera_model import collimated, field_direction
+from optics.geometry.tree import Motion
+from optics.raytrace.derivatives import pull_back, push_forward
+from optics.raytrace.system import assemble
+from scenes.models.camera_model import collimated, field_direction
 
 STEPS = [("M1", "rotate", 0), ("M2", "shift", 2), ("M3", "figure", 7), ("M3", "scale", 0), ("image", "rotate", 1)]
 FIGURE = {"M3": Motion(figure={7: 1e-7})}

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from optics import quadrature
+from optics.numerics import quadrature
 
 
 def disk_moment(a: int, b: int, inner: float = 0.0) -> float:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from optics.rotation import about_axis, rotation_matrix, rotation_vector
+from optics.geometry.pose import about_axis, rotation_matrix, rotation_vector
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

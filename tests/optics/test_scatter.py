@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from optics.finish import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON, Finish
-from optics.scatter import ABg, HarveyShack, acceptance, sample_distance, total_scatter
+from optics.materials.finish import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON, Finish
+from optics.materials.scatter import ABg, HarveyShack, acceptance, sample_distance, total_scatter
 
 FALSE_ALARM = 1e-3
 LOBES = [

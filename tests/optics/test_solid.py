@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.solid import Coating, Face, Solid, SolidError, face_plane, solid_mesh
-from optics.tree import Body, Motion, RigidTree
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Coating, Face, Solid, SolidError, face_plane, solid_mesh
+from optics.geometry.tree import Body, Motion, RigidTree
 
 ROUNDING = 1e-12
 """Relative: some hundred roundings of sizes near 1 m."""

@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optics import zernike
-from optics.aperture import Aperture, Circle, Ellipse, Rectangle
-from optics.surface import Surface
+from optics.geometry import zernike
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.surface import Surface
 
 CURVATURE, CONIC = st.floats(-0.5, 0.5), st.floats(-4.0, 2.0)
 PLACES = np.random.default_rng(1).uniform(-0.5, 0.5, (2, 40))

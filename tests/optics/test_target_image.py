@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.special import erf, j0, j1, struve
 
-from optics import quadrature
-from optics.diffraction import Grid, airy
-from optics.target_image import EdgeProfile, target_image
-from optics.targets import Target, bar_group, pinhole, siemens_star, slanted_edge
-from optics.vector_shape import HalfPlane, Polygon
+from optics.geometry.vector_shape import HalfPlane, Polygon
+from optics.numerics import quadrature
+from optics.targets.target_image import EdgeProfile, target_image
+from optics.targets.target_shapes import Target, bar_group, pinhole, siemens_star, slanted_edge
+from optics.waves.diffraction import Grid, airy
 
 WAVELENGTH, F_NUMBER, PITCH = 650e-9, 9.2, 7e-6
 CUTOFF = 1.0 / (WAVELENGTH * F_NUMBER)

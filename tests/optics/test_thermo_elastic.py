@@ -5,16 +5,15 @@ import pytest
 from scipy.spatial import ConvexHull, cKDTree
 from skfem import CellBasis, ElementHex2, MeshTet1
 
-from optics.aperture import Circle, Rectangle
-from optics.elastic_field import rigid_modes
-from optics.elastic_mesh import mirror_mesh, polyhedron_mesh
-from optics.figure import ZernikeFigure
-from optics.material import material
-from optics.polyhedron import enclosed
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.surface import Surface, plane
-from optics.thermo_elastic import (
+from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import enclosed
+from optics.geometry.surface import Surface, ZernikeFigure, plane
+from optics.geometry.zernike import zernike
+from optics.materials.material import material
+from optics.thermal.deformation import rigid_modes
+from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
+from optics.thermal.thermo_elastic import (
     Bonded,
     Displacement,
     ElasticBody,
@@ -24,7 +23,6 @@ from optics.thermo_elastic import (
     solve,
     solve_many,
 )
-from optics.zernike import zernike
 
 SILICA = material("fused silica")
 A, NU = SILICA.expansion, SILICA.poisson_ratio

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from optics.aperture import Circle, Rectangle
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.surface import Surface, plane
-from optics.trace import BeamMissedError, require_some
+from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.surface import Surface, plane
+from optics.raytrace.trace import BeamMissedError, require_some
 from tests.optics.bench import PASS, REFRACT, Stage, at, beam, build, disk_points, run, unit
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -165,7 +164,7 @@ def test_apertures_stop_what_is_outside(backend) -> None:
 
 
 def test_a_scaled_camera_scales_its_paths(backend) -> None:
-    from optics.tree import Motion
+    from optics.geometry.tree import Motion
 
     surface = Surface(-0.25, -1.0)
     position, direction = beam(disk_points(50, 0.4), -3.0, Z)

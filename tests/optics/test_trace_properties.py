@@ -9,12 +9,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optics.assembly import Assembly
-from optics.element import Element
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.surface import Surface, plane
-from optics.tree import Body, Motion, RigidTree, compose
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.surface import Surface, plane
+from optics.geometry.tree import Body, Motion, RigidTree, compose
+from optics.raytrace.assembly import Assembly, Element
 from tests.optics.bench import PASS, REFLECT, REFRACT, Stage, at, build, disk_points, run
 from tests.optics.test_motion_properties import motions, poses, undone, vectors
 

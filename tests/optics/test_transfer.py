@@ -7,14 +7,16 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from optics import quadrature, transfer, zernike
-from optics.diffraction import Grid, PupilField, image
-from optics.pupil_edge import PupilEdge
-from optics.pupil_function import PupilFunction, circular_pupil, fit_pupils
-from optics.quadrature import PupilNodes
-from optics.transfer import TransferTable, polychromatic_transfer
-from optics.tree import Motion
-from scenes.camera_model import IMAGE
+from optics.geometry import zernike
+from optics.geometry.tree import Motion
+from optics.numerics import quadrature
+from optics.numerics.quadrature import PupilNodes
+from optics.waves import transfer
+from optics.waves.diffraction import Grid, PupilField, image
+from optics.waves.pupil_edge import PupilEdge
+from optics.waves.pupil_function import PupilFunction, circular_pupil, fit_pupils
+from optics.waves.transfer import TransferTable, polychromatic_transfer
+from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
 
 F_NUMBER = 9.2

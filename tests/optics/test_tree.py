@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from optics.pose import Pose
-from optics.rotation import about_axis, rotation_matrix
-from optics.tree import COMPLEX_STEP, Body, Motion, RigidTree, State
+from optics.geometry.pose import Pose, about_axis, rotation_matrix
+from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State
 
 PIVOT = (0.0, 0.2, -0.1)
 

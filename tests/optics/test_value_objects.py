@@ -7,18 +7,16 @@ import pickle
 import numpy as np
 import pytest
 
-from optics.aperture import Circle, Ellipse, Rectangle
-from optics.element import Element, Interaction
-from optics.figure import ZernikeFigure
-from optics.frozen_map import FrozenMap
-from optics.glass import N_BK7, Glass, ThermalDispersion
-from optics.material import Material, material
-from optics.pose import Pose
-from optics.rotation import about_axis
-from optics.solid import Coating, Face, Solid
-from optics.surface import Surface
-from optics.system import Medium
-from optics.tree import Body, Motion
+from optics.geometry.aperture import Circle, Ellipse, Rectangle
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.solid import Coating, Face, Solid
+from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.tree import Body, Motion
+from optics.materials.glass import N_BK7, Glass, ThermalDispersion
+from optics.materials.material import Material, material
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Element, Interaction
+from optics.raytrace.system import Medium
 
 FIGURE = ZernikeFigure(0.5, (0.1, 0.0), {4: 1e-7, 5: 2e-7})
 SURFACE = Surface(-0.15, -1.5, (1e-5, 2e-6), FIGURE)

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from optics import quadrature
-from optics.vector_shape import Disk, HalfPlane, Polygon
+from optics.geometry.vector_shape import Disk, HalfPlane, Polygon
+from optics.numerics import quadrature
 
 RNG = np.random.default_rng(4)
 ARROW = np.array([[3.0, 1.0], [9.0, 0.0], [7.0, 4.0], [10.0, 9.0], [5.0, 6.0], [1.0, 8.0]]) * 1e-5  # not convex

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
-from optics import quadrature, zernike
-from optics.aperture import Circle
-from optics.surface import Surface
-from optics.tree import Motion
-from optics.wavefront import eikonal, fit_wavefront, path_difference
+from optics.geometry import zernike
+from optics.geometry.aperture import Circle
+from optics.geometry.surface import Surface
+from optics.geometry.tree import Motion
+from optics.numerics import quadrature
+from optics.waves.wavefront import eikonal, fit_wavefront, path_difference
 from tests.optics.bench import PASS, Stage, at, build, run
 
 F, RADIUS = 5.0, 0.2

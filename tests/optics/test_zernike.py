@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from optics import quadrature, zernike
+from optics.geometry import zernike
+from optics.numerics import quadrature
 
 # Noll, JOSA 66, 207 (1976), table I: index -> n, m (m < 0: sine)
 NOLL = {

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from optics.aperture import Circle
-from scenes.camera_model import IMAGE, CameraModel
+from optics.geometry.aperture import Circle
+from scenes.models.camera_model import IMAGE, CameraModel
 
 
 def batoid_camera(model: CameraModel, apertures: bool = False) -> Any:

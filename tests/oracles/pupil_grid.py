@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from optics import quadrature
-from optics.backend import Backend
-from optics.diffraction import Grid, PupilField
-from optics.imaging import aim_collimated, imaging_field
-from optics.pupil_function import PupilFunction, fit_pupils
-from optics.quadrature import PupilNodes
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import State
-from scenes.camera_model import CameraModel, field_direction
+from optics.geometry.tree import State
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.waves.diffraction import Grid, PupilField
+from optics.waves.imaging import aim_collimated, imaging_field
+from optics.waves.pupil_function import PupilFunction, fit_pupils
+from scenes.models.camera_model import CameraModel, field_direction
 
 WAVELENGTH = 650e-9
 _FIT = quadrature.disk(16, 64)

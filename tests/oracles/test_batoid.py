@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from optics.rotation import rotation_matrix
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion, State
-from scenes.camera_model import IMAGE, collimated, field_direction
+from optics.geometry.pose import rotation_matrix
+from optics.geometry.tree import Motion, State
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_model import IMAGE, collimated, field_direction
 from tests.oracles.peers import batoid_camera, batoid_rays
 
 batoid = pytest.importorskip("batoid")

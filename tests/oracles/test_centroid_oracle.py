@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.centroid import energy_centroid, gaussian_fit, mean_frames
-from optics.tree import Motion, State
-from scenes.channel import BASE
+from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
+from optics.geometry.tree import Motion, State
+from scenes.specs.channel import BASE
 
 centroids = pytest.importorskip("photutils.centroids", reason="photutils not installed (extra `oracles`)")
 pytestmark = pytest.mark.oracle

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.orbit.earth import Earth
+from twin.orbit.flight.earth import Earth
 
 pytestmark = pytest.mark.oracle
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from twin.orbit.earth import Earth, curvature_radii, east_north_up
-from twin.orbit.ground.frame import GroundFrame
+from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
+from twin.orbit.ground.grid import GroundFrame
 
 pyproj = pytest.importorskip("pyproj", reason="pyproj not installed")
 pytestmark = pytest.mark.oracle

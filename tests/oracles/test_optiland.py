@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from scenes.camera_model import collimated, field_direction
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_model import collimated, field_direction
 from tests.oracles.peers import optiland_camera, optiland_rays
 
 pytest.importorskip("optiland", reason="optiland not installed (extra `oracles`)")

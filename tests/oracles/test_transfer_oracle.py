@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from optics import quadrature, transfer, zernike
-from optics.pupil_function import fit_pupils
-from optics.rotation import rotation_matrix
-from optics.tree import Motion, State
-from scenes.camera_model import IMAGE
+from optics.geometry import zernike
+from optics.geometry.pose import rotation_matrix
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.waves import transfer
+from optics.waves.pupil_function import fit_pupils
+from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
 from tests.oracles.peers import batoid_camera, batoid_rays
 

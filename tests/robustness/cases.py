@@ -17,33 +17,33 @@ from unittest.mock import patch
 import typer
 from rich.console import Console
 
-from scenes.load import LIBRARY, load_error_budget, load_principle_experiment
-from twin.cli import explained
+from scenes.specs.load import SCENES, load_error_budget, load_principle_experiment
 from twin.design import app as design
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
 from twin.render import app as render
+from twin.run.cli import explained
 from twin.study.__main__ import app as study
 
 CUTS = (
-    "twin.render_job.trace_truth",
-    "twin.laboratory.focus_result.align",
+    "twin.main_job.render_job.trace_truth",
+    "twin.laboratory.focus_report.align",
     "twin.laboratory.distortion_bench.DistortionBench.record",
-    "twin.laboratory.turntable.choose",
-    "twin.orbit.angle.procedure.estimated",
+    "twin.laboratory.turntable_run.choose",
+    "twin.orbit.angle.angle_run.estimated",
     "twin.orbit.calibration.campaign._drawn",
-    "twin.orbit.calibration.images.Imager.measured",
-    "twin.orbit.monitoring.flight._changes",
-    "twin.orbit.images.flight.fly_patch",
-    "twin.study.command.local_workers",
-    "twin.study.gradient._Traced",
-    "twin.study.gradient._whole",
+    "twin.orbit.calibration.field_images.Imager.measured",
+    "twin.orbit.monitoring.monitoring_flight._changes",
+    "twin.orbit.images.simulate_run.fly_patch",
+    "twin.study.study_command.local_workers",
+    "twin.study.gradient.study_gradient._Traced",
+    "twin.study.gradient.study_gradient._whole",
     "twin.design.optimise",
 )
 """Functions that begin the long computations."""
 SOONER = (
-    "scenes.thermal_model.ThermalModel._solid_response",
-    "optics.transfer._correlate",
+    "scenes.models.thermal_model.ThermalModel._solid_response",
+    "optics.waves.transfer._correlate",
 )
 """Parts of building that take seconds, finite elements and transfer functions: most mutants stop before them."""
 
@@ -107,7 +107,7 @@ class Case:
 
 
 def _text(name: str) -> str:
-    return (LIBRARY / name).read_text("utf-8")
+    return (SCENES / name).read_text("utf-8")
 
 
 def _with(text: str, *changes: tuple[str, str]) -> str:
@@ -125,7 +125,7 @@ def _of_one(name: str, app: typer.Typer, words: str, file: str, **more: object) 
 
 def _config(name: str, app: typer.Typer, words: str, resolve: Callable, file: str, **more: object) -> Case:
     """A case with the config.yaml of a run."""
-    text = resolve(LIBRARY / file).to_yaml()
+    text = resolve(SCENES / file).to_yaml()
     return Case(name, app, tuple(words.split()), {"config.yaml": text}, "config.yaml", **more)  # type: ignore[arg-type]
 
 
@@ -135,7 +135,7 @@ def cases() -> dict[str, Case]:
 
 
 def _renders() -> Iterator[Case]:
-    from scenes.resolved import resolve
+    from scenes.specs.resolved import resolve
 
     quick = ("--frames", "1")
     for stem in ("perturb", "aligned", "steady", "image_quality", "targets"):
@@ -146,15 +146,15 @@ def _renders() -> Iterator[Case]:
     own = {
         "job.yaml": _with(_text("examples/targets.yaml"), ("instrument: gf7_pair", "instrument: ./pair.yaml")),
         "pair.yaml": _with(
-            _text("instruments/gf7_pair.yaml"),
+            _text("library/instruments/gf7_pair.yaml"),
             ("{camera: gf7, look: 26", "{camera: ./gf7.yaml, look: 26"),
             ("{camera: gf7, look: -5", "{camera: conic.yaml, look: -5"),
             ("monitor_ccd", "sub/ccd.yaml"),
         ),
-        "gf7.yaml": _with(_text("cameras/gf7.yaml"), ("detector: gf7_pan", "detector: ./pan.yaml")),
-        "conic.yaml": _text("cameras/gf7_conic.yaml"),
-        "sub/ccd.yaml": _text("detectors/monitor_ccd.yaml"),
-        "pan.yaml": _text("detectors/gf7_pan.yaml"),
+        "gf7.yaml": _with(_text("library/cameras/gf7.yaml"), ("detector: gf7_pan", "detector: ./pan.yaml")),
+        "conic.yaml": _text("library/cameras/gf7_conic.yaml"),
+        "sub/ccd.yaml": _text("library/detectors/monitor_ccd.yaml"),
+        "pan.yaml": _text("library/detectors/gf7_pan.yaml"),
     }
     for target in own:
         stem = Path(target).stem
@@ -163,7 +163,7 @@ def _renders() -> Iterator[Case]:
 
 
 def _labs() -> Iterator[Case]:
-    from scenes.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
+    from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
 
     resolvers = {"focus": resolve_focus, "distortion": resolve_distortion, "turntable": resolve_turntable}
     for stem, resolve in resolvers.items():
@@ -176,14 +176,14 @@ def _labs() -> Iterator[Case]:
             ("turntable: turntable", "turntable: ./table.yaml"),
         ),
         "table.yaml": _text("lab/turntable.yaml"),
-        "gf7.yaml": _text("cameras/gf7.yaml"),
+        "gf7.yaml": _text("library/cameras/gf7.yaml"),
     }
     for target in ("table.yaml", "gf7.yaml"):
         yield Case(f"lab-distortion-own-{Path(target).stem}", lab, ("distortion",), own, target)
 
 
 def _orbits() -> Iterator[Case]:
-    from scenes.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+    from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
 
     for stem in ("angle", "angle_gf7", "angle_off_axis"):
         yield _of_one(f"orbit-{stem}", orbit, "angle", f"orbit/{stem}.yaml")
@@ -199,8 +199,8 @@ def _orbits() -> Iterator[Case]:
     }
     for stem, resolve in configs.items():
         yield _config(f"orbit-{stem}-config", orbit, stem, resolve, f"orbit/{stem}.yaml", weight=0.5)
-    payload = _with(_text("payloads/th1.yaml"), ("detector: th1_line", "detector: ./line.yaml"))
-    own = {"th1.yaml": payload, "line.yaml": _text("detectors/th1_line.yaml")}
+    payload = _with(_text("library/payloads/th1.yaml"), ("detector: th1_line", "detector: ./line.yaml"))
+    own = {"th1.yaml": payload, "line.yaml": _text("library/detectors/th1_line.yaml")}
     for command in ("angle", "simulate"):
         test = {"test.yaml": _with(_text(f"orbit/{command}.yaml"), ("camera: th1", "camera: ./th1.yaml"))}
         for target in own if command == "simulate" else ("th1.yaml",):
@@ -208,7 +208,7 @@ def _orbits() -> Iterator[Case]:
 
 
 def _studies() -> Iterator[Case]:
-    from twin.study.setup import resolve_study
+    from twin.study.runs.setup import resolve_study
 
     workers = ("--workers", "1")
     for stem in ("smoke", "alignment", "aperture", "interval", "prism_heat"):
@@ -238,11 +238,11 @@ def _rest() -> Iterator[Case]:
     yield _of_one("design", design, "", file)
     own = {
         "design.yaml": _with(_text(file), ("camera: gf7\n", "camera: ./gf7.yaml\n")),
-        "gf7.yaml": _text("cameras/gf7.yaml"),
+        "gf7.yaml": _text("library/cameras/gf7.yaml"),
     }
     yield Case("design-own-camera", design, (), own, "gf7.yaml")
     yield _of_one("principle", bench, "principle", "lab/principle_experiment.yaml")
-    yield _of_one("budget", bench, "budget", "budgets/monitor_pair.yaml")
+    yield _of_one("budget", bench, "budget", "library/budgets/monitor_pair.yaml")
 
 
 __all__ = ["Case", "Reached", "cases", "cut"]

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from scenes.errors import InputError
+from scenes.yaml.errors import InputError
 from tests.robustness.mutate_tree import TREES, YAMLS, paths
 from tests.robustness.nasty import NUMBERS, TEXTS, UNITS
 

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from scenes.yaml_file import dump_yaml, parse_yaml
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.robustness.nasty import PATHS, TEXTS, VALUES
 
 
@@ -219,7 +219,7 @@ def tag(text: str, chance: random.Random) -> str:
         *(
             "!!python/object/apply:os.system ",
             "!!python/name:os.system ",
-            "!!python/object:scenes.job.JobSpec ",
+            "!!python/object:scenes.specs.job.JobSpec ",
             "!x ",
             "! ",
         ),

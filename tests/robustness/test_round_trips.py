@@ -5,20 +5,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scenes.errors import InputError
-from scenes.lab_setup import resolve_focus
-from scenes.load import load_three_line_camera
-from scenes.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor
-from scenes.resolved import resolve
-from scenes.units import ANGLE, LENGTH, PER_LENGTH3, SCALE, format_quantity, parse_quantity
-from scenes.yaml_file import dump_yaml, parse_yaml
+from scenes.specs.lab_setup import resolve_focus
+from scenes.specs.load import load_three_line_camera
+from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.units import ANGLE, LENGTH, PER_LENGTH3, SCALE, format_quantity, parse_quantity
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.robustness.cases import cases
 from tests.robustness.fuzz import mutant, write_files
 from tests.twin.orbit_bench import CirclePlatform
-from twin.orbit.earth import Earth
-from twin.orbit.light_effects import LightEffects
-from twin.orbit.line_camera import line_cameras
-from twin.orbit.sensor import Sensor
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.sensor import Sensor
 
 TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=20)
 SCALARS = st.none() | st.booleans() | st.integers(-(10**29), 10**29) | st.floats(allow_nan=False) | TEXT

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from optics.solid import solid_mesh
-from scenes.errors import InputError
-from scenes.load import CAMERAS, INSTRUMENTS, LIBRARY
-from scenes.resolved import resolve
-from scenes.yaml_file import dump_yaml, parse_yaml
-from twin.experiment import MonitorExperiment
-from twin.render_job import STAGES, render_job
+from optics.geometry.solid import solid_mesh
+from scenes.specs.load import CAMERAS, INSTRUMENTS, LIBRARY
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from twin.main_job.render_job import STAGES, render_job
+from twin.monitor.monitor_experiment import MonitorExperiment
 
 Key = tuple[str | int, ...]
 
@@ -257,9 +257,9 @@ def test_a_monitor_that_misses_says_by_how_much(tmp_path, backend, monkeypatch) 
     """Facets that are not turned to their beams: which spot, how far off in pixels and mm, in which file.
     The job is not to blame, it perturbs nothing.
     """
-    import scenes.instrument_model
+    import scenes.models.instrument_builder
 
-    monkeypatch.setattr(scenes.instrument_model, "square_facets", lambda assembly, *_: assembly)
+    monkeypatch.setattr(scenes.models.instrument_builder, "square_facets", lambda assembly, *_: assembly)
     camera, instrument = trees("gf7_pair")
     instrument["monitor"]["prism_180"]["angle_errors"] = {"roof_a": ["30 arcsec", "0 arcsec"]}
     with pytest.raises(InputError) as caught:

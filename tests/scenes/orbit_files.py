@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
+from scenes.yaml.errors import InputError
 
 
 def write(folder: Path, text: str) -> Path:

@@ -9,13 +9,13 @@ from scipy.spatial import ConvexHull, Delaunay
 from typer.testing import CliRunner
 
 import twin.render as command
-from optics.rotation import rotation_matrix
-from scenes import obstruction
-from scenes.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, separation
-from scenes.errors import InputError
-from scenes.instrument_builder import build_instrument
-from scenes.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
-from scenes.obstruction import RAYS, find_obstructions
+from optics.geometry.pose import rotation_matrix
+from scenes.models import obstruction
+from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, separation
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.obstruction import RAYS, find_obstructions
+from scenes.specs.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
+from scenes.yaml.errors import InputError
 
 PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
 PAIR = re.sub(r", tilt: \[[^]]*\]", "", PAIR)  # prisms square to the beam, for round numbers
@@ -88,9 +88,9 @@ def test_reference_instruments_have_room(name, instrument) -> None:
 @pytest.fixture
 def bare(backend, monkeypatch):
     """Function: changes of gf7_pair -> instrument, without the check that would refuse it."""
-    import scenes.instrument_model
+    import scenes.models.instrument_builder
 
-    monkeypatch.setattr(scenes.instrument_builder, "check_clearance", lambda instrument: None, raising=False)
+    monkeypatch.setattr(scenes.models.instrument_builder, "check_clearance", lambda instrument: None, raising=False)
     return lambda folder, *changes: built(changed(folder, *changes), backend)
 
 

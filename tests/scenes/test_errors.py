@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from scenes.errors import InputError, Issue, key_text, nearest, shown
+from scenes.yaml.errors import InputError, Issue, key_text, nearest, shown
 
 
 def test_message() -> None:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.job import NodeInfo, check_nodes, noll
-from scenes.load import EXAMPLES, load_job
+from scenes.specs.job import NodeInfo, check_nodes, noll
+from scenes.specs.load import EXAMPLES, load_job
+from scenes.yaml.errors import InputError
 
 ARCSEC = 4.84813681109536e-06
 NODES = {

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.camera_under_test import build_camera_under_test
-from scenes.errors import InputError
-from scenes.focus_test import FocusTestSpec
-from scenes.lab_setup import resolve_focus
-from scenes.load import LAB, LIBRARY, library_names
-from scenes.translate import validate
-from scenes.yaml_file import dump_yaml, parse_yaml
+from scenes.models.camera_assembly import build_camera_under_test
+from scenes.specs.focus_test import FocusTestSpec
+from scenes.specs.lab_setup import resolve_focus
+from scenes.specs.load import LAB, SCENES, library_names
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 
-FILE = LIBRARY / LAB / "focus.yaml"
+FILE = SCENES / LAB / "focus.yaml"
 
 
 def changed(folder: Path, old: str, new: str) -> tuple[Path, int]:

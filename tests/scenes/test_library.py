@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.load import (
+from scenes.specs.load import (
     CAMERAS,
     DETECTORS,
     EXAMPLES,
@@ -20,10 +19,11 @@ from scenes.load import (
     load_instrument,
     load_job,
 )
-from scenes.resolved import resolve
-from scenes.spec import Spec
-from scenes.translate import validate
-from scenes.yaml_file import dump_yaml, parse_yaml
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import Spec
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 
 CAMERA_NAMES = ("gf7", "gf7_conic", "monitor")
 # Radius, conic constant, vertex; metres.

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.load import LIBRARY, ORBIT, PAYLOADS, load_camera, load_instrument, load_three_line_camera
-from scenes.orbit_setup import AngleSetup, resolve_angle
 from scenes.schema import json_schema
-from scenes.yaml_file import dump_yaml, parse_yaml
+from scenes.specs.load import LIBRARY, ORBIT, PAYLOADS, SCENES, load_camera, load_instrument, load_three_line_camera
+from scenes.specs.orbit_setup import AngleSetup, resolve_angle
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.scenes.orbit_files import assert_told, write
 
-EXAMPLE = LIBRARY / ORBIT / "angle.yaml"
+EXAMPLE = SCENES / ORBIT / "angle.yaml"
 SMALL = """
 name: small
 camera: th1
@@ -144,14 +144,14 @@ def _with_lines(*names: str) -> dict:
 
 def test_usual_angles_are_filled_in() -> None:
     assert dict(resolve_angle(EXAMPLE).angles) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
-    setup = resolve_angle(LIBRARY / ORBIT / "angle_off_axis.yaml")
+    setup = resolve_angle(SCENES / ORBIT / "angle_off_axis.yaml")
     assert setup.angles["multispectral"] == ("multispectral", "nadir")
     assert (setup.pixels["high_resolution"], setup.pixels["multispectral"], setup.usual_pixels) == (30000, 6000, 12000)
 
 
 def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     """By name or path; and the config.yaml holds it whole."""
-    setup = resolve_angle(LIBRARY / ORBIT / "angle_gf7.yaml")
+    setup = resolve_angle(SCENES / ORBIT / "angle_gf7.yaml")
     assert setup.camera is None
     assert setup.instrument == load_instrument("gf7_pair")
     assert dict(setup.cameras) == {"gf7": load_camera("gf7")}
@@ -168,7 +168,7 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
 
 
 def test_a_config_without_its_camera(tmp_path: Path) -> None:
-    text = resolve_angle(LIBRARY / ORBIT / "angle_gf7.yaml").to_yaml()
+    text = resolve_angle(SCENES / ORBIT / "angle_gf7.yaml").to_yaml()
     for old, new, words in (
         ("\ninstrument:\n", "\ncamera:\n", "camera"),
         ("cameras:\n  gf7:", "cameras:\n  gf8:", "camera 'gf7' of the instrument's forward is missing"),

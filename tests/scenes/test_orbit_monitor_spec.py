@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.load import LIBRARY, ORBIT, load_instrument
-from scenes.orbit_monitor import MotionSpec
-from scenes.orbit_setup import MonitorSetup, resolve_monitor
 from scenes.schema import json_schema
+from scenes.specs.load import LIBRARY, ORBIT, SCENES, load_instrument
+from scenes.specs.orbit_monitor import MotionSpec
+from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
+from scenes.yaml.errors import InputError
 from tests.scenes.orbit_files import assert_told, write
 
-EXAMPLE = LIBRARY / ORBIT / "monitor.yaml"
+EXAMPLE = SCENES / ORBIT / "monitor.yaml"
 SMALL = """
 name: small
 instrument: gf7_pair

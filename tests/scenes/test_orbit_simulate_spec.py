@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.load import DETECTORS, LIBRARY, ORBIT, PAYLOADS, load_three_line_camera
-from scenes.orbit_setup import SimulateSetup, resolve_simulate
 from scenes.schema import json_schema
+from scenes.specs.load import DETECTORS, LIBRARY, ORBIT, PAYLOADS, SCENES, load_three_line_camera
+from scenes.specs.orbit_setup import SimulateSetup, resolve_simulate
+from scenes.yaml.errors import InputError
 from tests.scenes.orbit_files import assert_told, write
 
-EXAMPLE = LIBRARY / ORBIT / "simulate.yaml"
+EXAMPLE = SCENES / ORBIT / "simulate.yaml"
 SMALL = """
 name: small
 camera: th1

@@ -5,12 +5,11 @@ import math
 import pytest
 from pydantic import TypeAdapter
 
-from scenes.errors import InputError, Problem
-from scenes.orbit_spec import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
-from scenes.spec import Spec
-from scenes.translate import validate
-from scenes.utc_time import UtcTime, parse_utc
-from scenes.yaml_file import dump_yaml, parse_yaml
+from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, UtcTime, parse_utc
+from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.spec import Spec
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 
 PASSING = """
 epoch: 2011-03-05T03:05:00Z

@@ -8,15 +8,13 @@ angles by n.
 import numpy as np
 import pytest
 
-from optics.assembly import Assembly
-from optics.element import Interaction
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.solid import Coating, solid_mesh
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Body, Motion, RigidTree
-from scenes.prism_model import EDGE, prism_0, prism_180, roof_offset
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Coating, solid_mesh
+from optics.geometry.tree import Body, Motion, RigidTree
+from optics.raytrace.assembly import Assembly, Interaction
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.prism_model import EDGE, prism_0, prism_180, roof_offset
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 
 N = 1.4565

@@ -5,19 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.aperture import Circle, Ellipse, Rectangle
-from optics.assembly import Assembly
-from optics.element import Element, Interaction
-from optics.finish import BLACK, Finish
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.solid import Coating, Face, Solid
-from optics.surface import Surface, plane
-from optics.tree import Body, Motion, RigidTree
-from scenes.baffle import box, ring, tube
-from scenes.scene_mesh import sheet_mesh
-from scenes.scene_surface import Detector, Finishes, SceneSurface, mirror_surface, plate_surfaces, solid_surfaces
-from scenes.scenery import Scenery, build_scenery, focal_plane_housing
+from optics.geometry.aperture import Circle, Ellipse, Rectangle
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Coating, Face, Solid
+from optics.geometry.surface import Surface, plane
+from optics.geometry.tree import Body, Motion, RigidTree
+from optics.materials.finish import BLACK, Finish
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from scenes.models.meshes import sheet_mesh
+from scenes.models.scene_surface import Detector, Finishes, SceneSurface, mirror_surface, plate_surfaces, solid_surfaces
+from scenes.models.scenery import Scenery, build_scenery, focal_plane_housing
+from scenes.specs.baffle import box, ring, tube
 
 STATE = {
     "base/forward": Motion(scale=3e-5, rotate=(1e-4, 2e-4, -1e-4)),

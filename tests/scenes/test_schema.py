@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from scenes.quantity import PATTERN
 from scenes.schema import MODELS, json_schema, main, write_schemas
+from scenes.yaml.quantity import PATTERN
 
 ROOT = Path(__file__).resolve().parents[2]
 

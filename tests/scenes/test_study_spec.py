@@ -4,12 +4,12 @@ import re
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.load import EXAMPLES
-from scenes.study import StudySpec, unit_of
-from scenes.translate import validate
-from scenes.units import split_quantity, unit_ratio
-from scenes.yaml_file import dump_yaml, parse_yaml, read_yaml
+from scenes.specs.load import EXAMPLES
+from scenes.specs.study import StudySpec, unit_of
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.units import split_quantity, unit_ratio
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml, read_yaml
 
 TEXT = """name: study
 base: {command: render, file: perturb}

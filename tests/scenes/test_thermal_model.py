@@ -6,24 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.glass import glass
-from optics.heat import Temperature, carried_motion
-from optics.material import material
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.system import assemble
-from optics.thermo_elastic import face_change, free_linear_field
-from optics.trace import make_rays, trace
-from optics.tree import Motion, compose
-from scenes.errors import InputError
-from scenes.instrument import MaterialsSpec
-from scenes.instrument_builder import build_instrument
-from scenes.instrument_model import Instrument
-from scenes.job import check_nodes
-from scenes.load import load_camera, load_instrument, load_job
-from scenes.resolved import resolve, resolve_job
-from scenes.thermal_model import TERMS, TemperatureError, ThermalModel
-from twin.experiment import MonitorExperiment
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.tree import Motion, compose
+from optics.materials.glass import glass
+from optics.materials.material import material
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.thermal.heat import Temperature, carried_motion
+from optics.thermal.thermo_elastic import face_change, free_linear_field
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import TERMS, TemperatureError, ThermalModel
+from scenes.specs.instrument import MaterialsSpec
+from scenes.specs.job import check_nodes
+from scenes.specs.load import load_camera, load_instrument, load_job
+from scenes.specs.resolved import resolve, resolve_job
+from scenes.yaml.errors import InputError
+from twin.monitor.monitor_experiment import MonitorExperiment
 
 SILICA = material("fused silica")
 WAVELENGTH = 650e-9

@@ -6,14 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.backend import Backend
-from optics.tree import Motion
-from scenes.errors import InputError
-from scenes.load import LAB, LIBRARY, library_names, load_principle_experiment
-from scenes.spec import Spec
-from scenes.translate import validate
-from scenes.turntable import PrincipleExperimentSpec
-from scenes.turntable_model import (
+from optics.geometry.tree import Motion
+from optics.numerics.backend import Backend
+from scenes.models.principle_model import (
     UNITS,
     autocollimator_body,
     axis_body,
@@ -23,10 +18,15 @@ from scenes.turntable_model import (
     paraxial_focus,
     pinhole_body,
 )
-from scenes.yaml_file import dump_yaml, parse_yaml
-from twin.autocollimator import AutocollimatorPath
+from scenes.specs.load import LAB, SCENES, library_names, load_principle_experiment
+from scenes.specs.principle_experiment import PrincipleExperimentSpec
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import Spec
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from twin.validation.paper_001.principle_images import AutocollimatorPath
 
-FILE = LIBRARY / LAB / "principle_experiment.yaml"
+FILE = SCENES / LAB / "principle_experiment.yaml"
 SPEC = load_principle_experiment().spec
 ANGLES = [math.radians(15), math.radians(30)]
 

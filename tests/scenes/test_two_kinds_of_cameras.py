@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from optics.frozen_map import FrozenMap
-from scenes.camera import CameraSpec
-from scenes.errors import InputError
-from scenes.instrument_builder import build_instrument
-from scenes.instrument_model import Instrument
-from scenes.load import load_camera, load_instrument
-from twin.truth import trace_sight
+from optics.numerics.frozen_map import FrozenMap
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.specs.camera import CameraSpec
+from scenes.specs.load import load_camera, load_instrument
+from scenes.yaml.errors import InputError
+from twin.monitor.truth import trace_sight
 
 GF7 = load_camera("gf7")
 

@@ -5,8 +5,8 @@ import random
 
 import pytest
 
-from scenes.errors import Problem
-from scenes.units import (
+from scenes.yaml.errors import Problem
+from scenes.yaml.units import (
     ANGLE,
     DISTANCE,
     KINDS,

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from scenes.errors import InputError
-from scenes.yaml_file import LARGEST_BYTES, dump_yaml, parse_yaml, read_yaml
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import LARGEST_BYTES, dump_yaml, parse_yaml, read_yaml
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from optics.aperture import Circle
-from optics.assembly import Assembly
-from optics.element import Element, Interaction
-from optics.finish import ABSORBER, BARE, Finish
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.solid import Coating, Face, Solid
-from optics.surface import plane
-from optics.system import assemble
-from optics.tree import Body, RigidTree
-from scenes.camera_model import LINE_AXIS, collimated, field_direction
-from scenes.scene_surface import Detector, Finishes, SceneSurface, detector_surface, mirror_surface, solid_surfaces
-from scenes.scenery import Scenery
+from optics.geometry.aperture import Circle
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Coating, Face, Solid
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, RigidTree
+from optics.materials.finish import ABSORBER, BARE, Finish
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.system import assemble
+from scenes.models.camera_model import LINE_AXIS, collimated, field_direction
+from scenes.models.scene_surface import (
+    Detector,
+    Finishes,
+    SceneSurface,
+    detector_surface,
+    mirror_surface,
+    solid_surfaces,
+)
+from scenes.models.scenery import Scenery
 
 PERFECT = Finish(records=True)
 """A detector that records all of its light."""

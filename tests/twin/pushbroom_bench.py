@@ -6,17 +6,15 @@ from functools import cache
 
 import numpy as np
 
-from scenes.load import load_detector, load_three_line_camera
-from scenes.orbit_spec import OrbitSpec
-from twin.orbit.attitude import Attitude
-from twin.orbit.earth import Earth
-from twin.orbit.images.camera_optics import optics_of
-from twin.orbit.images.line_optics import LineOptics
+from scenes.specs.load import load_detector, load_three_line_camera
+from scenes.specs.orbit_spec import OrbitSpec
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import ImagedLine, imaged_lines
-from twin.orbit.line_camera import line_cameras
-from twin.orbit.orbit import propagate
-from twin.orbit.sensor import Sensor
-from twin.orbit.trajectory import Trajectory
 
 LINES = ("forward", "nadir", "aft")
 LINE_TIME = 0.7e-3

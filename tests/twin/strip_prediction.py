@@ -10,11 +10,11 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
-from optics.frozen_map import FrozenMap
+from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.schemes import GAUGE
 from twin.orbit.calibration.strip import with_points
-from twin.orbit.earth import east_north_up
+from twin.orbit.flight.earth import east_north_up
 
 
 @dataclass(frozen=True, eq=False)

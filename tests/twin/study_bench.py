@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 
-from scenes.load import INSTRUMENTS, LIBRARY
+from scenes.specs.load import INSTRUMENTS, LIBRARY
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDY = """name: study

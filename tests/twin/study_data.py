@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from scenes.study import StudySpec
-from scenes.translate import validate
-from scenes.yaml_file import parse_yaml
-from twin.study.sampling import draw
+from scenes.specs.study import StudySpec
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import parse_yaml
+from twin.study.runs.sampling import draw
 
 
 def study_of(factors: str, design: str, responses: str = "{y: {key: [a, b_um]}}", report: str = "{}") -> StudySpec:

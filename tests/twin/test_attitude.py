@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from optics.rotation import rotation_vector
-from scenes.orbit_spec import AttitudeSpec, ErrorsSpec, OrbitSpec
-from twin.orbit.attitude import Attitude
-from twin.orbit.earth import Earth
-from twin.orbit.earth_rotation import RATE
-from twin.orbit.measurement_errors import TERMS
-from twin.orbit.orbit import propagate
-from twin.orbit.trajectory import Trajectory
+from optics.geometry.pose import rotation_vector
+from scenes.specs.orbit_spec import AttitudeSpec, ErrorsSpec, OrbitSpec
+from twin.orbit.flight.earth import RATE, Earth
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
 
 EARTH = Earth()
 FALSE_ALARM = 1e-6

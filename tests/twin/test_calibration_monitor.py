@@ -11,16 +11,13 @@ import pytest
 
 import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
-from optics.frozen_map import FrozenMap
-from scenes.load import LIBRARY, ORBIT
-from scenes.orbit_angle import LINES
-from scenes.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.orbit_spec import ThermalDriftSpec
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import invoke, refused
-from twin.orbit.calibration.campaign import fly_fields, line_model
-from twin.orbit.calibration.drift import drifted_payload
-from twin.orbit.calibration.influences import simultaneous
-from twin.orbit.calibration.monitor import (
+from twin.orbit.calibration.camera_drift import (
     PooledErrors,
     all_told,
     flown,
@@ -29,10 +26,12 @@ from twin.orbit.calibration.monitor import (
     with_monitor,
     without_monitor,
 )
+from twin.orbit.calibration.campaign import drifted_payload, fly_fields, line_model
+from twin.orbit.calibration.influences import simultaneous
 from twin.orbit.calibration.schemes import tested as at_checks
 
 run = partial(invoke, command.app)
-EXAMPLE = LIBRARY / ORBIT / "calibrate_monitor.yaml"
+EXAMPLE = SCENES / ORBIT / "calibrate_monitor.yaml"
 WHOLE = resolve_calibration(EXAMPLE)
 KEPT = ("Beijing", "Anhui", "Xinjiang")
 SEED = np.random.SeedSequence(3)

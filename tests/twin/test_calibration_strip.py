@@ -10,11 +10,11 @@ from scipy.linalg import eigh
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
-from optics.frozen_map import FrozenMap
-from scenes.load import LIBRARY, ORBIT
-from scenes.orbit_angle import EffectsSpec
-from scenes.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.orbit_spec import ThermalDriftSpec
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.orbit_angle import EffectsSpec
+from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import invoke, refused
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.campaign import fly_fields
@@ -24,7 +24,7 @@ from twin.orbit.calibration.strip import adjusted_strip, calibrated_with_ties, f
 from twin.orbit.calibration.strip import tested_in_strip as in_strip
 
 run = partial(invoke, command.app)
-EXAMPLE = LIBRARY / ORBIT / "calibrate_strip.yaml"
+EXAMPLE = SCENES / ORBIT / "calibrate_strip.yaml"
 WHOLE = resolve_calibration(EXAMPLE)
 ARCSEC = np.pi / 648000
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.twin.study_bench import write_study
-from twin.study.block_result import BlockResult
-from twin.study.chunk_store import ChunkStore
-from twin.study.plan import Plan
-from twin.study.setup import resolve_study
+from twin.study.runs.block_result import BlockResult
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
 
 BLOCKS = 4
 

@@ -3,24 +3,24 @@
 import numpy as np
 import pytest
 
-from analysis import monitoring
-from analysis.monitoring import MonitorGeometry
-from optics import zernike
-from optics.assembly import points_to_world
-from optics.diffraction import Grid, PupilField, image
-from optics.heat import Temperature
-from optics.rotation import rotation_matrix, rotation_vector
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Body, Motion, RigidTree
-from optics.wavefront import path_difference
-from scenes.camera_model import collimated, field_direction
-from scenes.thermal_model import ThermalModel
-from twin.monitor import MonitorPath
-from twin.monitor_derivative import spot_jacobian
-from twin.motions import ElementaryMotion, line_family
-from twin.orbit.line_camera import traced_line_cameras
-from twin.truth import trace_sight, trace_truth, truth_jacobian
+from analysis.monitor import monitoring
+from analysis.monitor.monitoring import MonitorGeometry
+from optics.geometry import zernike
+from optics.geometry.pose import rotation_matrix, rotation_vector
+from optics.geometry.tree import Body, Motion, RigidTree
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.thermal.heat import Temperature
+from optics.waves.diffraction import Grid, PupilField, image
+from optics.waves.wavefront import path_difference
+from scenes.models.camera_model import collimated, field_direction
+from scenes.models.thermal_model import ThermalModel
+from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_path import MonitorPath
+from twin.monitor.motions import ElementaryMotion, line_family
+from twin.monitor.truth import trace_sight, trace_truth, truth_jacobian
+from twin.orbit.flight.line_camera import traced_line_cameras
 
 CAMERA = "forward"
 PLANE = f"base/{CAMERA}/focal_plane"

@@ -15,16 +15,16 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import twin.render as command
-from optics.heat import Temperature
-from scenes.course import CourseSpec, moment
-from scenes.errors import InputError
-from scenes.job import check_nodes
-from scenes.load import EXAMPLES, load_job
-from scenes.resolved import resolve
-from twin.course import course_states, run_course
-from twin.experiment import MonitorExperiment
-from twin.results import stated
-from twin.truth import trace_truth
+from optics.thermal.heat import Temperature
+from scenes.specs.course import CourseSpec, moment
+from scenes.specs.job import check_nodes
+from scenes.specs.load import EXAMPLES, load_job
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from twin.main_job.render_results import stated
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.time_series import course_states, run_course
+from twin.monitor.truth import trace_truth
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = "base/forward/monitor/left/prism_180"
@@ -163,7 +163,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
     resolved, experiment = resolve(folder / "config.yaml"), prepared
     states = course_states(experiment, resolved.job)
     done: list[int] = []
-    monkeypatch.setattr("twin.course.CHUNK", 2)
+    monkeypatch.setattr("twin.monitor.time_series.CHUNK", 2)
     pieces = run_course(experiment, resolved, states, done.append)
     assert done == [0, 2, 3]
     whole = json.loads((folder / "course.json").read_text())
@@ -171,7 +171,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
         for which, values in camera.items():
             for key, numbers in values.items():
                 np.testing.assert_allclose(numbers, whole["cameras"][name][which][key], rtol=1e-6, atol=1e-8)
-    monkeypatch.setattr("twin.course.LARGEST_SERIES", 50_000)
+    monkeypatch.setattr("twin.monitor.time_series.LARGEST_SERIES", 50_000)
     with pytest.raises(InputError, match="do not fit into memory; found '3 times', allowed: at most 1 "):
         run_course(experiment, resolved, states)
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from analysis.monitoring import PARAMETERS, PER_SI
-from analysis.recovery import measure_spots
+from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
-from twin.crosstalk import crosstalk
-from twin.truth import trace_truth
+from twin.monitor.crosstalk import crosstalk
+from twin.monitor.truth import trace_truth
 
 PIXEL_NOISE = (1e-3) ** 2 * np.eye(4)  # px^2, weighs the four coordinates alike
 

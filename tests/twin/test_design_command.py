@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from scenes.camera import CameraSpec
-from scenes.camera_design import resolve_design
-from scenes.errors import InputError
-from scenes.load import EXAMPLES, load_camera
-from scenes.translate import validate
-from scenes.yaml_file import read_yaml
+from scenes.models.camera_design import resolve_design
+from scenes.specs.camera import CameraSpec
+from scenes.specs.load import EXAMPLES, load_camera
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import read_yaml
 from twin.design import app
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"

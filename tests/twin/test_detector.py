@@ -10,14 +10,14 @@ import pytest
 import yaml
 from scipy import stats
 
-from scenes.band import BandSpec
-from scenes.detector import DetectorSpec
-from scenes.errors import InputError
-from scenes.load import LIBRARY
+from scenes.specs.band import BandSpec
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.load import LIBRARY
+from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
-from twin.detector import EmvaDetector, FixedPattern
-from twin.line_ccd import LineCcd
 from twin.render import app
+from twin.sensors.area_detector import EmvaDetector, FixedPattern
+from twin.sensors.line_ccd import LineCcd
 
 FALSE_ALARM = 1e-6
 SHEET = {

@@ -7,22 +7,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.centroid import energy_centroid
 from analysis.orientation.measurement import locate_spots
+from analysis.spots.centroid import energy_centroid
 from analysis.units import ARCSEC
-from optics.backend import load_backend
-from optics.diffraction import Grid
-from optics.target_image import target_image
-from optics.targets import pinhole
-from optics.transfer import TransferTable
-from scenes.lab_setup import resolve_distortion
+from optics.numerics.backend import load_backend
+from optics.targets.target_image import target_image
+from optics.targets.target_shapes import pinhole
+from optics.waves.diffraction import Grid
+from optics.waves.transfer import TransferTable
+from scenes.specs.lab_setup import resolve_distortion
 from twin.laboratory import printed_004
-from twin.laboratory.distortion import DistortionRun, measure
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.distortion_json import to_dict
-from twin.laboratory.distortion_sections import lab_result
-from twin.laboratory.dividing_error import TurntableModel
-from twin.trial.bench_error import BenchError
+from twin.laboratory.distortion_report import lab_result, to_dict
+from twin.laboratory.distortion_run import DistortionRun, measure
+from twin.laboratory.turntable_bench import TurntableModel
+from twin.run.result import BenchError
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from optics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
+from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,11 +62,11 @@ def test_a_child_without_an_answer() -> None:
 
 def test_an_error_in_the_child_is_passed_on() -> None:
     with pytest.raises(RuntimeError, match="no_such_variant"):
-        doctor.run_probe(["-m", "twin.probe", "render", "no_such_variant"])
+        doctor.run_probe(["-m", "twin.run.probe", "render", "no_such_variant"])
 
 
 def test_the_variant_is_the_one_asked_for() -> None:
-    assert doctor.run_probe(["-m", "twin.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
+    assert doctor.run_probe(["-m", "twin.run.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
 
 
 def test_every_dependency_is_pinned() -> None:

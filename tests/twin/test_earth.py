@@ -5,8 +5,17 @@ import numpy as np
 import pyproj
 import pytest
 
-from twin.orbit.earth import EQUATORIAL_RADIUS, FLATTENING, Earth, curvature_radii, east_north_up
-from twin.orbit.earth_rotation import DAY, RATE, rotation_over, tai_of
+from twin.orbit.flight.earth import (
+    DAY,
+    EQUATORIAL_RADIUS,
+    FLATTENING,
+    RATE,
+    Earth,
+    curvature_radii,
+    east_north_up,
+    rotation_over,
+    tai_of,
+)
 
 EARTH = Earth(-0.15, (4e-7, -2e-6))
 EPOCH = "2011-03-05T03:05:00Z"

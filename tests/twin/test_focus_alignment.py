@@ -12,23 +12,20 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.focal_plane.rigid_motion import RigidMotion
-from optics.backend import load_backend
-from optics.frozen_map import FrozenMap
-from optics.pose import Pose
-from optics.rotation import rotation_matrix, rotation_vector
-from scenes.lab_setup import FocusSetup, resolve_focus
-from scenes.load import LAB, LIBRARY
-from twin.edge_images import TRACK
-from twin.laboratory.focus import Alignment, align, line_turn, misset, mount_of, plan_shims
+from analysis.focal_plane.plane_fit import RigidMotion
+from optics.geometry.pose import Pose, rotation_matrix, rotation_vector
+from optics.numerics.backend import load_backend
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.lab_setup import FocusSetup, resolve_focus
+from scenes.specs.load import LAB, SCENES
+from twin.laboratory.focus_alignment import Alignment, align, line_turn, misset, mount_of, plan_shims
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_json import to_dict
-from twin.laboratory.focus_result import run_focus
+from twin.laboratory.focus_report import run_focus, to_dict
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
-from twin.trial.bench_error import BenchError
-from twin.trial.result import silent
+from twin.run.result import BenchError, silent
+from twin.targets.edge_images import TRACK
 
-FILE = LIBRARY / LAB / "focus.yaml"
+FILE = SCENES / LAB / "focus.yaml"
 ARCMIN = np.pi / 180 / 60
 CONFOCAL = 40e-6
 """Paper 004, section 2: all line CCDs within +-0.04 mm of one focus,"""

@@ -8,30 +8,29 @@ import numpy as np
 import pytest
 
 from analysis.mtf.slanted_edge import measure_edge
-from optics.frozen_map import FrozenMap
-from optics.pose import Pose
-from optics.pupil_function import PupilFunction
-from optics.rotation import rotation_matrix
-from optics.transfer import polychromatic_transfer
-from optics.tree import Motion
-from scenes.camera_under_test import ROOT
-from scenes.lab_setup import resolve_focus
-from scenes.load import LAB, LIBRARY
-from twin.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.tree import Motion
+from optics.numerics.frozen_map import FrozenMap
+from optics.waves.pupil_function import PupilFunction
+from optics.waves.transfer import polychromatic_transfer
+from scenes.models.camera_assembly import ROOT
+from scenes.specs.lab_setup import resolve_focus
+from scenes.specs.load import LAB, SCENES
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.laboratory.printed_004 import MTF_NYQUIST
-from twin.line_ccd import band_wavelengths
+from twin.sensors.line_ccd import band_wavelengths
+from twin.targets.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
 
 ARCMIN = np.pi / 180 / 60
 TABLE = 2e-4
-"""Error of interpolated transfer functions that twin.edge_images states."""
+"""Error of interpolated transfer functions that twin.targets.edge_images states."""
 OUTSIDE = 1e-4
 """Outside of the table only the splines over frequency remain."""
 MISSET = Motion(rotate=(3.0 * ARCMIN, -8.0 * ARCMIN, 4.0 * ARCMIN), shift=(0.2e-3, -0.15e-3, 0.3e-3))
 
 
 def make(backend, fields: tuple[float, ...], bands: tuple[str, ...]) -> FocusBench:
-    setup = resolve_focus(LIBRARY / LAB / "focus.yaml")
+    setup = resolve_focus(SCENES / LAB / "focus.yaml")
     some = FrozenMap({name: setup.camera.bands[name] for name in bands})
     test = setup.test.model_copy(update={"fields": fields})
     return FocusBench(

@@ -5,14 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from scenes.load import load_three_line_camera
-from scenes.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.load import load_three_line_camera
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import CirclePlatform
-from twin.orbit.earth import Earth
-from twin.orbit.geolocation import GeolocationGrid
-from twin.orbit.light_effects import LightEffects
-from twin.orbit.line_camera import line_cameras, traced_line_cameras
-from twin.orbit.sensor import Sensor
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import line_cameras, traced_line_cameras
+from twin.orbit.flight.sensor import GeolocationGrid, Sensor
 
 LINES = 10_000
 UNSTEADY = CirclePlatform(wobble=math.radians(5.0 / 3600.0))

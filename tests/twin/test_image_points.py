@@ -11,22 +11,22 @@ from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
 from analysis.orbit.three_line_model import BIAS
-from scenes.load import LIBRARY, ORBIT
-from scenes.orbit_calibration import OrbitCalibrationSpec
-from scenes.orbit_points import ImagePointsSpec
-from scenes.orbit_setup import resolve_calibration, resolve_simulate
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+from scenes.specs.orbit_scene import ImagePointsSpec
+from scenes.specs.orbit_setup import resolve_calibration, resolve_simulate
 from tests.twin.commands import invoke, refused
+from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign, fly_fields
-from twin.orbit.calibration.images import FieldImages
+from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.influences import INNER, simultaneous
-from twin.orbit.calibration.procedure import true_values
 from twin.orbit.calibration.screening import screened
-from twin.orbit.images.flight import Simulation, simulate
+from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.point_judgement import judged, true_ground
-from twin.orbit.images.points import MatchedPoints, map_points, tie_points
+from twin.orbit.images.simulate_run import Simulation, simulate
 
 run = partial(invoke, command.app)
-SIMULATE, CALIBRATE = (LIBRARY / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))
+SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))
 POINTS = "points: {control: 200, check: 100, tie: 200, reach: 40, template: 31}"
 SIZE = "lines: 1000, pixels: 1000}"
 

@@ -8,26 +8,26 @@ import pytest
 import yaml
 
 import twin.render as command
-from optics import quadrature
-from optics.assembly import points_to_world
-from optics.imaging import aim_collimated
-from optics.line_of_sight import chief_directions
-from optics.rotation import rotation_matrix
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.transfer import polychromatic_transfer
-from optics.tree import Motion
-from optics.wavefront import fit_wavefront, path_difference
-from scenes.camera_model import LAUNCH_DISTANCE
-from scenes.load import LIBRARY, load_detector
-from scenes.resolved import resolve
+from optics.geometry.pose import rotation_matrix
+from optics.geometry.tree import Motion
+from optics.numerics import quadrature
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.waves.imaging import aim_collimated
+from optics.waves.transfer import polychromatic_transfer
+from optics.waves.wavefront import fit_wavefront, path_difference
+from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.specs.load import LIBRARY, load_detector
+from scenes.specs.resolved import resolve
 from tests.twin.commands import invoke
-from twin.image_quality import FIELDS, quality_dicts
-from twin.image_quality import image_quality as quality_of
-from twin.line_ccd import LineCcd, band_wavelengths
-from twin.study.base_job import Run
-from twin.study.render_base import RenderBase
-from twin.target_path import TargetPath
+from twin.monitor.image_quality import FIELDS, quality_dicts
+from twin.monitor.image_quality import image_quality as quality_of
+from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.study.runs.base_job import Run
+from twin.study.runs.render_base import RenderBase
+from twin.targets.target_path import TargetPath
 
 WAVELENGTH, ARCSEC = 650e-9, np.pi / 180 / 3600
 NODES = quadrature.disk(12)

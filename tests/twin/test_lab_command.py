@@ -10,12 +10,12 @@ import pytest
 import tifffile
 
 import twin.lab as command
-from scenes.load import LAB, LIBRARY
+from scenes.specs.load import LAB, LIBRARY, SCENES
 from tests.twin.commands import files, invoke, refused
 
 run = partial(invoke, command.app)
-FOCUS = LIBRARY / LAB / "focus.yaml"
-TURNTABLE = LIBRARY / LAB / "turntable.yaml"
+FOCUS = SCENES / LAB / "focus.yaml"
+TURNTABLE = SCENES / LAB / "turntable.yaml"
 BANDS, FIELDS = ("B1", "B4"), ("-0.9", "0.9")
 CHANGES = {
     "camera: gf7\n": "camera: own_camera.yaml\n",

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from optics.assembly import points_to_world
-from optics.line_of_sight import chief_directions
-from optics.rotation import rotation_matrix
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion
-from scenes.errors import InputError
-from scenes.load import load_three_line_camera
-from scenes.spec import Spec
-from scenes.three_line_camera import ThreeLineCameraSpec
-from scenes.translate import validate
-from scenes.yaml_file import dump_yaml, parse_yaml
-from twin.orbit.line_camera import (
+from optics.geometry.pose import rotation_matrix
+from optics.geometry.tree import Motion
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.specs.load import load_three_line_camera
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import Spec
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from twin.orbit.flight.line_camera import (
     along_track_angle,
     dihedral_angle,
     line_cameras,

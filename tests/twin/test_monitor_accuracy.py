@@ -5,13 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from analysis import model_fit, monitoring
-from analysis.monitoring import PER_SI
-from analysis.recovery import measure_spots
+from analysis.monitor import model_fit, monitoring
+from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
-from optics.tree import Motion
-from scenes.channel import BASE
-from twin.truth import trace_truth
+from optics.geometry.tree import Motion
+from scenes.specs.channel import BASE
+from twin.monitor.truth import trace_truth
 
 SHIFT, TURN, SCALE = 50e-6, 20 * ARCSEC, 20e-6  # the largest motions that are claimed
 ALONE = [tuple(sign * (i == k) for i in range(4)) for k in range(4) for sign in (1, -1)]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from optics import quadrature
-from optics.aim import aim
-from optics.tree import Motion, State
-from scenes.channel import BASE
-from twin import monitor
-from twin.monitor import SPOT_RANGES, MonitorPath
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.raytrace.aim import aim
+from scenes.specs.channel import BASE
+from twin.monitor import monitor_path
+from twin.monitor.monitor_path import SPOT_RANGES, MonitorPath
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCURACY = 1e-6  # of the peak: what the nodes are chosen for
@@ -61,7 +61,7 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     steps = [
         path.light_per_pixel
         * path.response.apply(
-            monitor.image(one.fields([inner]), *(path.grid(axis, path.response.reach) for axis in (1, 0)))
+            monitor_path.image(one.fields([inner]), *(path.grid(axis, path.response.reach) for axis in (1, 0)))
         )
         for one in path.classes[number : number + 2]
     ]
@@ -107,25 +107,25 @@ def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
         calls.append(arguments)
         return aim(*arguments)
 
-    monkeypatch.setattr(monitor, "aim", counted)
+    monkeypatch.setattr(monitor_path, "aim", counted)
     predicted = path.rays(states, known)
     assert not calls
     aimed = path.rays(states, replace(known, turn=np.zeros_like(known.turn)))
     assert len(calls) == 1
     # a nanometre off its node on the face, a ray is off by that part of the aperture in direction
-    limit = 2.0 * monitor.AIM_TOLERANCE / path.face_radius * path.numerical_aperture
+    limit = 2.0 * monitor_path.AIM_TOLERANCE / path.face_radius * path.numerical_aperture
     assert np.max(np.abs(predicted.direction - aimed.direction)) < limit
-    assert np.max(np.abs(predicted.position - aimed.position)) < 2.0 * monitor.AIM_TOLERANCE
+    assert np.max(np.abs(predicted.position - aimed.position)) < 2.0 * monitor_path.AIM_TOLERANCE
 
 
 SCRIPT = """
 import hashlib
 import numpy as np
-from optics.backend import load_backend
-from optics.tree import Motion
-from scenes.job import JobSpec
-from scenes.resolved import resolve_job
-from twin.experiment import MonitorExperiment
+from optics.numerics.backend import load_backend
+from optics.geometry.tree import Motion
+from scenes.specs.job import JobSpec
+from scenes.specs.resolved import resolve_job
+from twin.monitor.monitor_experiment import MonitorExperiment
 setup = MonitorExperiment(resolve_job(JobSpec(instrument="gf7_pair")), load_backend("llvm"))
 rng = np.random.default_rng(5)
 states = [{"base/forward/focal_plane": Motion(shift=tuple(3e-5 * rng.normal(size=3)))} for _ in range(7)]

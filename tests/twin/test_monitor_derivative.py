@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from scenes.channel import BASE
-from twin.monitor import MonitorPath
-from twin.monitor_derivative import photon_derivative, spot_jacobian
-from twin.motions import ElementaryMotion, line_family
+from scenes.specs.channel import BASE
+from twin.monitor.monitor_derivative import photon_derivative, spot_jacobian
+from twin.monitor.monitor_path import MonitorPath
+from twin.monitor.motions import ElementaryMotion, line_family
 
 MOTIONS = (
     *line_family("forward"),

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.centroid import mean_frames
-from analysis.likelihood import cramer_rao_bound
-from analysis.recovery import measure_spots, recover
+from analysis.monitor.recovery import measure_spots, recover
+from analysis.spots.centroid import mean_frames
+from analysis.spots.likelihood import cramer_rao_bound
 from analysis.units import ARCSEC
-from optics.tree import Motion
-from scenes.channel import BASE
+from optics.geometry.tree import Motion
+from scenes.specs.channel import BASE
 
 SEEDS = 200
 FRAMES = 9

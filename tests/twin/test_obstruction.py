@@ -8,22 +8,23 @@ import pytest
 import yaml
 
 import twin.render as command
-from optics import quadrature, zernike
-from optics.aperture import Circle, Rectangle
-from optics.imaging import imaging_rays
-from optics.pose import Pose
-from optics.solid import solid_mesh
-from optics.trace import make_rays, trace
-from optics.transfer import TransferTable, polychromatic_transfer, transfer
-from optics.tree import Motion
-from optics.wavefront import path_to_sphere
-from scenes.baffle import Plate
-from scenes.load import load_band_detectors
-from scenes.shadow import ImagingShadows, Shadows, TracedBeams
+from optics.geometry import zernike
+from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.pose import Pose
+from optics.geometry.solid import solid_mesh
+from optics.geometry.tree import Motion
+from optics.numerics import quadrature
+from optics.raytrace.trace import make_rays, trace
+from optics.waves.imaging import imaging_rays
+from optics.waves.transfer import TransferTable, polychromatic_transfer, transfer
+from optics.waves.wavefront import path_to_sphere
+from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
+from scenes.specs.baffle import Plate
+from scenes.specs.load import load_band_detectors
 from tests.twin.commands import invoke
-from twin.image_quality import _CameraBench, image_quality
-from twin.line_ccd import LineCcd, band_wavelengths
-from twin.target_path import TargetPath
+from twin.monitor.image_quality import _CameraBench, image_quality
+from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.targets.target_path import TargetPath
 
 CAMERA, ROOT = "forward", "base/forward"
 PRISM = f"{ROOT}/monitor/left/prism_180"

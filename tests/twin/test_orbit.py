@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from scenes.orbit_spec import OrbitSpec
-from twin.orbit.earth import EQUATORIAL_RADIUS, Earth
-from twin.orbit.earth_rotation import DAY, RATE
-from twin.orbit.orbit import (
+from scenes.specs.orbit_spec import OrbitSpec
+from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, RATE, Earth
+from twin.orbit.flight.orbit import (
     FIELD_RADIUS,
     GM,
     J2,
@@ -146,7 +145,7 @@ def test_tolerance_does_not_matter() -> None:
 
 def test_without_flattening_it_is_an_ellipse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kepler's equation, solved here, with all elements at work."""
-    monkeypatch.setattr("twin.orbit.orbit.J2", 0.0)
+    monkeypatch.setattr("twin.orbit.flight.orbit.J2", 0.0)
     e, i, node, perigee, argument = 0.05, 1.1, 2.0, 0.7, 1.5
     degrees = {
         key: f"{math.degrees(value)!r} deg"

@@ -15,20 +15,19 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from analysis.orbit.sensitivity import STATEMENTS, judge
 from analysis.units import ARCSEC
-from scenes.load import LIBRARY, ORBIT
-from scenes.orbit_angle import LINES
-from scenes.orbit_setup import AngleSetup, resolve_angle
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from tests.analysis.test_sensitivity import REFUTED
 from tests.twin.commands import files, invoke, refused
-from twin.orbit.angle.camera import angle_camera
-from twin.orbit.angle.flight import AnglePass, fly
-from twin.orbit.angle.procedure import estimated, frame_rows, run_passes, tls_angles
-from twin.orbit.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.line_camera import look_angle
-from twin.trial.result import silent
+from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
+from twin.orbit.angle.angle_run import estimated, frame_rows, run_passes, tls_angles
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import look_angle
+from twin.run.result import silent
 
 run = partial(invoke, command.app)
-EXAMPLE = LIBRARY / ORBIT / "angle.yaml"
+EXAMPLE = SCENES / ORBIT / "angle.yaml"
 SETUP = resolve_angle(EXAMPLE)
 LOOK = np.radians(25.0)
 RADIUS, ABOVE = 6.37e6, 499.7e3

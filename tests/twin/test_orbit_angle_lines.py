@@ -11,20 +11,19 @@ import pytest
 
 import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
-from optics.tree import Motion
-from scenes.load import LIBRARY, ORBIT
-from scenes.orbit_setup import AngleSetup, resolve_angle
+from optics.geometry.tree import Motion
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from tests.twin.commands import files, invoke, refused
-from twin.orbit.angle.camera import AngleCamera, angle_camera
-from twin.orbit.angle.flight import AnglePass, fly
-from twin.orbit.angle.procedure import estimated, run_passes, values_of
-from twin.orbit.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.line_camera import traced_line_cameras
-from twin.trial.result import silent
-from twin.truth import trace_truth
+from twin.monitor.truth import trace_truth
+from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
+from twin.orbit.angle.angle_run import estimated, run_passes, values_of
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.run.result import silent
 
 run = partial(invoke, command.app)
-PAIR, LINES = (resolve_angle(LIBRARY / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
+PAIR, LINES = (resolve_angle(SCENES / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
 
 
 GRADIENT = ", gradient: [0.2 K/m, 0 K/m, 0.4 K/m]"
@@ -180,7 +179,7 @@ def done(tmp_path_factory):
 
 def write(folder: Path, old: str, new: str) -> Path:
     """The example, changed; without the gradient, whose finite elements take seconds."""
-    text = (LIBRARY / ORBIT / "angle_gf7.yaml").read_text("utf-8")
+    text = (SCENES / ORBIT / "angle_gf7.yaml").read_text("utf-8")
     for before, after in ((GRADIENT, ""), (old, new)):
         assert text.count(before) == 1, before
         text = text.replace(before, after)

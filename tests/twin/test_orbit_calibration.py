@@ -14,25 +14,24 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.three_line_model import misclosure
-from optics.frozen_map import FrozenMap
-from scenes.load import LIBRARY, ORBIT
-from scenes.orbit_angle import LINES, EffectsSpec
-from scenes.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.orbit_spec import ThermalDriftSpec
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.load import ORBIT, SCENES
+from scenes.specs.orbit_angle import LINES, EffectsSpec
+from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import files, invoke, refused
+from twin.orbit.calibration.calibration_json import to_dict
+from twin.orbit.calibration.calibration_run import run_calibration_passes, true_values
 from twin.orbit.calibration.campaign import fly_fields
 from twin.orbit.calibration.influences import INNER, simultaneous, surprises
 from twin.orbit.calibration.latitude import fitted, latitude_fits, rate_priors
-from twin.orbit.calibration.light import light_shift
-from twin.orbit.calibration.points import ImagePoints, PassData, image_sigma
-from twin.orbit.calibration.procedure import run_calibration_passes, true_values
+from twin.orbit.calibration.observations import ImagePoints, PassData, image_sigma, light_shift
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, schemes_tested, values_of
-from twin.orbit.calibration.to_json import to_dict
-from twin.orbit.light_effects import NO_EFFECTS, LightEffects
-from twin.trial.result import silent
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.run.result import silent
 
 run = partial(invoke, command.app)
-EXAMPLE = LIBRARY / ORBIT / "calibrate.yaml"
+EXAMPLE = SCENES / ORBIT / "calibrate.yaml"
 WHOLE = resolve_calibration(EXAMPLE)
 SETUP = WHOLE.model_copy(update={"test": WHOLE.test.model_copy(update={"repeats": 2})})
 NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)

@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import chi2
 
 from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
-from optics.tree import Motion
-from scenes.orbit_setup import MonitorSetup, resolve_monitor
+from optics.geometry.tree import Motion
+from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
 from tests.twin.commands import files, invoke, refused
-from twin.orbit.line_camera import traced_line_cameras
-from twin.orbit.monitoring.procedure import rms, run_monitored
-from twin.trial.result import silent
-from twin.truth import trace_truth
+from twin.monitor.truth import trace_truth
+from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.orbit.monitoring.monitoring_run import rms, run_monitored
+from twin.run.result import silent
 
 ARCSEC = np.pi / 648000
 FALSE_ALARM = 1e-6

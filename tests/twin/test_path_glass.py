@@ -8,25 +8,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from optics.assembly import Assembly
-from optics.element import Element, Interaction
-from optics.finish import ABSORBER, BARE, Finish
-from optics.fresnel import reflectance
-from optics.pose import Pose
-from optics.rotation import rotation_matrix
-from optics.solid import Coating, Face, Solid
-from optics.surface import plane
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Body, RigidTree
-from scenes.scene_surface import Finishes, solid_surfaces
-from scenes.scenery import Scenery
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Coating, Face, Solid
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, RigidTree
+from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.scene_surface import Finishes, solid_surfaces
+from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, right_angle_prism, screen, slab
-from twin.path_tracing.events import Event, decode
-from twin.path_tracing.families import nominal_codes
+from twin.path_tracing.families import Event, decode, nominal_codes
 from twin.path_tracing.integrator import Sampling
-from twin.path_tracing.result import Family, PathResult
+from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.tracer import PathTracer
 

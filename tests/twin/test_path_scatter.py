@@ -10,13 +10,13 @@ import pytest
 from scipy.integrate import dblquad
 from scipy.stats import chi2
 
-from optics.finish import ABSORBER, Finish
-from optics.pose import Pose
-from optics.scatter import ABg, HarveyShack, total_scatter
-from scenes.scenery import Scenery
+from optics.geometry.pose import Pose
+from optics.materials.finish import ABSORBER, Finish
+from optics.materials.scatter import ABg, HarveyShack, total_scatter
+from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.twin.path_bench import flat_mirror, screen
-from twin.path_tracing.events import Event
+from twin.path_tracing.families import Event
 from twin.path_tracing.integrator import Sampling
 from twin.path_tracing.shading import Leaving, spread
 from twin.path_tracing.source import DiskSource, random_streams

@@ -12,22 +12,29 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from optics.pose import Pose
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion
-from scenes.scene_surface import IDEAL, Detector, detector_surface
-from scenes.scenery import FACING_THE_LIGHT, Scenery, build_scenery
+from optics.geometry.pose import Pose
+from optics.geometry.tree import Motion
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.scene_surface import IDEAL, Detector, detector_surface
+from scenes.models.scenery import FACING_THE_LIGHT, Scenery, build_scenery
 from tests.optics.bench import disk_points
 from tests.twin.path_bench import scene_beam
-from twin.monitor import MonitorPath
-from twin.path_tracing.events import signature
-from twin.path_tracing.families import nominal_codes
-from twin.path_tracing.integrator import BALANCED, FAINT, NAME, Sampling, make_integrator
-from twin.path_tracing.scene import VARIANTS, VariantUnavailable, load_mitsuba
+from twin.monitor.monitor_path import MonitorPath
+from twin.path_tracing.families import nominal_codes, signature
+from twin.path_tracing.integrator import (
+    BALANCED,
+    FAINT,
+    NAME,
+    VARIANTS,
+    Sampling,
+    VariantUnavailable,
+    load_mitsuba,
+    make_integrator,
+)
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.stray import monitor_families, trace_stray
+from twin.path_tracing.stray_rays import monitor_families, trace_stray
 from twin.path_tracing.tracer import PathTracer
 
 INSTRUMENTS = ["gf7_pair", "monitor_pair"]

@@ -14,18 +14,27 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import twin.picture_light as picture_light
+import twin.pictures.picture_light as picture_light
 import twin.render as command
-from scenes.load import EXAMPLES
-from scenes.resolved import resolve
-from twin.light_paths import trace_light_paths
-from twin.picture import SHOTS, PictureError, Shot, render_shot, staged, which_body, write_pictures
-from twin.picture_clean import displayed, still_patches, without_grain
-from twin.picture_light import colour_variant
-from twin.picture_scene import points_in_world
-from twin.picture_view import framed, looking
-from twin.render_job import render_job
-from twin.scene_file import build_scene
+from scenes.specs.load import EXAMPLES
+from scenes.specs.resolved import resolve
+from twin.main_job.render_job import render_job
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.picture import (
+    SHOTS,
+    PictureError,
+    Shot,
+    displayed,
+    render_shot,
+    staged,
+    still_patches,
+    which_body,
+    without_grain,
+    write_pictures,
+)
+from twin.pictures.picture_light import colour_variant
+from twin.pictures.picture_scene import framed, looking, points_in_world
+from twin.pictures.scene_file import build_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = EXAMPLES / "perturb.yaml"

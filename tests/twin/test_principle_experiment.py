@@ -11,19 +11,26 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.autocollimator import exact_reading, mirror_rotation, relation_factor
-from optics.backend import Backend
-from optics.trace import BeamMissedError
-from optics.tree import Motion
-from scenes.load import load_principle_experiment
-from scenes.turntable import BenchErrorsSpec, PrincipleSetup
-from scenes.turntable_model import UNITS, autocollimator_body, axis_body, mirror_body
-from twin import principle_printed as printed
-from twin.autocollimator import window_pattern
-from twin.principle_checks import declared_spread, principle_checks, printed_mean_difference
-from twin.principle_experiment import Reader, run_principle_experiment, states_of, table_2, whole_programme
-from twin.principle_figure import write_principle_figure
-from twin.principle_table import PrincipleTable, Series
+from analysis.monitor.autocollimator import exact_reading, mirror_rotation, relation_factor
+from optics.geometry.tree import Motion
+from optics.numerics.backend import Backend
+from optics.raytrace.trace import BeamMissedError
+from scenes.models.principle_model import UNITS, autocollimator_body, axis_body, mirror_body
+from scenes.specs.load import load_principle_experiment
+from scenes.specs.principle_experiment import BenchErrorsSpec, PrincipleSetup
+from twin.validation.paper_001 import principle_rows as printed
+from twin.validation.paper_001.principle import write_principle_figure
+from twin.validation.paper_001.principle_bench import (
+    PrincipleTable,
+    Reader,
+    Series,
+    run_principle_experiment,
+    states_of,
+    table_2,
+    whole_programme,
+)
+from twin.validation.paper_001.principle_images import window_pattern
+from twin.validation.paper_001.principle_rows import declared_spread, principle_checks, printed_mean_difference
 
 ARCSEC = math.pi / 648000
 SETUP = load_principle_experiment()

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.recovery import measure_spots
-from optics.glass import glass
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion
-from scenes.instrument_builder import build_instrument
-from scenes.load import load_camera
+from analysis.monitor.recovery import measure_spots
+from optics.geometry.tree import Motion
+from optics.materials.glass import glass
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.load import load_camera
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
-from twin.monitor import MonitorPath
+from twin.monitor.monitor_path import MonitorPath
 from twin.render import app
 
 ARCSEC = np.pi / 648000.0

@@ -17,11 +17,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info
 
-from optics import array_math, quadrature, zernike
+from optics.geometry import zernike
+from optics.numerics import array_math, quadrature
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
-from twin.monitor import MAP_TERMS
-from twin.results import stated
+from twin.main_job.render_results import stated
+from twin.monitor.monitor_path import MAP_TERMS
 
 KERNELS = {
     "one": {"OPENBLAS_CORETYPE": "Haswell"},

@@ -7,15 +7,23 @@ from scipy.special import erf
 from scipy.stats import chi2
 
 from analysis.mtf.slanted_edge import measure_edge
-from scenes.load import load_detector, load_three_line_camera
-from scenes.orbit_scene import ControlSpec, GroundSpec, TerrainSpec
+from scenes.specs.load import load_detector, load_three_line_camera
+from scenes.specs.orbit_scene import ControlSpec, GroundSpec, TerrainSpec
 from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, optics
-from twin.orbit.ground.frame import GroundFrame
+from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
-from twin.orbit.images.look_map import SteepTerrainError
 from twin.orbit.images.patch import PatchError, fly_patch, window_of
-from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
+from twin.orbit.images.pushbroom import (
+    MARGIN,
+    PushbroomScene,
+    SteepTerrainError,
+    Window,
+    extent_of,
+    look_map,
+    render_patch,
+    require_open,
+)
 
 FRAME = GroundFrame(*PLACE)
 ROUGH = TerrainSpec.model_validate({"kind": "fractal", "relief": "80 m", "height": "600 m", "exponent": 2.0})

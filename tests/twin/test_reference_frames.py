@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 import twin
-from twin.artefact import Table
-from twin.reference_frames import FRAMES, SCHEMA, described, frames_text
-from twin.run_folder import MANIFEST
-from twin.trial.result import LabResult
+from twin.run.artefact import Table
+from twin.run.reference_frames import FRAMES, SCHEMA, described, frames_text
+from twin.run.result import LabResult
+from twin.run.run_folder import MANIFEST
 
 SOURCES = sorted(Path(twin.__file__).parent.rglob("*.py"))
 # what it was run with and which checks passed: no positions, directions or times of an experiment

@@ -20,9 +20,9 @@ import tifffile
 import xarray as xr
 
 import twin.render as command
-from scenes.load import EXAMPLES
+from scenes.specs.load import EXAMPLES
 from tests.twin.commands import files, invoke
-from twin.render_job import render_job
+from twin.main_job.render_job import render_job
 
 run = partial(invoke, command.app)
 """The command inside this process."""
@@ -109,7 +109,7 @@ def ready(repeated, monkeypatch):
     _, _, _, kept = repeated
     monkeypatch.setattr(command, "render_job", lambda *arguments, **options: kept[0])
     for writer in ("write_report", "write_scene", "write_summary"):
-        monkeypatch.setattr(f"twin.output.{writer}", lambda *drawn: drawn[-1].touch())
+        monkeypatch.setattr(f"twin.main_job.render_files.{writer}", lambda *drawn: drawn[-1].touch())
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------

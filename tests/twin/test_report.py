@@ -9,17 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.recovery import ESTIMATORS
-from scenes.resolved import resolve
-from twin.render_job import render_job
-from twin.report import render_report
-from twin.report.content import goodness
-from twin.report.crosstalk_content import is_wrong
-from twin.report.labels import PARAMETERS
-from twin.report.numbers import FAR, decimals_for, fixed, plain, residual_text, significant
-from twin.report.systematics import systematics
-from twin.results import RenderRun
-from twin.summary_figure import write_summary
+from analysis.monitor.recovery import ESTIMATORS
+from scenes.specs.resolved import resolve
+from twin.main_job.crosstalk_content import is_wrong
+from twin.main_job.render_job import render_job
+from twin.main_job.render_report import render_report
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_content import goodness, systematics
+from twin.main_job.report_labels import PARAMETERS
+from twin.main_job.summary_figure import write_summary
+from twin.run.artefact import FAR, decimals_for, fixed, plain, residual_text, significant
 
 VOID = {"meta", "br", "hr", "img", "input", "link", "col", "wbr"}
 NAMESPACES = ("http://www.w3.org/1999/xlink", "http://www.w3.org/2000/svg")

@@ -17,10 +17,10 @@ import pytest
 import xarray as xr
 
 from tests.twin.study_bench import ROOT
-from twin import run_folder
-from twin.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
-from twin.unfinished import LOCK, OLD, PARTIAL, Unfinished
-from twin.versions import versions
+from twin.run import run_folder
+from twin.run.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
+from twin.run.unfinished import LOCK, OLD, PARTIAL, Unfinished
+from twin.run.versions import versions
 
 
 def everything(folder: Path) -> set[str]:
@@ -328,7 +328,7 @@ def test_runs_that_start_together_get_a_number_each(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from twin.run_folder import RunFolder
+from twin.run.run_folder import RunFolder
 with RunFolder(Path(sys.argv[1]), force=True) as folder:
     folder.write_text("half.txt", "half")
     {act}
@@ -357,7 +357,7 @@ def test_what_a_living_run_has_is_left_alone(tmp_path):
         folder.write_text("a.txt", "mine")
         a_run(tmp_path / "other")
         # another process sees the lock as well
-        code = "import sys; from pathlib import Path; from twin.run_folder import RunFolder\n"
+        code = "import sys; from pathlib import Path; from twin.run.run_folder import RunFolder\n"
         code += "with RunFolder(Path(sys.argv[1])) as f: f.write_text('x', 'y')"
         subprocess.run([sys.executable, "-c", code, str(tmp_path / "third")], cwd=ROOT, timeout=60, check=True)
     assert (tmp_path / "run" / "a.txt").read_text() == "mine"

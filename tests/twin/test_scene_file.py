@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from optics.solid import face_plane
-from optics.tree import Motion
-from scenes.channel import BASE
-from scenes.mirror_mesh import BOARD, CHIP, mirror_mesh
-from twin.light_paths import FIELDS, trace_light_paths
-from twin.scene_file import TUBE, build_scene
+from optics.geometry.solid import face_plane
+from optics.geometry.tree import Motion
+from scenes.models.meshes import BOARD, CHIP, mirror_mesh
+from scenes.specs.channel import BASE
+from twin.pictures.light_paths import FIELDS, trace_light_paths
+from twin.pictures.scene_file import TUBE, build_scene
 
 TOLERANCE = 1e-3
 """Metres: meshes and float32 files are for looking at."""

@@ -9,13 +9,13 @@ import pyproj
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from optics.tree import Motion
-from scenes.load import load_three_line_camera
-from scenes.orbit_spec import OrbitSpec
-from scenes.three_line_camera import ThreeLineCameraSpec
+from optics.geometry.tree import Motion
+from scenes.specs.load import load_three_line_camera
+from scenes.specs.orbit_spec import OrbitSpec
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import RATE, CirclePlatform, turn
-from twin.orbit.earth import Earth
-from twin.orbit.light_effects import (
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import (
     NO_EFFECTS,
     SPEED_OF_LIGHT,
     LightEffects,
@@ -25,10 +25,10 @@ from twin.orbit.light_effects import (
     standard_refractivity,
     unrefracted,
 )
-from twin.orbit.line_camera import LineCamera, line_cameras, traced_line_cameras
-from twin.orbit.orbit import propagate
-from twin.orbit.sensor import Sensor
-from twin.orbit.trajectory import Trajectory
+from twin.orbit.flight.line_camera import LineCamera, line_cameras, traced_line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import Trajectory
 
 ARCSEC = math.radians(1.0 / 3600.0)
 EARTH = Earth()

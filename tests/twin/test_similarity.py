@@ -11,26 +11,26 @@ from functools import cache
 import numpy as np
 import pytest
 
-from optics import quadrature
-from optics.heat import Temperature
-from optics.imaging import imaging_rays
-from optics.material import MATERIALS, Material, material
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.transfer import polychromatic_transfer
-from optics.tree import Motion, State
-from scenes.camera_assembly import line_body
-from scenes.instrument_builder import build_instrument
-from scenes.instrument_model import Instrument
-from scenes.load import load_camera, load_instrument
-from scenes.scenery import build_scenery
-from scenes.thermal_model import ThermalModel
-from twin.image_quality import image_quality
-from twin.light_paths import trace_light_paths
-from twin.monitor import CcdRays, MonitorPath
-from twin.orbit.line_camera import traced_line_cameras
-from twin.target_path import TargetPath
-from twin.truth import trace_truth
+from optics.geometry.tree import Motion, State
+from optics.materials.material import MATERIALS, Material, material
+from optics.numerics import quadrature
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.thermal.heat import Temperature
+from optics.waves.imaging import imaging_rays
+from optics.waves.transfer import polychromatic_transfer
+from scenes.models.camera_assembly import line_body
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.models.scenery import build_scenery
+from scenes.models.thermal_model import ThermalModel
+from scenes.specs.load import load_camera, load_instrument
+from twin.monitor.image_quality import image_quality
+from twin.monitor.monitor_path import CcdRays, MonitorPath
+from twin.monitor.truth import trace_truth
+from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.pictures.light_paths import trace_light_paths
+from twin.targets.target_path import TargetPath
 
 ARCSEC = np.pi / 648000.0
 CAMERAS = {"gf7": "gf7_pair", "gf7_conic": "gf7_pair", "gf7_short": "gf7_pair", "monitor": "monitor_pair"}

@@ -11,11 +11,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import twin.orbit.__main__ as command
-from scenes.load import LIBRARY, ORBIT
+from scenes.specs.load import ORBIT, SCENES
 from tests.twin.commands import files, invoke, refused
 
 run = partial(invoke, command.app)
-EXAMPLE = LIBRARY / ORBIT / "simulate.yaml"
+EXAMPLE = SCENES / ORBIT / "simulate.yaml"
 SIZE = "lines: 1000, pixels: 1000}"
 SMALL = "lines: 64, pixels: 80}"
 # such small images have no room for templates

@@ -13,9 +13,9 @@ import pytest
 import typer
 from rich.console import Console
 
-from scenes.standard_output import Terminal, print_json, to_stdout
+from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from tests.twin.study_bench import ROOT
-from twin.cli import exit_on_terminate
+from twin.run.cli import exit_on_terminate
 
 FULL = "/dev/full"
 LIST = ("twin.validate", "--list")

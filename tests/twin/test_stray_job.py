@@ -7,16 +7,16 @@ import pytest
 import xarray as xr
 from typer.testing import CliRunner
 
-from optics.finish import COATED, MIRROR
-from scenes.baffle_spec import BaffleSpec
-from scenes.instrument_builder import build_instrument
-from scenes.job import JobSpec
-from scenes.load import LIBRARY
-from scenes.resolved import resolve_job
-from twin.experiment import MonitorExperiment
-from twin.path_tracing.stray import NominalPathLost, trace_stray
+from optics.materials.finish import COATED, MIRROR
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.baffle import BaffleSpec
+from scenes.specs.job import JobSpec
+from scenes.specs.load import LIBRARY
+from scenes.specs.resolved import resolve_job
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.path_tracing.stray_light import REACH, diffraction_spots, stray_light
+from twin.path_tracing.stray_rays import NominalPathLost, trace_stray
 from twin.render import app
-from twin.stray_light import REACH, diffraction_spots, stray_light
 
 PATHS = 20_000
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from optics.finish import MIRROR, Finish
-from optics.scatter import total_scatter
-from optics.tree import Motion
-from scenes.scene_surface import Finishes
-from scenes.scenery import build_scenery, focal_plane_housing
-from twin.path_tracing.events import Event
+from optics.geometry.tree import Motion
+from optics.materials.finish import MIRROR, Finish
+from optics.materials.scatter import total_scatter
+from scenes.models.scene_surface import Finishes
+from scenes.models.scenery import build_scenery, focal_plane_housing
+from twin.path_tracing.families import Event
 from twin.path_tracing.integrator import BALANCED, FAINT, Sampling
-from twin.path_tracing.result import Family
+from twin.path_tracing.path_result import Family
 from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
-from twin.path_tracing.stray import NominalPathLost, monitor_families, pinhole, trace_stray
+from twin.path_tracing.stray_rays import NominalPathLost, monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import PathTracer
 
 CCD = "forward/left/area_ccd"

@@ -24,12 +24,12 @@ from distributed.security import Security
 import twin.study.__main__ as command
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT, children, chunks, start, wait_for, write_study
-from twin.study.chunk_store import ChunkStore
-from twin.study.cluster import local_workers
-from twin.study.engine import Engine
-from twin.study.plan import Plan
-from twin.study.render_base import BLOCK
-from twin.study.setup import resolve_study
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.cluster import local_workers
+from twin.study.runs.engine import Engine
+from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import BLOCK
+from twin.study.runs.setup import resolve_study
 
 run = partial(invoke, command.app)
 

@@ -4,11 +4,11 @@ import math
 
 import pytest
 
-from scenes.study import ResponseSpec
-from twin.study.block_result import BlockResult
-from twin.study.config_tree import leaf, with_values
-from twin.study.plan import Plan
-from twin.study.setup import resolve_study
+from scenes.specs.study import ResponseSpec
+from twin.study.runs.block_result import BlockResult
+from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
 
 QUICK = [("lab distortion", "distortion")]
 SMALLER = {"distortion": [(("test", "points"), 11), (("test", "sets"), 2)]}

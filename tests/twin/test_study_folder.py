@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-import twin.versions
+import twin.run.versions
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
-from twin.run_folder import Numbered, RunFolder, RunFolderError
-from twin.study.folder import StudyFolder
-from twin.study.setup import StudySetup, resolve_study
-from twin.study.task import OtherProgramError, Task, evaluate
-from twin.versions import source_digest, sources
+from twin.run.run_folder import Numbered, RunFolder, RunFolderError
+from twin.run.versions import source_digest, sources
+from twin.study.runs.setup import StudySetup, resolve_study
+from twin.study.runs.study_folder import StudyFolder
+from twin.study.runs.task import OtherProgramError, Task, evaluate
 
 OWN = {".lock", "config.yaml", "study_state.json", "chunks/index.txt", "chunks/00000.npz"}
 """Files of ``work``."""
@@ -47,7 +47,7 @@ def test_sources_are_all_that_can_compute() -> None:
     """Everything that the program of a worker may import, wherever in a file the import stands."""
     from tests.test_architecture import PACKAGES, imported_modules
 
-    todo, seen = ["twin.study.task", "twin.study.plan"], set()
+    todo, seen = ["twin.study.runs.task", "twin.study.runs.plan"], set()
     while todo:
         name = todo.pop()
         place = ROOT.joinpath(*name.split("."))
@@ -57,7 +57,12 @@ def test_sources_are_all_that_can_compute() -> None:
         seen.add(name)
         assert path.relative_to(ROOT).as_posix() in sources()
         todo += [other for other in imported_modules(path) if other.split(".")[0] in PACKAGES]
-    assert {"twin.detector", "optics.trace", "scenes.thermal_model", "analysis.recovery"} <= seen
+    assert {
+        "twin.sensors.area_detector",
+        "optics.raytrace.trace",
+        "scenes.models.thermal_model",
+        "analysis.monitor.recovery",
+    } <= seen
 
 
 @pytest.mark.parametrize("change", ["edited", "new", "gone"])
@@ -69,12 +74,12 @@ def test_other_code_is_not_mixed_in(setup, tmp_path, monkeypatch, change) -> Non
     own = sources()
     other = dict(own)
     if change == "gone":
-        del other["twin/detector.py"]
+        del other["twin/sensors/area_detector.py"]
     else:
-        other["twin/detector.py" if change == "edited" else "twin/new.py"] = "0" * 16
-    monkeypatch.setattr(twin.versions, "sources", lambda: other)
-    monkeypatch.setattr("twin.study.folder.sources", lambda: other)
-    named = "twin/new.py" if change == "new" else "twin/detector.py"
+        other["twin/sensors/area_detector.py" if change == "edited" else "twin/new.py"] = "0" * 16
+    monkeypatch.setattr(twin.run.versions, "sources", lambda: other)
+    monkeypatch.setattr("twin.study.runs.study_folder.sources", lambda: other)
+    named = "twin/new.py" if change == "new" else "twin/sensors/area_detector.py"
     with pytest.raises(RunFolderError, match=rf"another version of the program.*changed: {named}.*--out.*--force"):
         work(path, fresh(setup), resume=True)
     assert {name: (path / name).read_bytes() for name in files(path)} == before
@@ -83,8 +88,12 @@ def test_other_code_is_not_mixed_in(setup, tmp_path, monkeypatch, change) -> Non
 
 def test_another_version_of_a_package_is_named(setup, tmp_path, monkeypatch) -> None:
     path = work(tmp_path / "run", setup)
-    other = twin.versions.versions() | {"numpy": "1.0"}
-    for place in ("twin.versions.versions", "twin.study.folder.versions", "twin.study.setup.versions"):
+    other = twin.run.versions.versions() | {"numpy": "1.0"}
+    for place in (
+        "twin.run.versions.versions",
+        "twin.study.runs.study_folder.versions",
+        "twin.study.runs.setup.versions",
+    ):
         monkeypatch.setattr(place, lambda: other)
     with pytest.raises(RunFolderError, match=r"numpy was [0-9.]+ and is 1\.0"):
         work(path, fresh(setup), resume=True)
@@ -94,7 +103,7 @@ def test_sources_change_with_the_files(tmp_path, monkeypatch) -> None:
     for name in ("optics/a.py", "twin/b.py", "twin/validation/c.py", "scenes/d.yaml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")
-    monkeypatch.setattr(twin.versions, "ROOT", tmp_path)
+    monkeypatch.setattr(twin.run.versions, "ROOT", tmp_path)
     read = sources.__wrapped__
     first = read()
     assert set(first) == {"optics/a.py", "twin/b.py"}
@@ -169,8 +178,8 @@ def test_studies_that_start_together_get_a_number_each(setup, tmp_path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from twin.study.folder import StudyFolder
-from twin.study.setup import resolve_study
+from twin.study.runs.study_folder import StudyFolder
+from twin.study.runs.setup import resolve_study
 with StudyFolder(Path(sys.argv[1]), resolve_study(sys.argv[2]), force=True):
     os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -187,7 +196,7 @@ def test_a_study_that_a_killed_command_was_replacing_is_not_lost(setup, tmp_path
     work(path, setup, resume=True)
     assert aside.exists()
     times = {"started_unix_s": 1.5e9, "wall_time_s": 1.0}
-    manifest = {"program": "twin.study", "versions": twin.versions.versions(), **times, "sha256": {}}
+    manifest = {"program": "twin.study", "versions": twin.run.versions.versions(), **times, "sha256": {}}
     (path / "manifest.json").write_text(json.dumps(manifest))
     work(tmp_path / "other", setup)
     assert {place.name for place in tmp_path.iterdir()} == {"run", "other", "in"}

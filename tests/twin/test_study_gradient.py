@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optics.frozen_map import FrozenMap
-from scenes.load import EXAMPLES
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.load import EXAMPLES
 from tests.twin.study_bench import write_study
 from twin.study.__main__ import app
-from twin.study.base_job import Run
-from twin.study.gradient import AD, TRACED, WHOLE, study_gradient
-from twin.study.setup import StudySetup, resolve_study
+from twin.study.gradient.study_gradient import AD, TRACED, WHOLE, study_gradient
+from twin.study.runs.base_job import Run
+from twin.study.runs.setup import StudySetup, resolve_study
 
 AGREEMENT = 1e-6
 """Differences extrapolated to the fifth power of the step leave 1e-8, rounding of the traces 1e-9 of an entry; entries

@@ -14,11 +14,11 @@ import pytest
 import xarray as xr
 
 from tests.twin.study_bench import ROOT, alive, children, chunks, start, wait_for, write_study
-from twin.study.chunk_store import ChunkStore
-from twin.study.cluster import local_workers
-from twin.study.engine import Engine, IncompleteError
-from twin.study.plan import Plan
-from twin.study.setup import resolve_study
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.cluster import local_workers
+from twin.study.runs.engine import Engine, IncompleteError
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
 
 pytestmark = pytest.mark.slow
 RUNS = 600
@@ -111,13 +111,13 @@ def test_runs_that_kill_their_worker_are_named(tmp_path, monkeypatch) -> None:
     def deadly(task):
         import os
 
-        from twin.study.task import evaluate
+        from twin.study.runs.task import evaluate
 
         if task.first <= 3 < task.first + len(task.blocks):
             os._exit(9)
         return evaluate(task)
 
-    monkeypatch.setattr("twin.study.engine.evaluate", deadly)
+    monkeypatch.setattr("twin.study.runs.engine.evaluate", deadly)
     store = ChunkStore(tmp_path, plan)
     store.open()
     before = dict(os.environ)

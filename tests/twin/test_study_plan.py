@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm, truncnorm
 
-from scenes.errors import InputError
+from scenes.yaml.errors import InputError
 from tests.twin.study_bench import STUDY, write_study
-from twin.study.config_tree import leaf, with_values
-from twin.study.plan import Plan
-from twin.study.render_base import BLOCK
-from twin.study.setup import StudySetup, resolve_study, study_from_text
+from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import BLOCK
+from twin.study.runs.setup import StudySetup, resolve_study, study_from_text
 
 FACTORS = STUDY[STUDY.index("factors:") : STUDY.index("design:")]
 NORMAL = "normal: {mean: 0 um, sigma: 1 um}"

@@ -5,19 +5,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from scenes.errors import InputError
-from scenes.job import PerturbationSpec
-from scenes.study import ResponseSpec
+from scenes.specs.job import PerturbationSpec
+from scenes.specs.study import ResponseSpec
+from scenes.yaml.errors import InputError
 from tests.twin.study_bench import write_study
-from twin.monitor import MonitorPath
-from twin.render_job import render_job
-from twin.study.base_job import Failure, Run
-from twin.study.block_result import BlockResult
-from twin.study.config_tree import leaf
-from twin.study.engine import check_responses
-from twin.study.perturbed_job import JobMaker, quantity_at, read_job
-from twin.study.plan import Plan
-from twin.study.setup import resolve_study
+from twin.main_job.render_job import render_job
+from twin.monitor.monitor_path import MonitorPath
+from twin.study.runs.base_job import Failure, Run
+from twin.study.runs.block_result import BlockResult
+from twin.study.runs.config_tree import leaf
+from twin.study.runs.engine import check_responses
+from twin.study.runs.perturbed_job import JobMaker, quantity_at, read_job
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
 
 
 def numbers(tree, path=()):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.twin.study_data import columns, dataset, study_of
-from twin.study.report import write_study_report
+from twin.study.report.study_report import write_study_report
 from twin.study.report.study_runs import StudyRuns
 
 TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenes.study import ParetoSpec
+from scenes.specs.study import ParetoSpec
 from tests.twin.study_data import columns, dataset, study_of
-from twin.study.report import summary
-from twin.study.report.convergence import courses
-from twin.study.report.pareto import pareto_front, ranks_of
-from twin.study.report.statistics import describe, quantile_ranks, runs_for_quantile, share_interval, std_interval
+from twin.study.report.study_analysis import courses, pareto_front, ranks_of
+from twin.study.report.study_report import summary
+from twin.study.report.study_statistics import describe, quantile_ranks, runs_for_quantile, share_interval, std_interval
 
 FALSE_ALARM = 1e-6
 """Of each statistical test; seeds are fixed, so that it passes always or never."""

@@ -12,19 +12,19 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.signal import fftconvolve
 
 from analysis.mtf.slanted_edge import measure_edge
-from optics import quadrature
-from optics.diffraction import Grid, image
-from optics.imaging import imaging_field
-from optics.pupil_function import circular_pupil
-from optics.system import assemble
-from optics.transfer import polychromatic_transfer
-from optics.tree import Motion, State
-from scenes.band import BandSpec
-from scenes.camera_model import LAUNCH_DISTANCE
-from scenes.load import load_detector
-from twin.edge_images import ALONG, DIRECTIONS, TRACK
-from twin.line_ccd import LineCcd, band_wavelengths
-from twin.target_images import (
+from optics.geometry.tree import Motion, State
+from optics.numerics import quadrature
+from optics.raytrace.system import assemble
+from optics.waves.diffraction import Grid, image
+from optics.waves.imaging import imaging_field
+from optics.waves.pupil_function import circular_pupil
+from optics.waves.transfer import polychromatic_transfer
+from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.specs.band import BandSpec
+from scenes.specs.load import load_detector
+from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.targets.edge_images import ALONG, DIRECTIONS, TRACK
+from twin.targets.target_images import (
     PLACES,
     BarDesign,
     TargetCamera,
@@ -33,8 +33,8 @@ from twin.target_images import (
     pinhole_target,
     star_target,
 )
-from twin.target_measurement import CURVE, read_bars, read_edge
-from twin.target_path import LocalMap, TargetPath
+from twin.targets.target_measurement import CURVE, read_bars, read_edge
+from twin.targets.target_path import LocalMap, TargetPath
 
 PITCH, WAVELENGTH, F_NUMBER = 7e-6, 650e-9, 9.2
 ANGLES = (2.0, 3.0, 5.0, 7.0, 10.0)

@@ -10,15 +10,15 @@ import yaml
 
 import twin.render as command
 from analysis.mtf.slanted_edge import measure_edge
-from scenes.job import JobSpec
-from scenes.load import EXAMPLES, LIBRARY
-from scenes.resolved import resolve, resolve_job
+from scenes.specs.job import JobSpec
+from scenes.specs.load import EXAMPLES, LIBRARY
+from scenes.specs.resolved import resolve, resolve_job
 from tests.twin.commands import files, invoke
-from twin.edge_images import DIRECTIONS
-from twin.experiment import MonitorExperiment
-from twin.reference_frames import described
-from twin.target_images import PLACES
-from twin.target_measurement import render_targets
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.run.reference_frames import described
+from twin.targets.edge_images import DIRECTIONS
+from twin.targets.target_images import PLACES
+from twin.targets.target_measurement import render_targets
 
 run = partial(invoke, command.app)
 PITCH, FRAMES, REGION = 7e-6, 4, 112

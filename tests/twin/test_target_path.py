@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from optics.assembly import points_to_world
-from optics.system import assemble
-from optics.trace import make_rays, trace
-from optics.tree import Motion
-from scenes.camera_under_test import ROOT, build_camera_under_test
-from scenes.collimator import CameraUnderTestSpec, CollimatorSpec
-from scenes.load import load_camera
-from twin.target_path import TargetPath
+from optics.geometry.tree import Motion
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_assembly import ROOT, build_camera_under_test
+from scenes.specs.focus_test import CameraUnderTestSpec, CollimatorSpec
+from scenes.specs.load import load_camera
+from twin.targets.target_path import TargetPath
 
 FOCAL_PLANE = f"{ROOT}/focal_plane"
 PLACES = np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.01], [0.05, -0.01], [-0.03, 0.004]])

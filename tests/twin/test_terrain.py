@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from scenes.orbit_scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
-from twin.orbit.earth import Earth
-from twin.orbit.ground.frame import GroundFrame
+from scenes.specs.orbit_scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
+from twin.orbit.flight.earth import Earth
+from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, fractal_field
 from twin.orbit.ground.orthophoto import SCALE, make_control
-from twin.orbit.ground.random_field import correlated_field, fractal_field
-from twin.orbit.ground.spline_grid import SplineGrid
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import Extent, apparent, reflectance
 

@@ -14,12 +14,12 @@ from scipy.stats import chi2
 
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import choose, compensate
-from scenes.dividing_error import DividingErrorSpec, TurntableTestSpec
-from scenes.errors import InputError
-from scenes.load import EXAMPLES, load_turntable_test
-from twin.laboratory.dividing_error import DividingError, TurntableModel
-from twin.laboratory.turntable import TurntableRun, run_turntable
-from twin.laboratory.turntable_sections import sections
+from scenes.specs.load import EXAMPLES, load_turntable_test
+from scenes.specs.turntable_test import DividingErrorSpec, TurntableTestSpec
+from scenes.yaml.errors import InputError
+from twin.laboratory.turntable_bench import DividingError, TurntableModel
+from twin.laboratory.turntable_report import sections
+from twin.laboratory.turntable_run import TurntableRun, run_turntable
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4

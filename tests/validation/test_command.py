@@ -18,9 +18,9 @@ import pytest
 
 import twin.validate as command
 from tests.twin.commands import files, invoke
-from twin.artefact import Data, PngFigure, SvgFigure, Table
+from twin.run.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
-from twin.validation.check import (
+from twin.validation.checks.check import (
     CONFIRMED,
     CONSISTENT,
     CORRECTED,
@@ -34,8 +34,8 @@ from twin.validation.check import (
     CheckResult,
     Explanation,
 )
-from twin.validation.chosen import Chosen, InputRange, Supposed
-from twin.validation.group import CheckGroup, Context, matches
+from twin.validation.checks.chosen import Chosen, InputRange, Supposed
+from twin.validation.checks.group import CheckGroup, Context, matches
 from twin.validation.registry import UnknownCheck, select
 from twin.validation.runner import run_checks
 
@@ -617,9 +617,9 @@ def test_bad_options(options, fake, tmp_path):
 SLOW = """
 import runpy, signal, sys, time
 from twin.validation import registry
-from twin.validation.check import Check
-from twin.validation.chosen import Chosen, InputRange, Supposed
-from twin.validation.group import CheckGroup
+from twin.validation.checks.check import Check
+from twin.validation.checks.chosen import Chosen, InputRange, Supposed
+from twin.validation.checks.group import CheckGroup
 
 def sleep(context):
     (context.folder / "begun").touch()

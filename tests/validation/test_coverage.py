@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from twin.validation import registry
-from twin.validation.check import PAPERS
-from twin.validation.group import matches
+from twin.validation.checks.check import PAPERS
+from twin.validation.checks.group import matches
 
 SUMMARY = Path(__file__).resolve().parents[2] / "docs" / "validation" / "README.md"
 IDS = {

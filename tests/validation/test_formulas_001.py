@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from twin.validation.check import CONFIRMED, CORRECTED, REFUTED
+from twin.validation.checks.check import CONFIRMED, CORRECTED, REFUTED
 from twin.validation.paper_001 import formulas as formulas_group
+from twin.validation.paper_001 import formulas as mirror
 from twin.validation.paper_001 import joint as joint_group
-from twin.validation.paper_001 import mirror
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 

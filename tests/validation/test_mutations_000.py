@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from analysis.orbit.planes import PlaneFit
-from optics.backend import load_backend
-from optics.rotation import about_axis
-from scenes.orbit_angle import LINES
-from twin.orbit.angle import flight as flight_module
-from twin.report.svg import undrawn
-from twin.validation.check import VERDICTS
-from twin.validation.group import Context
-from twin.validation.paper_000 import equations, figures, least_squares, uses
+from optics.geometry.pose import about_axis
+from optics.numerics.backend import load_backend
+from scenes.specs.orbit_angle import LINES
+from twin.orbit.angle import angle_flight as flight_module
+from twin.run.svg import undrawn
+from twin.validation.checks.check import VERDICTS
+from twin.validation.checks.group import Context
+from twin.validation.paper_000 import equations_000, figures, uses
 from twin.validation.paper_000.groups import GROUPS
 from twin.validation.paper_000.passes import planes_of
 from twin.validation.registry import select
@@ -35,7 +35,7 @@ def drawn():
     """Measurements of the groups, made once."""
     checks = {check.id: check for group in GROUPS for check in group.checks}
     context = Context(load_backend("llvm"), 1, frozenset(checks), checks, fast=True)
-    made = equations.make_passes(context)
+    made = equations_000.make_passes(context)
     return {
         "equations": replace(made, measured=made.measured[:120]),
         "figures": figures.make_passes(context, count=2),
@@ -47,7 +47,7 @@ def drawn():
 @pytest.fixture
 def quick(drawn, monkeypatch):
     """The groups on these measurements, without pictures."""
-    monkeypatch.setattr(equations, "make_passes", lambda _: drawn["equations"])
+    monkeypatch.setattr(equations_000, "make_passes", lambda _: drawn["equations"])
     monkeypatch.setattr(figures, "make_passes", lambda *_, **__: drawn["figures"])
     monkeypatch.setattr(uses, "make_passes", lambda _: drawn["uses"])
     monkeypatch.setattr(uses, "off_axis_passes", lambda _: drawn["off_axis"])
@@ -80,8 +80,8 @@ def squares(change):
     """(2): S of changed slopes, points and station."""
 
     def patch(monkeypatch):
-        right = least_squares.sum_of_squares
-        monkeypatch.setattr(least_squares, "sum_of_squares", lambda s, p, o: right(*change(np.array(s), p, o)))
+        right = equations_000.sum_of_squares
+        monkeypatch.setattr(equations_000, "sum_of_squares", lambda s, p, o: right(*change(np.array(s), p, o)))
 
     return patch
 
@@ -90,8 +90,8 @@ def sums(change):
     """(4): other sums."""
 
     def patch(monkeypatch):
-        right = least_squares.derivatives
-        monkeypatch.setattr(equations, "derivatives", lambda s, p, o: change(right(s, p, o), s, p, o))
+        right = equations_000.derivatives
+        monkeypatch.setattr(equations_000, "derivatives", lambda s, p, o: change(right(s, p, o), s, p, o))
 
     return patch
 
@@ -104,7 +104,7 @@ def solved(change, method="corrected"):
             fits = planes_of(measured, which, lines)
             return [_with_slopes(fit, change) if which == method else fit for fit in fits]
 
-        monkeypatch.setattr(equations, "planes_of", wrong)
+        monkeypatch.setattr(equations_000, "planes_of", wrong)
 
     return patch
 
@@ -116,7 +116,7 @@ def _with_slopes(fit, change):
     return replace(fit, normal=normal / np.linalg.norm(normal))
 
 
-def angles(change, module=equations, name="intersection_angles"):
+def angles(change, module=equations_000, name="intersection_angles"):
     """(6), (7): change: (unit normals, printed angles) -> angles."""
 
     def patch(monkeypatch):

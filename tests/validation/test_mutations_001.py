@@ -19,22 +19,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from analysis import autocollimator, intersection_angle, monitoring, recovery
+from analysis.monitor import autocollimator, intersection_angle, monitoring, recovery
 from analysis.units import ARCSEC
-from scenes.load import load_principle_experiment
-from twin import principle_checks, principle_table
-from twin.principle_experiment import Reader, run_principle_experiment
-from twin.validation.check import REPRODUCED, UNDECIDED
-from twin.validation.group import Context
+from scenes.specs.load import load_principle_experiment
+from twin.validation.checks.check import REPRODUCED, UNDECIDED
+from twin.validation.checks.group import Context
 from twin.validation.paper_001 import (
+    budget,
     error_budget,
-    error_propagation,
     formulas,
+    formulas_images,
     joint,
-    left_right,
     monitored_errors,
     principle,
+    principle_bench,
+    principle_rows,
 )
+from twin.validation.paper_001.principle_bench import Reader, run_principle_experiment
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -166,14 +167,14 @@ def relation(change: Callable[[str, int, float, float], float]):
         def broken(axis, unit, between):
             return change(axis, unit, between, sound(axis, unit, between))
 
-        for module in (autocollimator, principle_table, principle_checks):
+        for module in (autocollimator, principle_bench, principle_rows):
             patch.setattr(module, "relation_factor", broken)
 
     return apply
 
 
 def plain_sum(errors):
-    return sum(error_propagation.frame_mean(e) if name == "centroid" else e for name, e in errors.items())
+    return sum(budget.frame_mean(e) if name == "centroid" else e for name, e in errors.items())
 
 
 def twice_the(angle):
@@ -203,7 +204,8 @@ DIFFERENCES = ("001.eq5", "001.eq7", "001.table1.d_gamma", "001.table1.d_f")
 
 
 def by_factors() -> list[Mutation]:
-    """(2), (3), (5), (7) and Table 1's joint forms, in analysis/monitoring.py; Table 5 through the same factors."""
+    """(2), (3), (5), (7) and Table 1's joint forms, in analysis/monitor/monitoring.py; Table 5 through the same
+    factors."""
     out = []
     for estimator, rows, group in (("paper_single", SINGLE, "formulas"), ("paper_joint", JOINT, "joint")):
         for identifier, (row, turns) in rows.items():
@@ -238,7 +240,7 @@ MUTATIONS = (
     ),
     *by_factors(),
     *(
-        Mutation(f"001.eq{number}", name, "formulas", f"001.eq{number + 1}", formula(left_right, function, broken))
+        Mutation(f"001.eq{number}", name, "formulas", f"001.eq{number + 1}", formula(formulas_images, function, broken))
         for number, function in ((4, "roll_displacement"), (6, "scale_displacement"))
         for name, broken in (
             ("sign", scaled(-1)),
@@ -248,18 +250,18 @@ MUTATIONS = (
         )
     ),
     Mutation("001.eq8", "sign", "joint", "001.eq8.y 001.eq8.x",
-             formula(left_right, "superposed", lambda sound: lambda first, second: first - second)),
-    Mutation("001.eq8", "twice", "joint", "001.eq8.y 001.eq8.x", formula(left_right, "superposed", scaled(2))),
+             formula(formulas_images, "superposed", lambda sound: lambda first, second: first - second)),
+    Mutation("001.eq8", "twice", "joint", "001.eq8.y 001.eq8.x", formula(formulas_images, "superposed", scaled(2))),
     Mutation("001.eq8", "one twice", "joint", "001.eq8.y 001.eq8.x",
-             formula(left_right, "superposed", lambda sound: lambda first, second: first + 2 * second)),
+             formula(formulas_images, "superposed", lambda sound: lambda first, second: first + 2 * second)),
     *(
         Mutation("001.eq9", f"{name} of {parameter}", "joint", f"001.eq9.{parameter}",
-                 formula(left_right, function, scaled(by)))
+                 formula(formulas_images, function, scaled(by)))
         for parameter, function in (("d_f", "right_of_focal_length"), ("d_beta", "right_of_rotation"))
         for name, by in (("sign", -1), ("twice", 2))
     ),
     *(
-        Mutation(equation, name, "joint", turns, formula(left_right, function, pair(change)))
+        Mutation(equation, name, "joint", turns, formula(formulas_images, function, pair(change)))
         for equation, function, sums, differences in (
             ("001.eq10", "parts_along", "001.eq10.d_beta", "001.eq10.d_f"),
             ("001.eq11", "parts_across", "001.eq11.d_alpha", "001.eq11.d_gamma"),
@@ -276,16 +278,16 @@ MUTATIONS = (
     Mutation("001.fig4", "twice", "joint", "001.fig4.angle",
              formula(intersection_angle, "exact", lambda sound: lambda f, b, lf, lb: twice_the(sound(f, b, lf, lb)))),
     Mutation("001.eq12", "frames not averaged", "error_budget", "001.eq12.frames 001.table4.printed_lines",
-             formula(error_propagation, "frame_mean", lambda sound: lambda error, frames=9: error)),
+             formula(budget, "frame_mean", lambda sound: lambda error, frames=9: error)),
     Mutation("001.eq12", "divided by 9", "error_budget", "001.eq12.frames 001.table4.printed_lines",
-             formula(error_propagation, "frame_mean", lambda sound: lambda error, frames=9: error / frames)),
+             formula(budget, "frame_mean", lambda sound: lambda error, frames=9: error / frames)),
     Mutation("001.eq12", "plain sum", "error_budget",
              "001.eq12 001.table4.printed_lines 001.table4.root_sum",
-             formula(error_propagation, "root_sum", lambda sound: plain_sum)),
+             formula(budget, "root_sum", lambda sound: plain_sum)),
     Mutation("001.eq12", "twice", "error_budget", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
-             formula(error_propagation, "root_sum", scaled(2))),
+             formula(budget, "root_sum", scaled(2))),
     Mutation("001.table4", "a quarter", "error_budget", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
-             formula(error_propagation, "root_sum", scaled(0.25))),
+             formula(budget, "root_sum", scaled(0.25))),
     Mutation("001.table5.d_gamma", "spots taken as one", "error_budget",
              "001.table5.d_beta.propagated 001.table5.d_alpha.propagated 001.table5.d_gamma.propagated "
              "001.table5.d_f.propagated 001.table5.d_f.by_table1",

@@ -16,14 +16,14 @@ from analysis.orbit import forward_intersection, normal_equations, null_space, t
 from analysis.orbit import stepwise as stepwise_module
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.third_difference import third_difference
-from optics.backend import load_backend
+from optics.numerics.backend import load_backend
 from twin.orbit.calibration import schemes as calibration_schemes
 from twin.orbit.calibration.latitude import fitted
-from twin.orbit.ground.random_field import stream
-from twin.report.svg import undrawn
+from twin.orbit.ground.grid import stream
+from twin.run.svg import undrawn
 from twin.validation import registry
-from twin.validation.paper_003 import exact, flights, marks, model, quality
-from twin.validation.paper_003.setups import FIELDS, changed, setup_of, without_light
+from twin.validation.paper_003 import exact, flights, model, rendered, stability
+from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_light
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -43,7 +43,7 @@ def exact_passes():
     points = setup.test.points.model_copy(update={"control": 30, "check": 20})
     setup = changed(setup, points=points)
     campaign = exact.exact_campaign(setup, stream(SEED, 0))
-    return setup, campaign, marks.rendered_marks(setup, campaign, stream(SEED, 1))
+    return setup, campaign, rendered.rendered_marks(setup, campaign, stream(SEED, 1))
 
 
 @cache
@@ -81,7 +81,7 @@ def turned(monkeypatch):
     monkeypatch.setattr(model, "exact_and_images", lambda: exact_passes()[0])
     monkeypatch.setattr(exact, "exact_campaign", lambda *_: exact_passes()[1])
     monkeypatch.setattr(exact, "places_seen", places_seen)
-    monkeypatch.setattr(marks, "rendered_marks", lambda *_: exact_passes()[2])
+    monkeypatch.setattr(rendered, "rendered_marks", lambda *_: exact_passes()[2])
     monkeypatch.setattr(flights, "flown", lambda *_: campaigns())
     monkeypatch.setattr(flights, "calibrated_alone", alone)
 
@@ -106,7 +106,7 @@ def of_model(change):
         return three_line_model.misclosure(camera, rays, ground, bias, offset)
 
     def patch(monkeypatch):
-        for module in (exact, marks, normal_equations, forward_intersection):
+        for module in (exact, rendered, normal_equations, forward_intersection):
             monkeypatch.setattr(module, "misclosure", broken)
 
     return patch
@@ -178,7 +178,7 @@ def of_differences(change):
         return replace(found, rms=rms, white_sigma=rms / np.sqrt(20.0))
 
     def patch(monkeypatch):
-        monkeypatch.setattr(quality, "third_difference", broken)
+        monkeypatch.setattr(stability, "third_difference", broken)
 
     return patch
 

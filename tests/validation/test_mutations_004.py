@@ -15,15 +15,15 @@ from analysis.focal_plane.plane_fit import FocalPlaneFit
 from analysis.turntable import chauvenet as criterion
 from analysis.turntable import dividing_error
 from analysis.turntable.dividing_error import DividingCompensation
-from optics.backend import load_backend
-from scenes.lab_setup import resolve_distortion, resolve_focus
-from twin.laboratory import distortion as laboratory
+from optics.numerics.backend import load_backend
+from scenes.specs.lab_setup import resolve_distortion, resolve_focus
+from twin.laboratory import distortion_run as laboratory
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.focus import align
+from twin.laboratory.focus_alignment import align
 from twin.laboratory.focus_bench import FocusBench
 from twin.validation import registry
-from twin.validation.check import FAILED
-from twin.validation.paper_004 import distortion, equations, focus, orientation
+from twin.validation.checks.check import FAILED
+from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, orientation
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -60,11 +60,11 @@ def _budget(right):
 @pytest.fixture
 def turned(monkeypatch):
     """Function: ids -> those whose verdict is not the expected one, on the cached images."""
-    monkeypatch.setattr(distortion, "measured_tests", lambda context: list(spot_tests()[1].values()))
+    monkeypatch.setattr(distortion_checks, "measured_tests", lambda context: list(spot_tests()[1].values()))
     right = FocusBench.budget
     monkeypatch.setattr(FocusBench, "budget", lambda self: _budget(right))
-    monkeypatch.setattr(focus, "FocusBench", lambda *_: alignment().bench)
-    monkeypatch.setattr(focus, "measured_alignments", lambda *_: [alignment()])
+    monkeypatch.setattr(focus_checks, "FocusBench", lambda *_: alignment().bench)
+    monkeypatch.setattr(focus_checks, "measured_alignments", lambda *_: [alignment()])
 
     def check(only):
         results = run_checks(select(GROUPS, only), load_backend("llvm"), 1, fast=True).results
@@ -99,7 +99,7 @@ def eq2(change):
         return change(np.sum(where * t), np.sum(where * t**2), *(np.sum(t**k) for k in (2, 3, 4)))
 
     def patch(monkeypatch):
-        for module in (orientation, equations):
+        for module in (orientation, equations_004):
             monkeypatch.setattr(module, "principal_distance_and_point", broken)
 
     return patch
@@ -118,7 +118,7 @@ def eq3(change):
         return np.asarray(change(np.sum(where * t, axis=-1), np.sum(t**2, axis=-1)))
 
     def patch(monkeypatch):
-        for module in (orientation, equations):
+        for module in (orientation, equations_004):
             monkeypatch.setattr(module, "principal_distance", broken)
 
     return patch
@@ -132,7 +132,7 @@ def eq4(change):
         return np.asarray(change(f * np.sum(t**3), np.sum(where * t**2), np.sum(t**4)))
 
     def patch(monkeypatch):
-        for module in (orientation, equations):
+        for module in (orientation, equations_004):
             monkeypatch.setattr(module, "principal_point", broken)
 
     return patch
@@ -140,26 +140,26 @@ def eq4(change):
 
 def vertex(factor):
     def patch(monkeypatch):
-        right = focus.focus_vertex
+        right = focus_checks.focus_vertex
 
         def broken(*given):
             found = right(*given)
             return dataclasses.replace(found, position=factor * found.position)
 
-        monkeypatch.setattr(focus, "focus_vertex", broken)
+        monkeypatch.setattr(focus_checks, "focus_vertex", broken)
 
     return patch
 
 
 def plane(change):
     def patch(monkeypatch):
-        right = focus.fit_focal_plane
+        right = focus_checks.fit_focal_plane
 
         def broken(*given, **options):
             found = right(*given, **options)
             return dataclasses.replace(found, **change(found))
 
-        monkeypatch.setattr(focus, "fit_focal_plane", broken)
+        monkeypatch.setattr(focus_checks, "fit_focal_plane", broken)
 
     return patch
 
@@ -178,13 +178,13 @@ def level(factor):
 
 def shims(change):
     def patch(monkeypatch):
-        right = focus.shim_plan
+        right = focus_checks.shim_plan
 
         def broken(*given):
             found = right(*given)
             return dataclasses.replace(found, change=change(found.change))
 
-        monkeypatch.setattr(focus, "shim_plan", broken)
+        monkeypatch.setattr(focus_checks, "shim_plan", broken)
 
     return patch
 
@@ -203,8 +203,8 @@ def edge(factor):
             return tuple(v / factor for v in self.right.frequency_at(value))
 
     def patch(monkeypatch):
-        right = focus.measure_edge
-        monkeypatch.setattr(focus, "measure_edge", lambda *given, **options: Broken(right(*given, **options)))
+        right = focus_checks.measure_edge
+        monkeypatch.setattr(focus_checks, "measure_edge", lambda *given, **options: Broken(right(*given, **options)))
 
     return patch
 
@@ -246,14 +246,14 @@ def compensation(factor):
         by_record = {id(test.record): test.spots for test in tests.values()}
         monkeypatch.setattr(laboratory, "_locate", lambda bench, record: by_record[id(record)])
         made = [laboratory.measure(bench, seed) for seed in tests]
-        monkeypatch.setattr(distortion, "measured_tests", lambda context: made)
+        monkeypatch.setattr(distortion_checks, "measured_tests", lambda context: made)
 
     return patch
 
 
 def reduction(change):
     def patch(monkeypatch):
-        monkeypatch.setattr(distortion, "lower", lambda raw, own: float(change(raw, own)))
+        monkeypatch.setattr(distortion_checks, "lower", lambda raw, own: float(change(raw, own)))
 
     return patch
 

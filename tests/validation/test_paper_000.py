@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from optics.backend import load_backend
-from twin.report.svg import undrawn
-from twin.validation.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
+from optics.numerics.backend import load_backend
+from twin.run.svg import undrawn
+from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
 from twin.validation.paper_000 import figures, suppositions, table1
+from twin.validation.paper_000.equations_000 import derivatives, least_slopes, numerical_derivatives, sum_of_squares
 from twin.validation.paper_000.groups import GROUPS
-from twin.validation.paper_000.least_squares import derivatives, least_slopes, numerical_derivatives, sum_of_squares
 from twin.validation.paper_000.sentences import AXES, SENTENCES
 from twin.validation.registry import select
 from twin.validation.runner import run_checks

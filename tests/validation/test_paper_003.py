@@ -5,10 +5,10 @@ tables say, and, marked slow, all of them.
 import numpy as np
 import pytest
 
-from optics.backend import load_backend
-from twin.report.svg import undrawn
+from optics.numerics.backend import load_backend
+from twin.run.svg import undrawn
 from twin.validation import registry
-from twin.validation.check import AGREED, CORRECTED, FAILED, NOT_CHECKABLE, UNDECIDED
+from twin.validation.checks.check import AGREED, CORRECTED, FAILED, NOT_CHECKABLE, UNDECIDED
 from twin.validation.paper_003 import fields, flights, model
 from twin.validation.registry import Selection, select
 from twin.validation.runner import run_checks

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from analysis.turntable.angle_fits import FITS
-from optics.backend import load_backend
+from optics.numerics.backend import load_backend
 from twin.validation import registry
-from twin.validation.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED, UNDECIDED
-from twin.validation.paper_004 import distortion, focus, turntable
+from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED, UNDECIDED
+from twin.validation.paper_004 import distortion_checks, focus_checks, turntable_checks
 from twin.validation.paper_004.orientation import Perspective
-from twin.validation.paper_004.turntable import FittedTable
+from twin.validation.paper_004.turntable_checks import FittedTable
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -145,9 +145,9 @@ def test_only_what_is_needed_runs(monkeypatch):
     def build(*_):
         raise AssertionError("not asked for")
 
-    monkeypatch.setattr(distortion.DistortionBench, "build", build)
-    monkeypatch.setattr(turntable, "fit_table", build)
-    monkeypatch.setattr(focus, "FocusBench", build)
+    monkeypatch.setattr(distortion_checks.DistortionBench, "build", build)
+    monkeypatch.setattr(turntable_checks, "fit_table", build)
+    monkeypatch.setattr(focus_checks, "FocusBench", build)
     found = run_checks(select(GROUPS, "004.table2.reduction,004.turntable.repeat"), load_backend("llvm"), 2).results
     assert {r.id: r.verdict for r in found} == {"004.turntable.repeat": REPRODUCED, "004.table2.reduction": REFUTED}
 
@@ -162,7 +162,7 @@ def test_only_what_is_needed_runs(monkeypatch):
 )
 def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, keys, monkeypatch):
     """The stated limits come from a formula; tables with such inputs, simulated, just agree and just do not."""
-    right = turntable.resolve_turntable
+    right = turntable_checks.resolve_turntable
     limits = results(REPEATS)[identifier].inputs[which]
 
     def judged(value):
@@ -176,8 +176,8 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
             }
             return setup.model_copy(update={"test": setup.test.model_copy(update=update)})
 
-        monkeypatch.setattr(turntable, "resolve_turntable", changed)
-        (found,) = run_checks(select([turntable.GROUP], identifier), load_backend("llvm"), 1, fast=True).results
+        monkeypatch.setattr(turntable_checks, "resolve_turntable", changed)
+        (found,) = run_checks(select([turntable_checks.GROUP], identifier), load_backend("llvm"), 1, fast=True).results
         return found.verdict
 
     assert limits.high is not None
@@ -190,8 +190,8 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
 )
 def test_advantage_of_the_network(network, value, verdict, monkeypatch):
     made = {**{name: 1.0 + 0.1 * k for k, name in enumerate(FITS)}, "network": network, "cubic_spline": 1.0}
-    monkeypatch.setattr(turntable, "fit_table", lambda *_: FittedTable("cubic_spline", made))
-    group = turntable.GROUP
+    monkeypatch.setattr(turntable_checks, "fit_table", lambda *_: FittedTable("cubic_spline", made))
+    group = turntable_checks.GROUP
     (run,) = run_checks(select([group], "004.turntable.network"), load_backend("llvm"), 1).runs
     (result,) = run.results
     assert (result.measured, result.verdict) == (pytest.approx(value), verdict)

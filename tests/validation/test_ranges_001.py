@@ -3,18 +3,17 @@
 import numpy as np
 import pytest
 
-from analysis import monitoring
-from analysis.spot_positions import SpotError
-from scenes.job import JobSpec
-from scenes.resolved import resolve_job
-from twin.report.svg import undrawn
-from twin.validation.check import CONFIRMED, CORRECTED, FAILED, REFUTED
-from twin.validation.group import Context
-from twin.validation.paper_001.ranges import GROUP, group
-from twin.validation.paper_001.ranges.bench import Bench
-from twin.validation.paper_001.ranges.curves import sampled
-from twin.validation.paper_001.ranges.singles import EDGE_PX, WIDE_PX, motion_of, single_range
-from twin.validation.paper_001.ranges.variants import variant
+from analysis.monitor import monitoring
+from analysis.spots.spot_positions import SpotError
+from scenes.specs.job import JobSpec
+from scenes.specs.resolved import resolve_job
+from twin.run.svg import undrawn
+from twin.validation.checks.check import CONFIRMED, CORRECTED, FAILED, REFUTED
+from twin.validation.checks.group import Context
+from twin.validation.paper_001.ranges import GROUP, ranges_group
+from twin.validation.paper_001.ranges.curves import Bench, sampled
+from twin.validation.paper_001.ranges.defocus import variant
+from twin.validation.paper_001.ranges.turns import EDGE_PX, WIDE_PX, motion_of, single_range
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -23,7 +22,7 @@ EXPECTED = {check.id: check.expected for check in GROUP.checks}
 
 @pytest.fixture(scope="module")
 def resolved():
-    return resolve_job(JobSpec(instrument=group.INSTRUMENT))
+    return resolve_job(JobSpec(instrument=ranges_group.INSTRUMENT))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +82,7 @@ def test_the_range_of_a_formula_turns_with_a_wrong_factor(bench, wide, backend, 
 
     def judged():
         both = [single_range(bench, wide, parameter, 1, 3)]
-        return group._range(context, row, both, bench.geometry("forward")).verdict
+        return ranges_group._range(context, row, both, bench.geometry("forward")).verdict
 
     assert judged() == verdict
     right = monitoring.coefficients

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from optics.backend import Backend
-from optics.pose import Pose
-from optics.pupil_function import PupilFunction
-from scenes.camera_under_test import ROOT, CameraUnderTest, build_camera_under_test
-from twin.edge_images import ALONG, DIRECTIONS, EdgeImager, EdgeOptics, knife_edge
-from twin.line_ccd import LineCcd
-from twin.target_path import LocalMap, TargetPath
-from twin.trial.result import Advance, silent
+from optics.geometry.pose import Pose
+from optics.numerics.backend import Backend
+from optics.waves.pupil_function import PupilFunction
+from scenes.models.camera_assembly import ROOT, CameraUnderTest, build_camera_under_test
+from twin.run.result import Advance, silent
+from twin.sensors.line_ccd import LineCcd
+from twin.targets.edge_images import ALONG, DIRECTIONS, EdgeImager, EdgeOptics, knife_edge
+from twin.targets.target_path import LocalMap, TargetPath
 
 if TYPE_CHECKING:
-    from scenes.lab_setup import FocusSetup
+    from scenes.specs.lab_setup import FocusSetup
 
 _SEARCH = 0.3e-3
 """Defocus up to which best focus is looked for, metres."""

@@ -11,13 +11,12 @@ import numpy as np
 from analysis.focal_plane.through_focus import FocusError, FocusVertex, focus_vertex
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.slanted_edge import measure_edge
-from optics.pose import Pose
-from optics.threads import cores, one_blas_thread
-from twin.detector import FixedPattern
-from twin.edge_images import ALONG, DIRECTIONS
+from optics.geometry.pose import Pose
+from optics.numerics.threads import cores, one_blas_thread
 from twin.laboratory.focus_bench import FocusBench, Site
-from twin.trial.bench_error import BenchError
-from twin.trial.result import Advance, silent
+from twin.run.result import Advance, BenchError, silent
+from twin.sensors.area_detector import FixedPattern
+from twin.targets.edge_images import ALONG, DIRECTIONS
 
 NYQUIST = 0.5
 """Cycles per pixel."""

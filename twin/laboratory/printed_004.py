@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from optics.frozen_map import FrozenMap
+from optics.numerics.frozen_map import FrozenMap
 
 MTF_NYQUIST: Mapping[str, float] = FrozenMap({"P": 0.2, "B1": 0.36, "B2": 0.36, "B3": 0.37, "B4": 0.36})
 """Table 1: average MTF of the backward camera in each band."""

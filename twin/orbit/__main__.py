@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import typer
 
-from scenes.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
-from twin.orbit.angle.result import run_angle
-from twin.orbit.calibration.result import run_calibration
-from twin.orbit.images.result import run_simulation
-from twin.orbit.monitoring.result import run_monitor
-from twin.trial.command import add_test
+from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+from twin.orbit.angle.angle_report import run_angle
+from twin.orbit.calibration.calibration_report import run_calibration
+from twin.orbit.images.simulate_report import run_simulation
+from twin.orbit.monitoring.monitoring_report import run_monitor
+from twin.run.command import add_test
 
 PROGRAM = "twin.orbit"
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.scenery import Scenery
+from scenes.models.scenery import Scenery
 from twin.path_tracing.families import Touch
-from twin.path_tracing.result import KINDS, Balance, Detections, Family, PathResult
+from twin.path_tracing.path_result import KINDS, Balance, Detections, Family, PathResult
 from twin.path_tracing.sinks import CLASSES, NOMINAL, Sinks
 from twin.path_tracing.tables import NOMINAL_SUMS, ROWS_PER_SURFACE
 

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from optics import fresnel
-from optics.backend import Backend
-from twin.path_tracing.events import BITS, FACTOR, OUTSIDE, START, Event
+from optics.materials import finish
+from optics.numerics.backend import Backend
+from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
 from twin.path_tracing.shading import Leaving, level, nearest_face, spread, within
 from twin.path_tracing.sinks import Arrival, Sinks, record
 from twin.path_tracing.tables import APERTURES, CLEARANCE, INDEX, PART, ROWS_PER_SURFACE, Kind, SceneTables
@@ -211,10 +211,10 @@ def _step(
         if glass:
             toward = dr.abs(cosine)
             after = dr.select(inside, 1.0, g[INDEX])
-            bent = fresnel.cosine_after(toward, before, after)
+            bent = finish.cosine_after(toward, before, after)
             total = bent <= 0.0
             bare, opaque = f[2] > 0.5, (f[2] <= 0.5) & (transmitted <= 0.0)
-            plain = fresnel.reflectance(toward, before, after)
+            plain = finish.reflectance(toward, before, after)
             transmitted = dr.select(bare, 1.0 - plain, dr.select(total, 0.0, transmitted))
             reflected = dr.select(bare, plain, dr.select(total & ~opaque, 1.0, reflected))
         going_on = reflected + transmitted + diffused

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from optics import scatter
-from optics.backend import Backend
-from twin.path_tracing.events import Event
+from optics.materials import scatter
+from optics.numerics.backend import Backend
+from twin.path_tracing.families import Event
 from twin.path_tracing.tables import SceneTables
 
 
@@ -37,7 +37,9 @@ def nearest_face(backend: Backend, tables: SceneTables, p: Any, d: Any, body: An
 
 
 def level(x: Any, y: Any, z: Any, g: Sequence[Any], even: int) -> tuple[Any, Any, Any, Any]:
-    """Level function of an asphere and its gradient, as ``optics.trace`` has it, from a row of the geometry table."""
+    """Level function of an asphere and its gradient, as ``optics.raytrace.trace`` has it, from a row of the geometry
+    table.
+    """
     import drjit as dr
 
     r2 = dr.fma(x, x, y * y)

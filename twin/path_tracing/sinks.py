@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from optics.backend import Backend
+from optics.numerics.backend import Backend
 from twin.path_tracing.tables import NOMINAL_SUMS, Kind, SceneTables
 
 NOMINAL, GHOST, STRAY = range(3)

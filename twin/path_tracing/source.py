@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from optics.aim import transverse_axes
-from optics.backend import Backend
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import transverse_axes
 from twin.path_tracing.kernel import Launch
 
 

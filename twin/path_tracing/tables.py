@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from optics.aperture import Aperture, Circle, Rectangle
-from optics.backend import Backend
-from scenes.scene_surface import SceneSurface
-from scenes.scenery import Scenery
+from optics.geometry.aperture import Aperture, Circle, Rectangle
+from optics.numerics.backend import Backend
+from scenes.models.scene_surface import SceneSurface
+from scenes.models.scenery import Scenery
 
 BLOCK = 4
 BLOCKS = 8

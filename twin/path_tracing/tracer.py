@@ -6,15 +6,13 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from optics.backend import Backend
-from scenes.scenery import Scenery
+from optics.numerics.backend import Backend
+from scenes.models.scenery import Scenery
 from twin.path_tracing.collect import Collector, Key, event_lists
-from twin.path_tracing.events import signature
-from twin.path_tracing.families import Touch, touches
-from twin.path_tracing.integrator import BALANCED, Sampling, make_integrator
+from twin.path_tracing.families import Touch, signature, touches
+from twin.path_tracing.integrator import BALANCED, Sampling, build_scene, load_mitsuba, make_integrator
 from twin.path_tracing.kernel import Features, Launch, PreparedScene
-from twin.path_tracing.result import PathResult
-from twin.path_tracing.scene import build_scene, load_mitsuba
+from twin.path_tracing.path_result import PathResult
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, draw, pieces, take
 from twin.path_tracing.tables import ROWS_PER_SURFACE, upload

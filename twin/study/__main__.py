@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from scenes.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.cli import BACKEND_HELP, explained, print_place, print_whole
-from twin.study.cluster import ClusterError
-from twin.study.command import Broken, StudyOptions, StudyRun, run_study
-from twin.study.engine import Estimate, IncompleteError
-from twin.study.engine import Progress as EngineProgress
+from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from twin.run.cli import BACKEND_HELP, explained, print_place, print_whole
+from twin.study.runs.cluster import ClusterError
+from twin.study.runs.engine import Estimate, IncompleteError
+from twin.study.runs.engine import Progress as EngineProgress
+from twin.study.study_command import Broken, StudyOptions, StudyRun, run_study
 
 TICK_SECONDS = 10.0
 """How often a line of progress is written where there is no terminal."""
@@ -99,8 +99,8 @@ def main(
 
 
 def _differentiate(file: Path, options: StudyOptions, errors: Console, as_json: bool, quiet: bool) -> None:
+    from twin.study.gradient.gradient_report import terminal_tables
     from twin.study.gradient_command import run_gradient
-    from twin.study.gradient_table import terminal_tables
 
     with explained(errors):
         try:
@@ -196,7 +196,7 @@ def _time_text(seconds: float | None) -> str:
 
 
 def _print_result(run: StudyRun) -> None:
-    from twin.report.page import cell_text
+    from twin.run.page import cell_text
 
     numbers = run.numbers
     title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from optics.backend import load_backend
-from twin.artefact import Artefact, SvgFigure
-from twin.cli import InputErrorText, check_backend
-from twin.reference_frames import described
-from twin.run_folder import MANIFEST, RunFolder, chosen
-from twin.study.command import StudyOptions, broken_by_signals
-from twin.study.folder import PROGRAM
-from twin.study.gradient import AD, Gradient, study_gradient
-from twin.study.setup import StudySetup, resolve_study
-from twin.versions import versions
+from optics.numerics.backend import load_backend
+from twin.run.artefact import Artefact, SvgFigure
+from twin.run.cli import InputErrorText, check_backend
+from twin.run.reference_frames import described
+from twin.run.run_folder import MANIFEST, RunFolder, chosen
+from twin.run.versions import versions
+from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
+from twin.study.runs.setup import StudySetup, resolve_study
+from twin.study.runs.study_folder import PROGRAM
+from twin.study.study_command import StudyOptions, broken_by_signals
 
 TEMPLATE = "gradient.html.j2"
 
@@ -63,7 +63,7 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
     with broken_by_signals(), RunFolder(chosen(options.out, f"{file.stem}-gradient"), options.force) as folder:
         found = study_gradient(setup, load_backend(options.backend), advance)
         advance("writing the report")
-        from twin.study.gradient_table import plain_data, whole_table
+        from twin.study.gradient.gradient_report import plain_data, whole_table
 
         numbers = described("gradient", plain_data(found))
         folder.write_text("config.yaml", setup.to_yaml())
@@ -86,12 +86,10 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
 
 def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None:
     # drawing libraries are not needed before
-    from twin.report.numbers import significant
-    from twin.report.page import artefact_content, environment
-    from twin.report.svg import look, to_svg
-    from twin.study.gradient_figure import heat_map, tornado
-    from twin.study.gradient_table import doubtful, factor_rows, response_table
-    from twin.trial.output import place
+    from twin.run.artefact import significant
+    from twin.run.page import artefact_content, environment, place
+    from twin.run.svg import look, to_svg
+    from twin.study.gradient.gradient_report import doubtful, factor_rows, heat_map, response_table, tornado
 
     with look("gradient"):
         figures = [
@@ -114,7 +112,7 @@ def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None
     for artefact in (*figures, *tables):
         folder.write_bytes(place(artefact), artefact.content())
     page = (
-        environment("twin.study.report")
+        environment(__package__)
         .get_template(TEMPLATE)
         .render(
             study=setup.study,

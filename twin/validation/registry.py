@@ -6,12 +6,12 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from scenes.errors import nearest
-from twin.validation.group import CheckGroup, matches
+from scenes.yaml.errors import nearest
+from twin.validation.checks.group import CheckGroup, matches
 from twin.validation.paper_000 import groups as paper_000
 from twin.validation.paper_001 import error_budget, formulas, joint, principle, ranges
 from twin.validation.paper_003 import fields, model
-from twin.validation.paper_004 import distortion, equations, focus, turntable, unprinted
+from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks, unprinted
 
 GROUPS: tuple[CheckGroup, ...] = (
     *paper_000.GROUPS,
@@ -22,10 +22,10 @@ GROUPS: tuple[CheckGroup, ...] = (
     error_budget.GROUP,
     model.GROUP,
     fields.GROUP,
-    focus.GROUP,
-    equations.GROUP,
-    turntable.GROUP,
-    distortion.GROUP,
+    focus_checks.GROUP,
+    equations_004.GROUP,
+    turntable_checks.GROUP,
+    distortion_checks.GROUP,
     unprinted.GROUP,
 )
 """Every group, in the order in which they run. A new one is added here."""

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from optics.backend import Backend
-from twin.artefact import Artefact
-from twin.experiment import MonitorExperiment
-from twin.validation.check import VERDICTS, CheckResult, Verdict
-from twin.validation.group import CheckGroup, Context
+from optics.numerics.backend import Backend
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.run.artefact import Artefact
+from twin.run.versions import versions
+from twin.validation.checks.check import VERDICTS, CheckResult, Verdict
+from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.registry import Selection
-from twin.versions import versions
 
 SCHEMA = "space-camera-twin/validation"
 SCHEMA_VERSION = 2

@@ -1,10 +1,9 @@
-"""Passes over test fields: what a three-line camera that has changed since the laboratory measures of ground points,
-drawn with stated noise instead of from images (paper 003).
+"""Passes over test fields, with a three-line camera that has changed since the laboratory and may drift.
 
 Ground points come from the nadir line's image and terrain of given relief; every line sees them through the rigorous
-sensor of `twin.orbit.sensor`, from the true orbit and attitude, with light time, aberration and refraction. The
+sensor of `twin.orbit.flight.sensor`, from the true orbit and attitude, with light time, aberration and refraction. The
 analysis gets image points, control coordinates and the measured orbit and attitude, and takes the effects on the light
-out of the image points by the laboratory's camera (`twin.orbit.calibration.points`).
+out of the image points by the laboratory's camera (`twin.orbit.calibration.observations`).
 """
 
 from __future__ import annotations
@@ -18,30 +17,82 @@ from scipy.spatial.transform import Rotation
 
 from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.frozen_map import FrozenMap
-from optics.rotation import about_axis, rotation_matrix
-from scenes.orbit_angle import LINES
-from scenes.orbit_spec import OrbitSpec, PassingSpec
-from scenes.three_line_camera import ThreeLineCameraSpec
-from twin.orbit.attitude import Attitude
-from twin.orbit.calibration.drift import drawn_drift, drawn_readings, drifted_payload
-from twin.orbit.calibration.images import FieldImages, Imager
-from twin.orbit.calibration.light import light_effects
-from twin.orbit.calibration.points import FieldPoints, ImagePoints, PassData, image_sigma
-from twin.orbit.earth import Earth, east_north_up
-from twin.orbit.ground.random_field import stream
-from twin.orbit.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.line_camera import LineCamera, changed_payload, line_cameras
-from twin.orbit.measurement_errors import TERMS
-from twin.orbit.orbit import propagate
-from twin.orbit.sensor import Sensor
-from twin.orbit.trajectory import Trajectory
-from twin.trial.bench_error import BenchError
-from twin.trial.result import Advance, silent
+from optics.geometry.pose import about_axis, rotation_matrix
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit_spec import OrbitSpec, PassingSpec
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from twin.orbit.calibration.field_images import FieldImages, Imager
+from twin.orbit.calibration.observations import FieldPoints, ImagePoints, PassData, image_sigma, light_effects
+from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
+from twin.orbit.ground.grid import stream
+from twin.run.result import Advance, BenchError, silent
 
 if TYPE_CHECKING:
-    from scenes.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
-    from scenes.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
+    from scenes.specs.orbit_setup import CalibrationSetup
+
+
+_DRIFT, _READING = 6, 7
+"""Streams of a field's seed. What else is drawn of a field does not change with them."""
+
+
+def drawn_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
+    """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
+
+    The draws of a line are the same whatever their sigmas are.
+
+    Args:
+        spec: the test.
+        seed: of the field.
+    """
+    if not spec.drift:
+        return FrozenMap({})
+    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
+    sigma = {name: np.array([*one.angles, one.focal_length]) for name, one in spec.drift.items()}
+    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
+
+
+def drawn_readings(
+    spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
+) -> FrozenMap[str, np.ndarray]:
+    """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
+
+    Args:
+        spec: the test.
+        drift: the true one.
+        seed: of the field.
+    """
+    if spec.monitor is None:
+        return FrozenMap({})
+    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(LINES), 4))
+    sigma = reading_sigma(spec) * spec.errors.switched_on
+    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(LINES, noise, strict=True)})
+
+
+def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
+    """(4,) standard deviation of the monitor's readings of a camera, radians and metres. The test has a monitor."""
+    assert spec.monitor is not None
+    return np.array([*spec.monitor.angles, spec.monitor.focal_length])
+
+
+def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray]) -> ThreeLineCameraSpec:
+    """The camera with each line turned in its own axes, Rx(d_beta) Ry(d_alpha) Rz(d_gamma), and with f + d_f."""
+    lines = dict(payload.lines)
+    for name, (alpha, beta, gamma, longer) in drift.items():
+        line = lines[name]
+        turn = (
+            rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha) @ about_axis(2, gamma)
+        )
+        rotate = tuple(Rotation.from_matrix(turn).as_rotvec().tolist())
+        lines[name] = line.model_copy(update={"rotate": rotate, "focal_length": line.focal_length + float(longer)})
+    return payload.model_copy(update={"lines": FrozenMap(lines)})
+
 
 _LEAST_IMAGE = 0.02
 """Pixels. Image points without errors are given this sigma, for an adjustment needs weights."""
@@ -50,7 +101,7 @@ _SPARE = 1.25
 _PICTURES = 5
 """Stream of a field's seed for its images; the others are of what is drawn without them."""
 _TIES = 8
-"""Stream of a field's seed for the tie points of its strip; `twin.orbit.calibration.drift` has two before."""
+"""Stream of a field's seed for the tie points of its strip; `twin.orbit.calibration.campaign` has two before."""
 _MARGIN = 6.0
 """Sigmas. No point is taken so near to the end of an image that its measured place could lie outside."""
 

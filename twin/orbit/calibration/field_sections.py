@@ -1,16 +1,25 @@
-"""What a report says of the single fields: how their parameters repeat, and how their biases go with latitude."""
+"""What a report says of single fields, of points measured in images, and of errors that the fit does not show."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
-from twin.artefact import Cell, SvgFigure, Table
-from twin.orbit.calibration.figure import drawn
-from twin.orbit.calibration.procedure import CalibrationRun
+from scenes.specs.orbit_angle import LINES
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.calibration_figures import drawn
+from twin.orbit.calibration.calibration_run import CalibrationRun
+from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.field_images import BEYOND, FieldImages
+from twin.orbit.calibration.influences import INNER, OFFSET, SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
-from twin.trial.section import Section
+from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS, LineJudgement
+from twin.orbit.images.point_report import drawn_points
+from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
+from twin.run.result import Section
 
 
 def fields_section(run: CalibrationRun) -> Section:
@@ -153,3 +162,282 @@ def biases_section(run: CalibrationRun) -> Section:
         "parameters do, or a reading of the bias in every pass.",
     )
     return Section("Biases against latitude", text, (figure, table))
+
+
+_SORTS = {"control": "orthophoto", "tie": "tie"}
+
+
+def images_section(campaign: Campaign) -> Section:
+    """How many points were matched, lost and wrong, by field, sort and line."""
+    assert campaign.images is not None
+    assert campaign.spec.images is not None
+    spec = campaign.spec.images
+    total = image_totals(campaign)
+    matching = _matching(campaign.images)
+    rows: list[tuple[Cell, ...]] = []
+    for one in campaign.images:
+        s = one.screening
+        assert s is not None
+        rows.append(
+            (
+                one.name,
+                s.entered,
+                s.wrong_entered,
+                s.entered - s.left,
+                s.right_lost,
+                s.wrong_left,
+                s.check_entered,
+                s.check_left,
+                s.wrong_check_left,
+            )
+        )
+    screened = Table(
+        "image-points",
+        "Image points in the adjustment",
+        "Of points that every line has. Rejected: robust weight zero (IGG), for check points rays that do not meet.",
+        (
+            "field",
+            "entered",
+            "wrong",
+            "rejected",
+            "right rejected",
+            "wrong left",
+            "check points",
+            "check left",
+            "wrong left",
+        ),
+        rows,
+    )
+    counts = [len(p.control_ground[p.control.control]) for p in campaign.passes]
+    text = (
+        f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
+        f"Of {total['found']} places that matching found, {total['wrong_found']} are wrong "
+        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on fields that look different in the "
+        f"orthophoto; thresholds of the matching leave {total['wrong_matched']} of {total['matched']}, the "
+        f"neighbours' agreement {total['wrong_accepted']} of {total['accepted']}, the adjustment "
+        f"{total['wrong_left']} of {total['left']} image points ({total['check_left']} check points: "
+        f"{total['wrong_check_left']}). The neighbours' test costs {total['right_rejected_by_consensus']} right ones, "
+        f"the adjustment {total['right_rejected_by_adjustment']}.",
+        f"{' and '.join(str(c) for c in counts)} control points are left. Their image points weigh by the covariances "
+        f"of the matching and {BEYOND:g} px beyond them, for what no fit shows. Matches of the three "
+        "lines with one piece of the orthophoto err alike, by its noise and its "
+        "other light; that moves the adjusted point and hardly shows in residuals, so that the fit looks better than "
+        "its sigmas. The orthophoto's error in plan is nearly one for all points of a patch: each of n points has been "
+        "given n times its variance, so that the patch counts once. A shift that the whole orthophoto shares is a "
+        "wrong datum and goes into the biases; no sigma contains it.",
+    )
+    first = campaign.images[0]
+    figures = [
+        PngFigure(
+            f"points-{sort}",
+            f"From predicted to found, {_SORTS[sort]} points, first patch of {first.name}",
+            "Arrows: what is left after the median displacement, enlarged as the title says; crosses: rejected by the "
+            "neighbours; points: not matched.",
+            drawn_points(first.shown, points),
+        )
+        for sort, points in first.patches[0].points.sorts.items()
+    ]
+    return Section("Points in images", text, (matching, screened, *figures))
+
+
+def image_totals(campaign: Campaign) -> dict[str, int]:
+    """Counts over all fields and lines; wrong by truth."""
+    assert campaign.images is not None
+    every = [j for one in campaign.images for _, j in _judgements(one)]
+    names = ("found", "matched", "accepted", "wrong_found", "wrong_matched", "wrong_accepted")
+    out = {name: sum(getattr(j, name) for j in every) for name in names}
+    out["right_rejected_by_consensus"] = sum(j.good_lost for j in every)
+    screenings = [one.screening for one in campaign.images if one.screening is not None]
+    more = ("entered", "left", "wrong_entered", "wrong_left", "check_entered", "check_left", "wrong_check_left")
+    out |= {name: sum(getattr(s, name) for s in screenings) for name in more}
+    out["right_rejected_by_adjustment"] = sum(s.right_lost for s in screenings)
+    return out
+
+
+def images_data(campaign: Campaign) -> dict[str, Any] | None:
+    """The numbers as plain data; None for drawn points."""
+    if campaign.images is None:
+        return None
+    fields: dict[str, Any] = {}
+    for one in campaign.images:
+        fields[one.name] = {
+            sort: {line: _numbers(parts) for line, parts in lines.items()} for sort, lines in _by_line(one).items()
+        }
+    return {"total": image_totals(campaign), "fields": fields}
+
+
+def _matching(images: tuple[FieldImages, ...]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for one in images:
+        for sort, lines in _by_line(one).items():
+            for line, parts in lines.items():
+                n = _numbers(parts)
+                wrong = (f"{n[f'wrong_{stage}']} of {n[stage]}" for stage in ("found", "matched", "accepted"))
+                cells = (n["right_rejected_by_consensus"], n["rms_lines_px"], n["rms_pixels_px"], n["chi_square_ratio"])
+                rows.append((one.name, _SORTS[sort], line, *wrong, *cells))
+    return Table(
+        "image-matching",
+        "Matching",
+        f"Wrong: more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px; "
+        "before any test, after the thresholds of matching, after consensus. RMS along the track and the line, px, and "
+        "chi-square of the errors over degrees of freedom, of right places.",
+        (
+            "field",
+            "points",
+            "line",
+            "wrong before",
+            "after matching",
+            "after consensus",
+            "right lost",
+            "RMS track",
+            "RMS line",
+            "χ²/dof",
+        ),
+        rows,
+        (None, None, None, None, None, None, None, 3, 3, 2),
+    )
+
+
+def _judgements(one: FieldImages) -> list[tuple[tuple[str, str], LineJudgement]]:
+    return [
+        ((sort, line), j)
+        for patch in one.patches
+        for sort, lines in patch.judgements.items()
+        for line, j in lines.items()
+    ]
+
+
+def _by_line(one: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
+    out: dict[str, dict[str, list[LineJudgement]]] = {}
+    for (sort, line), j in _judgements(one):
+        out.setdefault(sort, {}).setdefault(line, []).append(j)
+    return out
+
+
+def _numbers(parts: list[LineJudgement]) -> dict[str, Any]:
+    names = ("found", "matched", "accepted", "wrong_found", "wrong_matched", "wrong_accepted")
+    out: dict[str, Any] = {name: sum(getattr(j, name) for j in parts) for name in names}
+    out["right_rejected_by_consensus"] = sum(j.good_lost for j in parts)
+    degrees = np.array([j.degrees_of_freedom for j in parts])
+    square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
+    rms = np.sqrt(square / max(degrees.sum(), 1))
+    out |= {"rms_lines_px": float(rms[0]), "rms_pixels_px": float(rms[1])}
+    out["chi_square_ratio"] = float(sum(j.chi_square for j in parts) / max(degrees.sum(), 1))
+    return out
+
+
+def light_section(run: CalibrationRun) -> Section:
+    """What each effect does that is not taken out of the image points."""
+    if len(run.light) < 2:
+        return Section("Effects on the light", ("None is on.",))
+    pitch = run.campaign.passes[0].data.pitch
+    sizes: list[tuple[Cell, ...]] = []
+    rows: list[tuple[Cell, ...]] = []
+    for row in run.light:
+        name = _left(row)
+        if row.left:
+            moved = [float(v / pitch[line]) for line in LINES for v in row.moved[line]]
+            sizes.append((name, *moved))
+        inner, turned = row.most(INNER), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
+        said = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
+        rows.append((f"{name} left in" if row.left else name, *row.before, *row.after, *said, row.p_value))
+    pixels = Table(
+        "light-pixels",
+        "How far image points move",
+        "RMS over the check points, pixels, x along the track and y along the line.",
+        ("effect", *(f"{line} {axis}" for line in LINES for axis in "xy")),
+        sizes,
+        (None, *(3,) * 6),
+    )
+    effects = Table(
+        "light",
+        "What is not taken out of the image points",
+        "RMS at check points, mean of the fields, metres: by the laboratory's camera, and by each field's own "
+        "parameters; the unknowns of the simultaneous adjustment that move by the most of their sigmas; chance of the "
+        "fit, with the noise of the readings counted as independent.",
+        (
+            "case",
+            "plan before",
+            "height before",
+            "plan after",
+            "height after",
+            "interior",
+            "bias",
+            "chance of the fit",
+        ),
+        rows,
+        (None, 2, 2, 2, 2, None, None, 3),
+    )
+    left = run.light[-1]
+    most, ratio = left.most(INNER)
+    text = (
+        "Light time, aberration and refraction are in the image points. The analysis takes them out by its own models "
+        "of them, with the laboratory's camera and the measured orbit and attitude: for each image point, the "
+        "direction in which it looks and the straight line to the place that it sees are projected into the image, "
+        "and the point is moved by the difference. That the camera is 100 m wrong on the ground matters to some "
+        "thousandths of a pixel, most of it because the heights of check points, which refraction depends on, are "
+        "first known to 100 m.",
+        "Left in, they do hardly any harm where a camera is used as it was calibrated: biases and principal points "
+        f"take them up, the mean error in plan goes from {run.light[0].after[0]:.3f} m to {left.after[0]:.3f} m. But "
+        f"parameters are then wrong ({most} by {1e6 * left.shift[most]:+.1f} µm, {abs(ratio):.1f} sigmas), which the "
+        "fit need not show, and they are no longer those of the camera: seen from another height, or by a satellite "
+        "that tilts, the light does something else.",
+        "The corrections use the same models of the atmosphere and of the light as the simulation: they show that the "
+        "method is right, not how well an atmosphere is known.",
+    )
+    return Section("Effects on the light", text, (pixels, effects))
+
+
+def datum_section(run: CalibrationRun) -> Section:
+    """What a common shift of the control points does, and what is suspicious."""
+    rows: list[tuple[Cell, ...]] = []
+    for row in run.datum:
+        name, change = row.most
+        where = ", ".join(f"{v:g} {axis}" for v, axis in zip(row.shift, ("east", "north", "up"), strict=True) if v)
+        bias = [float(v / ARCSEC) for v in row.bias]
+        rows.append(
+            (where, *bias, f"{name} {1e6 * change:+.1f} µm", *map(float, row.offset), row.fit, row.p_value, *row.after)
+        )
+    table = Table(
+        "datum",
+        "All control points in a wrong datum",
+        "Shift in metres; mean changes of the fields' biases, arcseconds; the element of the interior that changes "
+        "most; mean changes of the orbit's offsets, metres; change of the chi-square and chance of the fit; RMS at "
+        "check points in the right datum, each field with its own parameters, metres.",
+        (
+            "shift, m",
+            *BIAS,
+            "interior",
+            *OFFSET,
+            "Δ chi-square",
+            "chance of the fit",
+            "plan after, m",
+            "height after, m",
+        ),
+        rows,
+        (None, 2, 2, 2, None, 3, 3, 3, 1, 3, 2, 2),
+    )
+    launch, spec = run.campaign.spec.launch, run.campaign.spec
+    roll, inner = (format_quantity(v, k) for v, k in ((launch.bias[0], ANGLE), (launch.interior, LENGTH)))
+    metres = SURPRISE * launch.bias[0] * spec.altitude
+    text = [
+        "A shift that all control points share in plan is a turn of the camera by shift over altitude, and one in "
+        "height a change of all principal distances and of the outer lines' x. Biases and interior take it up, the "
+        "orbit's offsets, which their prior holds, hardly do, and the fit need not show it. Check points of the same "
+        "wrong datum would not show it either.",
+        f"What remains is to ask whether the parameters are believable. The file expects {roll} (roll) and {inner} "
+        f"(interior) of a launch; beyond {SURPRISE:g} times this there is a warning, which is {metres:.0f} m of "
+        "shift across the track.",
+    ]
+    if run.surprises:
+        listed = ", ".join(f"{s.name} ({s.ratio:.1f}σ)" for s in run.surprises[:6])
+        text.append(f"Beyond what is expected here: {listed}.")
+    else:
+        text.append("Nothing is beyond what is expected here.")
+    return Section("Datum of the control points", tuple(text), (table,))
+
+
+def _left(row: LightRow) -> str:
+    if not row.left:
+        return "nothing left in"
+    return "all" if len(row.left) > 2 else " and ".join(name.replace("_", " ") for name in row.left)

@@ -14,11 +14,11 @@ from analysis.orbit.adjustment import Adjustment, Robust, adjust
 from analysis.orbit.calibration_parameters import Prior, Unknowns
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS, INTERIOR
-from scenes.orbit_angle import LINES
+from scenes.specs.orbit_angle import LINES
 from twin.orbit.calibration.campaign import Campaign
-from twin.orbit.calibration.light import EFFECTS
+from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import GAUGE, RMS, calibrated_alone, schemes_tested, tested_before, values_of
-from twin.orbit.light_effects import NO_EFFECTS
+from twin.orbit.flight.light_effects import NO_EFFECTS
 
 INNER = tuple(f"{line} {name}" for line in LINES for name in INTERIOR)
 OFFSET = ("along", "across", "down")

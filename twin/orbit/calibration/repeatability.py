@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
+from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.influences import INNER
-from twin.orbit.calibration.procedure import CalibrationRun
 
 PAPER_INTERIOR = 1e-5
 """Metres: "stable to 0.01 mm"."""

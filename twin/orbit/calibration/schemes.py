@@ -15,13 +15,13 @@ from analysis.orbit.calibration_parameters import Prior
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.null_space import Gauge
 from analysis.orbit.three_line_model import LineModel
-from optics.frozen_map import FrozenMap
+from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
-from twin.orbit.calibration.light import EFFECTS
-from twin.trial.result import Advance
+from twin.orbit.calibration.observations import EFFECTS
+from twin.run.result import Advance
 
 if TYPE_CHECKING:
-    from scenes.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit_setup import CalibrationSetup
 
 GAUGE = Gauge(held=("nadir x", "nadir y"))
 """The nadir line's principal point stays as the laboratory has it: x is not observable against pitch, y against roll so

@@ -14,12 +14,12 @@ from scipy.stats import chi2
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.residual_weights import REJECT
-from optics.frozen_map import FrozenMap
+from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.images import FieldImages, Screening
+from twin.orbit.calibration.field_images import FieldImages, Screening
 from twin.orbit.calibration.influences import simultaneous
-from twin.orbit.calibration.points import ImagePoints
-from twin.orbit.light_effects import NO_EFFECTS
+from twin.orbit.calibration.observations import ImagePoints
+from twin.orbit.flight.light_effects import NO_EFFECTS
 
 _ROUNDS = 3
 _SETTLED = 1.05

@@ -18,11 +18,11 @@ from analysis.orbit.calibration_parameters import CalibrationField
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.strip_adjustment import Datum, StripAdjustment, adjust_strip
 from analysis.orbit.three_line_model import LineModel, Rays
-from optics.frozen_map import FrozenMap
-from optics.threads import one_blas_thread
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import one_blas_thread
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.schemes import GAUGE, averaged
-from twin.trial.result import Advance
+from twin.run.result import Advance
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from twin.orbit.ground.frame import GroundFrame
-from twin.orbit.ground.random_field import correlated_field, stream
-from twin.orbit.ground.spline_grid import SplineGrid
+from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, stream
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import Extent, apparent, reflectance
 
 if TYPE_CHECKING:
-    from scenes.orbit_scene import ControlSpec, TextureSpec
+    from scenes.specs.orbit_scene import ControlSpec, TextureSpec
 
 SCALE = 10_000.0
 """Grey values of an orthophoto for a reflectance of 1."""

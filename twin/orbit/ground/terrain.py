@@ -10,12 +10,11 @@ import numpy as np
 from matplotlib.cbook import get_sample_data
 from scipy.ndimage import spline_filter
 
-from twin.orbit.earth import curvature_radii
-from twin.orbit.ground.random_field import fractal_field
-from twin.orbit.ground.spline_grid import SplineGrid
+from twin.orbit.flight.earth import curvature_radii
+from twin.orbit.ground.grid import SplineGrid, fractal_field
 
 if TYPE_CHECKING:
-    from scenes.orbit_scene import TerrainSpec
+    from scenes.specs.orbit_scene import TerrainSpec
 
 _MOST_POSTS = 4096
 """Posts along a side of a fractal; it repeats beyond."""

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from twin.orbit.ground.random_field import fractal_field, stream
-from twin.orbit.ground.spline_grid import SplineGrid
+from twin.orbit.ground.grid import SplineGrid, fractal_field, stream
 from twin.orbit.ground.terrain import Terrain
 
 if TYPE_CHECKING:
-    from scenes.orbit_scene import LightSpec, TextureSpec
+    from scenes.specs.orbit_scene import LightSpec, TextureSpec
 
 _DARKEST, _BRIGHTEST = 0.02, 0.85
 _EXPONENT = 1.25

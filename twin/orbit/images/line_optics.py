@@ -1,5 +1,4 @@
-"""The image of the ground that a moving line records: transfer function from the ground's image coordinates to pixels,
-and photons from reflectance.
+"""What the optics and the detector of a line do to its image.
 
 Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a place
 crosses the line it moves by `advance` pixels from one line to the next, less than one where the lens looks obliquely,
@@ -11,6 +10,7 @@ the track) an image sampled at lines and pixels thus has
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,18 +19,42 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import constants, fft
 
-from optics.convex_polygon import area
-from optics.pupil_function import PupilFunction, circular_pupil
-from optics.pupil_shadow import PupilShadow, separate
-from optics.transfer import TransferTable
-from optics.zernike import cartesian_terms
-from scenes.band import BandSpec
-from twin.line_ccd import LineCcd, band_wavelengths
-from twin.orbit.sensor import Sensor
+from optics.geometry.polygon import area
+from optics.geometry.zernike import cartesian_terms
+from optics.waves.pupil_function import PupilFunction, circular_pupil
+from optics.waves.pupil_shadow import PupilShadow, separate
+from optics.waves.transfer import TransferTable
+from scenes.specs.band import BandSpec
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from twin.orbit.flight.sensor import Sensor
+from twin.sensors.line_ccd import LineCcd, band_wavelengths
 
 if TYPE_CHECKING:
-    from scenes.detector import DetectorSpec
-    from scenes.orbit_scene import LineImageSpec
+    from scenes.specs.detector import DetectorSpec
+    from scenes.specs.orbit_scene import LineImageSpec
+
+
+def optics_of(
+    camera: ThreeLineCameraSpec, lines: tuple[str, ...], line_time: float, detectors: Mapping[str, DetectorSpec]
+) -> dict[str, LineOptics]:
+    """Lens and CCD of lines; lines that are made alike share them.
+
+    Raises:
+        ValueError: a line without an image section.
+    """
+    made: dict[tuple[object, ...], LineOptics] = {}
+    out = {}
+    for name in lines:
+        image = camera.image_of(name)
+        if image is None:
+            raise ValueError(f"{camera.name} does not say how its line {name} forms an image")
+        key = image.model_dump_json(), camera.pixels_of(name), camera.pitch_of(name)
+        if key not in made:
+            sheet = detectors[image.detector]
+            made[key] = LineOptics.from_specs(image, camera.pixels_of(name), camera.pitch_of(name), line_time, sheet)
+        out[name] = made[key]
+    return out
+
 
 SUN_TEMPERATURE = 5772.0
 """K (IAU 2015 Resolution B3, nominal effective temperature)."""

@@ -19,20 +19,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optics.frozen_map import FrozenMap
-from twin.detector import FixedPattern
-from twin.orbit.ground.frame import GroundFrame
+from optics.numerics.frozen_map import FrozenMap
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.ground.grid import GroundFrame, stream
 from twin.orbit.ground.orthophoto import Control, make_control
-from twin.orbit.ground.random_field import stream
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import apparent, around, reflectance
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
-from twin.orbit.images.look_map import LookMap, SteepTerrainError
-from twin.orbit.images.pushbroom import BORDER, PushbroomScene, Window, extent_of, look_map, render_patch, require_open
-from twin.orbit.sensor import Sensor
+from twin.orbit.images.pushbroom import (
+    BORDER,
+    LookMap,
+    PushbroomScene,
+    SteepTerrainError,
+    Window,
+    extent_of,
+    look_map,
+    render_patch,
+    require_open,
+)
+from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.orbit_scene import ControlSpec, GroundSpec
+    from scenes.specs.orbit_scene import ControlSpec, GroundSpec
 
 LARGEST_GROUND = 40_000.0
 """Metres: side of the ground of one patch, against input that asks for more than the memory holds."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from optics.frozen_map import FrozenMap
+from optics.numerics.frozen_map import FrozenMap
+from twin.orbit.images.image_points import MatchedPoints
 from twin.orbit.images.patch import Patch
-from twin.orbit.images.points import MatchedPoints
 
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
 """A match is wrong that lies more than 3 pixels off, or more than 5 of its sigmas and 1 pixel."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from twin.study.report.statistics import CONFIDENCE, Estimate, Interval
 from twin.study.report.study_runs import Factor, Response
+from twin.study.report.study_statistics import CONFIDENCE, Estimate, Interval
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from scenes.study import StudySpec
-from scenes.study_factor import FactorSpec
+from scenes.specs.study import StudySpec
+from scenes.specs.study_factor import FactorSpec
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
 
@@ -120,7 +120,7 @@ class StudyRuns:
 
     @classmethod
     def of(cls, data: xr.Dataset, study: StudySpec) -> StudyRuns:
-        """The runs of a data set as ``twin.study.dataset.make_dataset`` makes it."""
+        """The runs of a data set as ``twin.study.study_files.make_dataset`` makes it."""
         factors = tuple(
             Factor(name, str(data[name].attrs.get("units", "")), _factor_values(data[name].values), spec)
             for name, spec in study.factors.items()

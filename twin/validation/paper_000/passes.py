@@ -11,16 +11,15 @@ import numpy as np
 from analysis.orbit.planes import Method, PlaneFit, fit_plane
 from analysis.orbit.resection import Resection
 from analysis.units import ARCSEC
-from optics.backend import Backend
-from optics.frozen_map import FrozenMap
-from optics.rotation import rotation_matrix
-from scenes.orbit_angle import LINES
-from scenes.orbit_setup import AngleSetup, resolve_angle
-from twin.orbit.angle.camera import AngleCamera, angle_camera
-from twin.orbit.angle.flight import AnglePass, Measurement, fly
-from twin.orbit.angle.procedure import resected
-from twin.orbit.light_effects import NO_EFFECTS
-from twin.validation.scatter import mean_of
+from optics.geometry.pose import rotation_matrix
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit_setup import AngleSetup, resolve_angle
+from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly
+from twin.orbit.angle.angle_run import resected
+from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.validation.checks.check import mean_of
 
 TEST = "angle"
 OFF_AXIS = "angle_off_axis"

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from twin.validation.check import CORRECTED, OF_AGREEMENT, REFUTED, Basis, Check, Comparison, Verdict
+from twin.validation.checks.check import CORRECTED, OF_AGREEMENT, REFUTED, Basis, Check, Comparison, Verdict
 
 Kind = Literal["signs", "largest", "far", "alike", "little", "grows", "opposite"]
 Angle = Literal["alpha", "beta"]

@@ -11,15 +11,14 @@ import numpy as np
 from analysis.orbit.angles import angles_between
 from analysis.orbit.planes import fit_plane
 from analysis.units import ARCSEC
-from optics.threads import one_blas_thread
-from twin.orbit.angle.flight import Measurement
-from twin.orbit.angle.procedure import centred, effect_rows
-from twin.orbit.light_effects import SPEED_OF_LIGHT, standard_refractivity
-from twin.orbit.line_camera import dihedral_angle
-from twin.validation.check import CORRECTED, Check, CheckResult, Explanation
-from twin.validation.group import CheckGroup, Context
+from optics.numerics.threads import one_blas_thread
+from twin.orbit.angle.angle_flight import Measurement
+from twin.orbit.angle.angle_run import centred, effect_rows
+from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, standard_refractivity
+from twin.orbit.flight.line_camera import dihedral_angle
+from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
+from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.paper_000.passes import TEST, TRACED, Passes, repeated, setup_of
-from twin.validation.scatter import mean_of
 
 SCALE_HEIGHT = 8435.0
 """Of the standard atmosphere's pressure at 15 °C, R T/(M g), metres."""

@@ -1,4 +1,4 @@
-"""Paper 000's Table 1 and its claim of accuracy: planes and resection, from the same points and from their own."""
+"""Checks of paper 000's Table 1."""
 
 from __future__ import annotations
 
@@ -12,17 +12,41 @@ from numpy.typing import NDArray
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Station
 from analysis.units import ARCSEC
-from optics.threads import one_blas_thread
-from scenes.orbit_angle import LINES
-from twin.artefact import SvgFigure
-from twin.orbit.angle.flight import Measurement
-from twin.orbit.angle.procedure import effect_rows, values_of
-from twin.orbit.angle.to_json import PRINTED_DIFFERENCE_ARCSEC
-from twin.validation.check import NOT_CHECKABLE, REFUTED, SIGMAS, Check, CheckResult, Explanation
-from twin.validation.chosen import Chosen
-from twin.validation.group import CheckGroup, Context
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.orbit_angle import LINES
+from twin.orbit.angle.angle_flight import Measurement
+from twin.orbit.angle.angle_run import effect_rows, values_of
+from twin.orbit.angle.angle_sections import PRINTED_DIFFERENCE_ARCSEC
+from twin.run.artefact import SvgFigure
+from twin.run.svg import BLUE, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.validation.checks.check import NOT_CHECKABLE, REFUTED, SIGMAS, Check, CheckResult, Explanation
+from twin.validation.checks.chosen import Chosen
+from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.paper_000.passes import PAIRS, TEST, Passes, planes_of, repeated, setup_of
-from twin.validation.paper_000.table1_figure import differences_svg
+
+
+def differences_svg(same: NDArray[np.float64], own: NDArray[np.float64], printed: tuple[float, float]) -> str:
+    """Scatter of alpha and beta, both (passes, 2), arcsec, and the printed pair."""
+    with look("table1-000"):
+        figure = new_figure(4.2)
+        axes = figure.subplots()
+        axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+        axes.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
+        axes.plot(
+            *own.T, "o", color=ORANGE, ms=3.5, mew=0, alpha=0.7, label="points of their own, light left in planes"
+        )
+        axes.plot(*same.T, "s", color=BLUE, ms=3.0, mew=0, label="same points, light corrected in both")
+        axes.plot(
+            *printed, "D", color=VERMILION, ms=8, mec=INK, mew=0.8, label=f"printed: {printed[0]}″, {printed[1]}″"
+        )
+        axes.plot(*(-v for v in printed), "D", color="none", ms=8, mec=VERMILION, mew=1.4, label="printed, other sign")
+        axes.set_aspect("equal")
+        axes.set(xlabel="α: resection − planes, arcsec", ylabel="β: resection − planes, arcsec")
+        axes.set(xlim=(-2.0, 2.0), ylim=(-2.0, 2.3))
+        axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
+        plain_axes(axes)
+        return to_svg(figure)
+
 
 Array = NDArray[np.float64]
 ALPHA, BETA = PRINTED_DIFFERENCE_ARCSEC["alpha"], PRINTED_DIFFERENCE_ARCSEC["beta"]

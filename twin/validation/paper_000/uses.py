@@ -8,13 +8,12 @@ import numpy as np
 
 from analysis.orbit.angles import height_error, off_axis_angle
 from analysis.units import ARCSEC
-from optics.threads import one_blas_thread
-from twin.orbit.angle.flight import AnglePass
-from twin.orbit.angle.procedure import sighted
-from twin.validation.check import CORRECTED, Check, CheckResult, Explanation
-from twin.validation.group import CheckGroup, Context
+from optics.numerics.threads import one_blas_thread
+from twin.orbit.angle.angle_flight import AnglePass
+from twin.orbit.angle.angle_run import sighted
+from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
+from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.paper_000.passes import OFF_AXIS, TEST, Passes, planes_of, repeated, setup_of
-from twin.validation.scatter import mean_of
 
 _TENTH = "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"
 

@@ -1,21 +1,46 @@
-"""Paper 001's error budget: Table 3 line by line from its mechanisms, (12), and Table 4."""
+"""Checks of paper 001's error budget, Tables 3 to 5."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import hypot, log, sqrt
 
-from analysis.units import ARCSEC
-from twin.artefact import Cell, Data, SvgFigure, Table
-from twin.error_budget import BudgetLine
-from twin.validation.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult
-from twin.validation.chosen import Chosen, Supposed
-from twin.validation.group import CheckGroup, Context
-from twin.validation.paper_001 import budget_images, error_propagation, monitored_errors
-from twin.validation.paper_001.budget_images import FEW_DRAWS, BudgetImages
-from twin.validation.paper_001.error_budget_figure import budget_svg
+from matplotlib.ticker import FuncFormatter
 
-_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/budgets, are chosen for its Table 3"
+from analysis.units import ARCSEC
+from twin.run.artefact import Cell, Data, SvgFigure, Table
+from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
+from twin.validation.checks.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult
+from twin.validation.checks.chosen import Chosen, Supposed
+from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.paper_001 import budget, monitored_errors
+from twin.validation.paper_001.budget import FEW_DRAWS, BudgetImages
+from twin.validation.paper_001.random_states import BudgetLine
+
+
+def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:
+    """A row per line: text -> (printed, simulated, sigma), arcsec."""
+    with look("error-budget"):
+        figure = new_figure(1.0 + 0.32 * len(lines))
+        axes = figure.subplots()
+        for row, (printed, simulated, sigma) in enumerate(lines.values()):
+            axes.plot([printed], [row], "|", color=INK, ms=16.0, mew=2.0, label="printed" if row == 0 else None)
+            low = max(simulated - 3.0 * sigma, 0.5 * simulated)
+            axes.plot([low, simulated + 3.0 * sigma], [row, row], color=BLUE, lw=2.0)
+            axes.plot([simulated], [row], "o", color=BLUE, ms=6.0, label="simulated" if row == 0 else None)
+        axes.set_xscale("log")
+        axes.set_xlim(1e-3, 0.3)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.set_yticks(range(len(lines)), list(lines))
+        axes.set_ylim(len(lines) - 0.5, -0.6)
+        axes.set_xlabel("error of one spot, 3σ [arcsec]")
+        axes.tick_params(axis="y", length=0)
+        figure.legend(loc="outside upper right", ncols=2, frameon=False)
+        plain_axes(axes)
+        return to_svg(figure)
+
+
+_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
 _LINES = {
     "centroid": ("Energy centre of one image", 0.021),
     "coordinate_thermal": ("Thermal distortion of the coordinate system (recorder's board)", 0.018),
@@ -95,7 +120,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 def measured(context: Context) -> BudgetImages:
     """What was simulated for the selected checks."""
-    return budget_images.measured(context)
+    return budget.measured(context)
 
 
 def _line(context: Context, images: BudgetImages, line: BudgetLine) -> CheckResult:
@@ -123,7 +148,7 @@ def _line(context: Context, images: BudgetImages, line: BudgetLine) -> CheckResu
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
     """The input of one line, on which a root of squares hangs only with the line's share; value: of the root."""
     line = images.lines[name]
-    share = (error_propagation.frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
+    share = (budget.frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
 
     def response(factor: float) -> float:
         return sqrt(value**2 + (factor**2 - 1.0) * min(share, value) ** 2)
@@ -136,7 +161,7 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
     trials, causes, groups = images.inputs
     if "001.eq12" in context.selected:
         assert images.together is not None
-        total, sigma = error_propagation.root_sum_of_squares(images.lines)
+        total, sigma = budget.root_sum_of_squares(images.lines)
         value, spread = images.together.spot
         plain = sum(line.three_sigma for line in images.lines.values())
         measured, noise = value / total, value / total * hypot(spread / value, sigma / total)
@@ -146,7 +171,7 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         said = f"holds up to a correlation of {max(most, 0.0):.2g} of all pairs"
         drawn = Supposed("causes that are independent", said)
         how = (
-            f"{causes} random states with all causes, {error_propagation.FRAMES} noisy frames each: "
+            f"{causes} random states with all causes, {budget.FRAMES} noisy frames each: "
             f"{value / ARCSEC:.4f} arcsec; (12) over lines of {trials} states each: {total / ARCSEC:.4f}. The causes "
             "are drawn independently, as (12) takes them; the images show that they then add. A drift of temperature "
             f"that all glass shares would break it: the plain sum of the lines is {plain / ARCSEC:.3f} arcsec."
@@ -155,11 +180,11 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
     if "001.eq12.frames" in context.selected:
         assert images.scatter is not None
         (single, s_sigma), (mean, m_sigma) = images.scatter
-        should = error_propagation.frame_mean(single)
-        rest = error_propagation.root_sum({n: v for n, v in PRINTED.items() if n != "centroid"})
-        printed = error_propagation.root_sum(PRINTED)
+        should = budget.frame_mean(single)
+        rest = budget.root_sum({n: v for n, v in PRINTED.items() if n != "centroid"})
+        printed = budget.root_sum(PRINTED)
         how = (
-            f"{groups} groups of {error_propagation.FRAMES} frames, energy centroid: {single / ARCSEC:.5f} arcsec (3σ) "
+            f"{groups} groups of {budget.FRAMES} frames, energy centroid: {single / ARCSEC:.5f} arcsec (3σ) "
             f"in single frames, {mean / ARCSEC:.5f} in means. Of the printed lines the centroid's is then the smallest "
             f"but one: without it Table 4 were {rest:.4f} for {printed:.4f} arcsec, so that more frames gain nothing."
         )
@@ -173,15 +198,15 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         )
     if "001.table4.printed_lines" in context.selected:
         how = "Arithmetic of the printed numbers alone: Table 4 follows from Table 3 by (12) with 9 frames."
-        yield context.check("001.table4.printed_lines").judge(error_propagation.root_sum(PRINTED), None, how)
+        yield context.check("001.table4.printed_lines").judge(budget.root_sum(PRINTED), None, how)
     if "001.table4.root_sum" in context.selected:
-        total, sigma = error_propagation.root_sum_of_squares(images.lines)
-        how = f"(12) over the seven simulated lines, {error_propagation.FRAMES} frames, {trials} states and more each."
+        total, sigma = budget.root_sum_of_squares(images.lines)
+        how = f"(12) over the seven simulated lines, {budget.FRAMES} frames, {trials} states and more each."
         inputs = [_in_sum(images, name, total / ARCSEC) for name in _LARGEST]
         yield context.check("001.table4.root_sum").judge(total / ARCSEC, sigma / ARCSEC, how, inputs=inputs)
     if "001.table4.together" in context.selected:
         assert images.together is not None
-        how = f"{causes} random states with all causes, {error_propagation.FRAMES} noisy frames each, energy centroid."
+        how = f"{causes} random states with all causes, {budget.FRAMES} noisy frames each, energy centroid."
         value, spread = images.together.spot
         chosen = monitored_errors.all_causes(value / ARCSEC)
         yield context.check("001.table4.together").judge(value / ARCSEC, spread / ARCSEC, how, inputs=[chosen])

@@ -1,19 +1,193 @@
-"""What paper 001's formulas read from rendered spot images of single motions, beside the traced truth."""
+"""Images of single changes, measured, for the checks of paper 001's formulas.
+
+A displacement is before - after, in any unit of length; X is across the line, Y along it, L at its +Y end.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
-from analysis import autocollimator
+from analysis.monitor import autocollimator, recovery
+from analysis.monitor.intersection_angle import IntersectionAngleChange
+from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 from analysis.units import ARCSEC
-from optics.tree import Motion, State
-from scenes.channel import BASE
-from twin.experiment import MonitorExperiment
-from twin.validation.paper_001 import left_right
-from twin.validation.paper_001.monitor_images import MonitorImages, Ratio, quotient
+from optics.geometry.tree import Motion, State
+from scenes.specs.channel import BASE
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import Truth, trace_truth
+from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg
+
+Value = TypeVar("Value", float, np.ndarray)
+
+
+def roll_displacement(x_left: Value, x_right: Value) -> Value:
+    """Eq. (4): how far a roll of the camera moves a spot across the line."""
+    return (x_left - x_right) / 2.0
+
+
+def scale_displacement(y_left: Value, y_right: Value) -> Value:
+    """Eq. (6): how far a change of the focal length moves a spot along the line; (y11 - y01) is minus the left Y."""
+    return (y_right - y_left) / 2.0
+
+
+def superposed(first: Value, second: Value) -> Value:
+    """Eq. (8), of one side: the displacement by two changes at once from those by each of them."""
+    return first + second
+
+
+def right_of_focal_length(left: Value) -> Value:
+    """Eq. (9): Y of the right spot from that of the left one when the focal length changes."""
+    return -left
+
+
+def right_of_rotation(left: Value) -> Value:
+    """Eq. (9): the same when the line of sight turns about X."""
+    return left
+
+
+def parts_along(left: Value, right: Value) -> tuple[Value, Value]:
+    """Eq. (10): the shares of the focal length and of the turn about X in Y."""
+    return (left - right) / 2.0, (left + right) / 2.0
+
+
+def parts_across(left: Value, right: Value) -> tuple[Value, Value]:
+    """Eq. (11): the shares of the turn about Y and of the roll in X."""
+    return (left + right) / 2.0, (left - right) / 2.0
+
+
+FRAMES = 9
+PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A reading divided by what it should be.
+
+    Attributes:
+        value: mean of the cameras.
+        sigma: its standard deviation.
+        cameras: camera -> (value, sigma).
+    """
+
+    value: float
+    sigma: float
+    cameras: Mapping[str, tuple[float, float]]
+
+    @classmethod
+    def mean(cls, cameras: Mapping[str, tuple[float, float]]) -> Ratio:
+        """Of camera -> (value, sigma); the cameras' noise is independent."""
+        values, sigmas = np.array(list(cameras.values())).T
+        return cls(float(values.mean()), float(np.sqrt(np.sum(sigmas**2)) / len(values)), dict(cameras))
+
+    @property
+    def text(self) -> str:
+        """Each camera's own value."""
+        return ", ".join(f"{name} {value:.5f} ± {sigma:.5f}" for name, (value, sigma) in self.cameras.items())
+
+
+def quotient(above: tuple[float, float], below: tuple[float, float]) -> tuple[float, float]:
+    """Quotient of two measured numbers, (value, sigma) each, with its sigma."""
+    value = above[0] / below[0]
+    return value, float(np.hypot(above[1], value * below[1]) / abs(below[0]))
+
+
+class MonitorImages:
+    """Nine frames before and after every state, measured; what the formulas make of the spots is worked out on demand.
+
+    Args:
+        experiment: the instrument.
+        states: name -> state; both cameras' bodies may move in it.
+        seed: of the noise.
+        progress: takes a fraction and what is done next.
+    """
+
+    def __init__(
+        self,
+        experiment: MonitorExperiment,
+        states: Mapping[str, State],
+        seed: int,
+        progress: Callable[[float, str], None],
+    ) -> None:
+        self.experiment = experiment
+        self.motions = list(states)
+        every = list(states.values())
+        progress(0.0, "trace the truth")
+        self.truth: Truth = trace_truth(experiment.instrument, experiment.backend, every)
+        progress(0.4, "render and measure the spots")
+        pieces = [piece for _, piece in experiment.measure(every, FRAMES, seed)]
+        self.before = np.concatenate([p.before for p in pieces])
+        self.after = np.concatenate([p.after for p in pieces])
+        self.covariance = np.concatenate([p.shift_covariance for p in pieces])
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(self.experiment.calibration.cameras)
+
+    def geometry(self, camera: str) -> MonitorGeometry:
+        """What the formulas are given of a camera."""
+        return self.experiment.calibration.cameras[camera].geometry
+
+    @property
+    def first(self) -> MonitorGeometry:
+        """The geometry of the first camera; both have the same prescription."""
+        return self.geometry(self.cameras[0])
+
+    @property
+    def local_share(self) -> float:
+        """Focal length along the line at its centre, where d_beta is taken, over the formulas' f; of both cameras."""
+        cameras = self.experiment.instrument.cameras
+        return float(np.mean([cameras[c].line_focal_length / self.geometry(c).focal_length_m for c in self.cameras]))
+
+    def parameters(self) -> Mapping[str, Mapping[str, CameraParameters]]:
+        """Camera -> estimator -> what it reads from the spots, (S,)."""
+        cameras = self.experiment.calibration.cameras
+        return recovery.estimates(self.before, self.after, self.covariance, cameras)
+
+    def angles(self) -> Mapping[str, IntersectionAngleChange]:
+        """Estimator -> change of the intersection angle, (S,)."""
+        return recovery.angles(self.parameters(), self.experiment.calibration.cameras)
+
+    def reading(self, camera: str, motion: str, estimator: str, parameter: str) -> tuple[float, float]:
+        """What a formula reads of one state, and its sigma, SI."""
+        found = self.parameters()[camera][estimator]
+        state, k = self.motions.index(motion), PARAMETERS.index(parameter)
+        return float(found.vector[state, k]), float(found.sigma[state, k])
+
+    def true(self, camera: str, motion: str, parameter: str) -> float:
+        """Traced change of one of PARAMETERS, SI."""
+        return float(getattr(self.truth.cameras[camera], parameter)[self.motions.index(motion)])
+
+    def spots(self, camera: str, motion: str, axis: str) -> tuple[float, float, float]:
+        """Displacements before - after of the left and the right spot along ``axis``, X or Y, and the sigma of each,
+        metres; the two sigmas are taken as equal.
+        """
+        state, k, column = self.motions.index(motion), self.cameras.index(camera), "YX".index(axis)
+        moved = (self.before - self.after)[state, 2 * k : 2 * k + 2, column]
+        pitch = self.geometry(camera).pixel_m
+        variance = np.diagonal(self.covariance[state, k])[column::2]
+        return float(moved[0]) * pitch, float(moved[1]) * pitch, float(np.sqrt(variance.mean())) * pitch
+
+    def over_truth(self, motion: str, estimator: str, parameter: str) -> Ratio:
+        """Reading divided by the traced change."""
+        return self.over(motion, estimator, parameter, lambda camera: self.true(camera, motion, parameter))
+
+    def over_motion(self, motion: str, estimator: str, parameter: str, amount: float) -> Ratio:
+        """Reading divided by the amount of the motion."""
+        return self.over(motion, estimator, parameter, lambda camera: amount)
+
+    def over(self, motion: str, estimator: str, parameter: str, should: Callable[[str], float]) -> Ratio:
+        """Reading divided by what it should be of each camera."""
+        out = {}
+        for camera in self.cameras:
+            out[camera] = quotient(self.reading(camera, motion, estimator, parameter), (should(camera), 0.0))
+        return Ratio.mean(out)
+
 
 SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
 """Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
@@ -97,7 +271,7 @@ class SingleMotions(MonitorImages):
         for camera in self.cameras:
             left, right, sigma = self.spots(camera, "about Z", "X")
             end = 0.5 * self.geometry(camera).separation_m * math.tan(TURN)
-            out[camera] = quotient((left_right.roll_displacement(left, right), sigma / math.sqrt(2.0)), (end, 0.0))
+            out[camera] = quotient((roll_displacement(left, right), sigma / math.sqrt(2.0)), (end, 0.0))
         return Ratio.mean(out)
 
     def growth(self) -> Ratio:
@@ -107,7 +281,7 @@ class SingleMotions(MonitorImages):
             left, right, sigma = self.spots(camera, "scale", "Y")
             g = self.geometry(camera)
             should = g.separation_m * self.true(camera, "scale", "d_f") / g.focal_length_m
-            moved = left_right.scale_displacement(left, right), sigma / math.sqrt(2.0)
+            moved = scale_displacement(left, right), sigma / math.sqrt(2.0)
             out[camera] = quotient(moved, (should, 0.0))
         return Ratio.mean(out)
 
@@ -116,6 +290,26 @@ class SingleMotions(MonitorImages):
         worst = 0.0
         for camera in self.cameras:
             left, right, _ = self.spots(camera, "scale", "Y")
-            mean = left_right.scale_displacement(left, right)
+            mean = scale_displacement(left, right)
             worst = max(worst, float(np.max(np.abs(np.array([-left, right]) / mean - 1.0))))
         return worst
+
+
+def ratios_svg(ratios: Mapping[str, tuple[str, float]]) -> str:
+    """A row per check: id -> (equation, measured over right)."""
+    with look("formulas-001"):
+        figure = new_figure(0.8 + 0.27 * len(ratios))
+        axes = figure.subplots()
+        axes.axvline(1.0, color=INK, lw=1.0)
+        for row, (_, value) in enumerate(ratios.values()):
+            axes.plot([1.0, value], [row, row], color=LIGHT, lw=4.0, solid_capstyle="butt", zorder=0)
+            axes.plot([value], [row], "o", color=BLUE, ms=7.0)
+            text = f"{value:.4f}".replace("-", "\N{MINUS SIGN}")
+            axes.text(1.06, row, text, transform=axes.get_yaxis_transform(), ha="right", va="center")
+        axes.text(1.06, -0.75, "measured", transform=axes.get_yaxis_transform(), ha="right", va="center", color=GREY)
+        axes.set_yticks(range(len(ratios)), [f"{name}   {where}" for name, (where, _) in ratios.items()])
+        axes.set_ylim(len(ratios) - 0.5, -0.6)
+        axes.set_xlabel("measured, where 1 is a correct formula")
+        axes.tick_params(axis="y", length=0)
+        plain_axes(axes)
+        return to_svg(figure)

@@ -9,14 +9,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from analysis.units import ARCSEC
-from twin.artefact import Cell, SvgFigure, Table
-from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
-from twin.validation.group import CheckGroup, Context
-from twin.validation.paper_001 import left_right
+from twin.run.artefact import Cell, SvgFigure, Table
+from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
+from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.paper_001 import formulas_images
 from twin.validation.paper_001.formulas import INSTRUMENT, without_cos2
-from twin.validation.paper_001.formulas_figure import ratios_svg
+from twin.validation.paper_001.formulas_images import FRAMES, PARAMETERS, Ratio, ratios_svg
 from twin.validation.paper_001.joint_images import AMOUNTS, JointMotions
-from twin.validation.paper_001.monitor_images import FRAMES, PARAMETERS, Ratio
 
 _LINEAR = "0.2 %, a fifth of what Table 5 can tell of such changes"
 _ANGLE = "1 % of a change of 5 arcsec is the 0.05 arcsec of Table 5"
@@ -155,8 +154,8 @@ def _spots(images: JointMotions) -> Iterator[tuple[str, Ratio, str]]:
     )
     frames = f"{FRAMES} frames before and after each"
     how = f"Spots of rendered images of each change and of both ({sizes}), {frames}; the worse side of each camera."
-    yield "001.eq8.y", images.superposition("d_f", "d_beta", "Y", left_right.superposed), how
-    yield "001.eq8.x", images.superposition("d_alpha", "d_gamma", "X", left_right.superposed), how
+    yield "001.eq8.y", images.superposition("d_f", "d_beta", "Y", formulas_images.superposed), how
+    yield "001.eq8.x", images.superposition("d_alpha", "d_gamma", "X", formulas_images.superposed), how
     how = (
         f"Spots of rendered images of the one change ({sizes}), {frames}. Reticle and area CCD stand 3 mm apart across "
         "the line, so that the spots have a lever arm of half that; the ratio is it over L/2."
@@ -164,16 +163,16 @@ def _spots(images: JointMotions) -> Iterator[tuple[str, Ratio, str]]:
     yield "001.eq8.d_gamma_alone", images.stray("d_gamma", "Y", "X"), how
     yield "001.eq8.d_f_alone", images.stray("d_f", "X", "Y"), how
     how = f"Camera grown by {AMOUNTS['d_f'] * 1e6:g} ppm, {frames}."
-    yield "001.eq9.d_f", images.symmetry("d_f", "Y", left_right.right_of_focal_length), how
+    yield "001.eq9.d_f", images.symmetry("d_f", "Y", formulas_images.right_of_focal_length), how
     how = f"Line CCD moved along Y by {AMOUNTS['d_beta'] * 1e6:g} µm, {frames}."
-    yield "001.eq9.d_beta", images.symmetry("d_beta", "Y", left_right.right_of_rotation), how
+    yield "001.eq9.d_beta", images.symmetry("d_beta", "Y", formulas_images.right_of_rotation), how
     parts = ((10, "Y", "d_f", 0), (10, "Y", "d_beta", 1), (11, "X", "d_alpha", 0), (11, "X", "d_gamma", 1))
     how = (
         f"Spots of rendered images of all four changes at once and of the one alone ({sizes}), {frames}. What is left "
         "is the lever arm of 001.eq8.d_gamma_alone and 001.eq8.d_f_alone."
     )
     for number, axis, parameter, part in parts:
-        form = left_right.parts_along if number == 10 else left_right.parts_across
+        form = formulas_images.parts_along if number == 10 else formulas_images.parts_across
         yield f"001.eq{number}.{parameter}", images.separated(parameter, axis, part, form), how
 
 

@@ -8,10 +8,10 @@ from itertools import product
 import numpy as np
 
 from analysis.units import ARCSEC
-from optics.tree import Motion, State
-from scenes.channel import BASE
-from twin.experiment import MonitorExperiment
-from twin.validation.paper_001.monitor_images import PARAMETERS, MonitorImages, Ratio, quotient
+from optics.geometry.tree import Motion, State
+from scenes.specs.channel import BASE
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.validation.paper_001.formulas_images import PARAMETERS, MonitorImages, Ratio, quotient
 
 AMOUNTS = {"d_alpha": 50e-6, "d_beta": 50e-6, "d_gamma": 20 * ARCSEC, "d_f": 20e-6}
 """Motion behind each parameter: line CCD along X, along Y (m) and about Z (rad), growth of the camera."""

@@ -6,16 +6,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from analysis.units import ARCSEC
-from twin.artefact import Cell, Table
-from twin.error_budget import Together
-from twin.validation.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
-from twin.validation.chosen import Chosen, Supposed
-from twin.validation.group import Context
-from twin.validation.paper_001 import error_propagation
-from twin.validation.paper_001.budget_images import BudgetImages
+from twin.run.artefact import Cell, Table
+from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
+from twin.validation.checks.chosen import Chosen, Supposed
+from twin.validation.checks.group import Context
+from twin.validation.paper_001 import budget
+from twin.validation.paper_001.budget import BudgetImages
+from twin.validation.paper_001.random_states import Together
 
 TABLE_4 = 0.145 * ARCSEC
-_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/budgets, are chosen for its Table 3"
+_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
 _DIGITS = "half of the last printed digit"
 _PARAMETERS = {
     "d_beta": ("d_beta_rad", "Δβ, 3σ", 0.05, "arcsec", 0.005, _DIGITS),
@@ -76,7 +76,7 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         if f"001.table5.{name}.propagated" in context.selected:
             yield _propagated(context, images, name)
     if "001.table5.d_f.by_table1" in context.selected:
-        value = error_propagation.propagated(TABLE_4, images.geometry, "paper_joint")["d_f"] / 1e-3
+        value = budget.propagated(TABLE_4, images.geometry, "paper_joint")["d_f"] / 1e-3
         how = "Table 1's joint factors on the printed Table 4; the other three rows come out alike by both columns."
         reason = Explanation(0.02, CORRECTED, "Table 1's joint Δf is half of (7), and Table 5 was made with (7).")
         yield context.check("001.table5.d_f.by_table1").judge(value, None, how, None, [reason])
@@ -100,9 +100,9 @@ def _simulated(context: Context, images: BudgetImages, together: Together, name:
     field, _, _, unit, *_ = _PARAMETERS[name]
     size = _UNIT[unit]
     values = {e: tuple(v / size for v in p[field]) for e, p in together.parameters.items()}
-    formula = error_propagation.propagated(together.spot[0], images.geometry)[name] / size
+    formula = budget.propagated(together.spot[0], images.geometry)[name] / size
     how = (
-        f"{images.inputs[1]} random states with all causes through images of {error_propagation.FRAMES} frames, "
+        f"{images.inputs[1]} random states with all causes through images of {budget.FRAMES} frames, "
         f"printed factor, reading - traced truth. By formula from the simulated error of one spot: {formula:.3g}; "
         f"corrected factors by Monte Carlo: {values['derived'][0]:.3g} ± {values['derived'][1]:.2g} {unit}."
     )
@@ -118,12 +118,12 @@ def _simulated(context: Context, images: BudgetImages, together: Together, name:
 
 def all_causes(value: float) -> Chosen:
     """What all inputs make together, to which every error is proportional."""
-    return Chosen.power("errors by all inputs of scenes/budgets/monitor_pair.yaml, times", 1.0, "1", value)
+    return Chosen.power("errors by all inputs of scenes/library/budgets/monitor_pair.yaml, times", 1.0, "1", value)
 
 
 def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResult:
     unit = _PARAMETERS[name][3]
-    value = error_propagation.propagated(TABLE_4, images.geometry)[name] / _UNIT[unit]
+    value = budget.propagated(TABLE_4, images.geometry)[name] / _UNIT[unit]
     g = images.geometry
     how = (
         f"The printed factors on the printed Table 4 of every coordinate of both spots, independent; f = "
@@ -135,7 +135,7 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
 
             def response(factor: float, field: str = field, size: float = size) -> float:
                 changed = replace(g, **{field: factor * size})
-                return error_propagation.propagated(TABLE_4, changed)[name] / _UNIT[unit]
+                return budget.propagated(TABLE_4, changed)[name] / _UNIT[unit]
 
             inputs.append(Chosen(what, size, "m", response))
     return context.check(f"001.table5.{name}.propagated").judge(value, None, how, inputs=inputs)
@@ -163,7 +163,7 @@ def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
 
 
 def _show(context: Context, images: BudgetImages, together: Together) -> None:
-    formula = error_propagation.propagated(together.spot[0], images.geometry)
+    formula = budget.propagated(together.spot[0], images.geometry)
     rows: list[list[Cell]] = []
     for name, (field, text, printed, unit, *_) in _PARAMETERS.items():
         size = _UNIT[unit]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.orbit.three_line_model import BIAS
-from scenes.orbit_angle import LINES
-from scenes.orbit_setup import CalibrationSetup
+from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.latitude import LatitudeFit, fitted

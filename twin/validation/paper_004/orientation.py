@@ -21,11 +21,11 @@ from analysis.orientation.distortion_model import (
     principal_point,
 )
 from analysis.units import ARCSEC
-from twin.laboratory.distortion import DistortionRun, rms
+from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM
-from twin.validation.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
-from twin.validation.group import Context
-from twin.validation.paper_004.turntable import dividing
+from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
+from twin.validation.checks.group import Context
+from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
 UM, MM = 1e6, 1e3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from twin.validation.check import NOT_CHECKABLE, Check, CheckResult
-from twin.validation.group import CheckGroup, Context
+from twin.validation.checks.check import NOT_CHECKABLE, Check, CheckResult
+from twin.validation.checks.group import CheckGroup, Context
 
 _FIGURES = {
     "004.fig1": (

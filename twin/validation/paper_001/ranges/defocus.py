@@ -1,20 +1,174 @@
-"""Defocus of the line CCD, seen by a beam that leaves through a part of the pupil; and the area CCDs' field."""
+"""How far the formulas hold under defocus, for other pupil offsets, fields and kinds of return."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from optics.backend import Backend
-from optics.tree import Motion, State
-from scenes.channel import BASE
-from scenes.resolved import ResolvedJob
-from twin.validation.paper_001.ranges.bench import CORRECTED, FORMS, Bench
-from twin.validation.paper_001.ranges.curves import Curves, sampled
-from twin.validation.paper_001.ranges.singles import CLAIMED, FINE, NAMES, motion_of
-from twin.validation.paper_001.ranges.variants import variant
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, Motion, RigidTree, State
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from scenes.models.instrument_model import Instrument
+from scenes.specs.channel import BASE
+from scenes.specs.resolved import ResolvedJob
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_path import MonitorPath
+from twin.validation.paper_001.ranges.curves import CORRECTED, FORMS, Bench, Curves, sampled
+from twin.validation.paper_001.ranges.turns import CLAIMED, FINE, NAMES, motion_of
+
+RETURNS = ("plane", "roof", "roof along", "corner")
+"""Kinds of return: a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube."""
+
+
+def variant(
+    resolved: ResolvedJob,
+    backend: Backend,
+    camera: str,
+    pixels: int | None = None,
+    pupil_offset: tuple[float, float] | None = None,
+    field: float | None = None,
+    ccd_offset: tuple[float, float] | None = None,
+) -> MonitorExperiment:
+    """The experiment with one camera of an instrument, changed and built anew.
+
+    Args:
+        resolved: the instrument as its file gives it.
+        backend: where to trace.
+        camera: the camera that is kept.
+        pixels: rows and columns of the area CCDs.
+        pupil_offset: centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
+        field: of the area CCDs, radians.
+        ccd_offset: (X, Y) from the pinhole to the area CCD's centre, metres.
+
+    Raises:
+        InputError: the prisms cannot stand so.
+    """
+    spec = resolved.instrument
+    site = spec.cameras[camera]
+    if pupil_offset is not None:
+        site = site.model_copy(update={"pupil_offset": pupil_offset})
+    of_ccd: dict[str, Any] = {} if pixels is None else {"rows": pixels, "columns": pixels}
+    if ccd_offset is not None:
+        of_ccd["offset"] = ccd_offset
+    of_monitor: dict[str, Any] = {"area_ccd": spec.monitor.area_ccd.model_copy(update=of_ccd)}
+    if field is not None:
+        of_monitor["field"] = field
+    changed = {
+        "cameras": FrozenMap({camera: site}),
+        "monitor": spec.monitor.model_copy(update=of_monitor),
+        "baffles": FrozenMap({}),
+    }
+    return MonitorExperiment(resolved.model_copy(update={"instrument": spec.model_copy(update=changed)}), backend)
+
+
+def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
+    """The experiment with another kind of return, in place; call it before anything is rendered.
+
+    The facet becomes an opening of the same size, behind which two or three mirrors stand square to each other and
+    meet in its middle. Rays meet them in one order; the other orders give the same ray, as turns by half a turn do not
+    depend on theirs.
+
+    Args:
+        experiment: newly built.
+        kind: of RETURNS.
+
+    Raises:
+        ValueError: it is no such kind.
+    """
+    if kind not in RETURNS:
+        raise ValueError(f"no return {kind!r}; there are {', '.join(RETURNS)}")
+    if kind != "plane":
+        instrument = experiment.instrument
+        experiment.instrument = replace(instrument, assembly=_returning(instrument, kind))
+        experiment.path = MonitorPath(experiment.instrument, experiment.backend)
+    return experiment
+
+
+def _returning(instrument: Instrument, kind: str) -> Assembly:
+    """The assembly with mirrors square to each other behind every facet's opening."""
+    old = instrument.assembly
+    bodies, elements, sequences = list(old.tree.bodies), dict(old.elements), dict(old.sequences)
+    for channel in instrument.channels:
+        name = f"{channel.key}/return_face"
+        elements[name] = replace(old.elements[name], interaction=Interaction.PASS)
+        added = []
+        for k, pose in enumerate(_mirrors(kind)):
+            body, mirror = Body(f"{channel.face_body}/mirror_{k}", pose), f"{name}/mirror_{k}"
+            bodies.append(body)
+            elements[mirror] = Element(mirror, body.path, plane(), Interaction.REFLECT)
+            added.append(mirror)
+        way = old.sequences[f"{channel.key}/monitor"]
+        at = way.index(name)
+        sequences[f"{channel.key}/monitor"] = (*way[: at + 1], *added, *way[at + 1 :])
+    return Assembly(RigidTree(tuple(bodies)), elements, sequences, old.media)
+
+
+def _mirrors(kind: str) -> list[Pose]:
+    """Poses of the mirrors in the facet's frame (x along the line, y across it, z to the light)."""
+    if kind.startswith("roof"):
+        ridge = 1 if kind == "roof" else 0
+        return [Pose(about_axis(ridge, side * math.pi / 4)) for side in (1.0, -1.0)]
+    lean = math.acos(1.0 / math.sqrt(3.0))  # of a cube's faces to its diagonal
+    return [Pose(about_axis(2, 2.0 * math.pi * k / 3.0) @ about_axis(0, lean)) for k in range(3)]
+
+
+SHIFT = 60e-6
+"""Of the line CCD, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a kind of return does.
+
+    Attributes:
+        kind: of variants.RETURNS.
+        across, along: (2,) motion of the spots (left, right) over the motion of the line CCD across and along the line.
+        gain: (4,) corrected reading over truth, single changes.
+        note: how pinhole and area CCD had to stand.
+    """
+
+    kind: str
+    across: np.ndarray
+    along: np.ndarray
+    gain: np.ndarray
+    note: str
+
+
+_OFFSETS: dict[str, tuple[float, float] | None] = {
+    "plane": None,
+    "roof": None,
+    "roof along": (0.0, 3e-3),
+    "corner": (0.0, 0.0),
+}
+_NOTES = {
+    "plane": "as built",
+    "roof": "as built; the ridge lies across the line",
+    "roof along": "the ridge lies along the line; the area CCD stands beside its pinhole along the line",
+    "corner": "the spot falls on its own pinhole: the area CCD must see it through a beam splitter",
+}
+
+
+def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Response]:
+    """All kinds of return, by rendered images."""
+    camera, pitch = like.cameras[0], resolved.instrument.monitor.area_ccd.pitch
+    out = []
+    for kind in RETURNS:
+        built = with_return(variant(resolved, backend, camera, ccd_offset=_OFFSETS[kind]), kind)
+        bench = Bench(built, like)
+        states = [{}, piston(camera, 0.0, along=(SHIFT, 0.0)), piston(camera, 0.0, along=(0.0, SHIFT))]
+        place = bench.positions(states)
+        moved = (place[1:] - place[0]) * pitch / SHIFT
+        # columns run along -X, rows along +Y
+        out.append(Response(kind, -moved[0, :, 1], moved[1, :, 0], gains(bench)[CORRECTED], _NOTES[kind]))
+    return out
+
 
 CONFOCAL = 40e-6
 """How well paper 004 sets the line CCD to the focus, metres."""

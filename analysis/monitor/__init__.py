@@ -1,0 +1,1 @@
+"""From spot shifts to a camera's parameters (paper 001)."""

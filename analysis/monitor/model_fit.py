@@ -1,0 +1,288 @@
+"""Estimator `model`: weighted least squares on all spot coordinates with the Jacobian of the traced instrument.
+
+The instrument is linear over the small motions that a monitor sees: spot shifts s = A m (px) and changes of the
+camera's parameters p = B m, for P motions m. `fit` estimates m from s (Gauss-Markov) and maps it to p with the full
+covariance. It can tell apart only the family of motions that it assumes; `observability` says, with numbers, what
+happens to all others.
+
+Order of spot coordinates: [left row, left column, right row, right column], px, after - before. Order of parameters:
+d_alpha, d_beta, d_gamma (rad), d_f (m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.monitor.monitoring import CameraParameters
+from analysis.units import ARCSEC
+
+__all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "observability"]
+
+Array = NDArray[np.float64]
+_SHOWN = (("d_alpha", 1 / ARCSEC, '"'), ("d_beta", 1 / ARCSEC, '"'), ("d_gamma", 1 / ARCSEC, '"'), ("d_f", 1e6, " um"))
+# Below this shift of any spot, px per unit of motion, a motion is called invisible; monitors resolve some 1e-3 px.
+_INVISIBLE_PX = 1e-5
+# Statements leave out what is smaller than this part of the largest component beside it ...
+_NEGLIGIBLE = 1e-5
+# ... and what is below this, arcsec or um per unit of motion: the rounding of Jacobians taken by differences.
+_ROUNDING = 1e-6
+
+
+class RankError(ValueError):
+    """The motions cannot be told apart by the spots.
+
+    `null_vectors` (K, P): combinations of motions that move no spot.
+    """
+
+    def __init__(self, message: str, null_vectors: Array) -> None:
+        super().__init__(message)
+        self.null_vectors = null_vectors
+
+
+def fit(
+    shift: ArrayLike,
+    covariance: ArrayLike,
+    spot_jacobian: ArrayLike,
+    parameter_jacobian: ArrayLike,
+    motion_names: Sequence[str] | None = None,
+    rank_tolerance: float = 1e-8,
+) -> CameraParameters:
+    """Parameters from spot shifts.
+
+    shift: (..., 4) px. covariance: (..., 4, 4) px^2, positive definite, or all zero (no noise: equal weights, zero
+        sigma).
+    spot_jacobian: (4, P) px per unit of motion. parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to
+        4.
+    rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
+    Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
+    """
+    data, spread = np.asarray(shift, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
+    if data.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
+        raise ValueError(
+            f"model fit: shift must be (..., 4), covariance (..., 4, 4), found {data.shape}, {spread.shape}"
+        )
+    if not (np.all(np.isfinite(data)) and np.all(np.isfinite(spread))):
+        raise ValueError("model fit: shift and covariance must be finite")
+    _check_rank(spots, motion_names, rank_tolerance)
+    noiseless = not np.any(spread)
+    try:
+        # whitening: solve(L, x) has unit covariance
+        root = np.linalg.cholesky(np.eye(4) if noiseless else spread)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("model fit: covariance of the shifts is not positive definite") from error
+    white = np.linalg.solve(root, np.broadcast_to(spots, (*root.shape[:-2], *spots.shape)))
+    # pinv by QR-like SVD of the column-scaled matrix: units of motion differ by many orders of magnitude
+    length = np.linalg.norm(white, axis=-2, keepdims=True)
+    inverse = np.linalg.pinv(white / length, rcond=rank_tolerance * 1e-3) / np.swapaxes(length, -1, -2)
+    gain = parameters @ inverse @ np.linalg.inv(root)
+    values = np.einsum("...ij,...j->...i", gain, data)
+    result = gain @ spread @ np.swapaxes(gain, -1, -2)
+    return CameraParameters.from_vector(values, result)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionReport:
+    """What the spots and the model make of one unit (scale) of one motion.
+
+    name, scale: the motion and the size of its unit, SI. signature_px: (4,) spot shifts.
+    explained: fraction [0, 1] of the signature, weighted by its noise, that the family's motions can imitate.
+    imitation: (F,) the amounts of the family's motions (in their units) that the fit puts in its place.
+    reported, true: (4,) parameters that the model reports, and the true change; rad and m.
+    nearest, cosine: the single family motion (other than itself) with the most similar signature, and their cosine.
+    """
+
+    name: str
+    scale: float
+    signature_px: Array
+    explained: float
+    imitation: Array
+    reported: Array
+    true: Array
+    nearest: str | None
+    cosine: float
+
+    @property
+    def error(self) -> Array:
+        """(4,) reported - true, rad and m."""
+        return self.reported - self.true
+
+
+@dataclass(frozen=True, eq=False)
+class ObservabilityReport:
+    """rank and singular values (of noise-weighted, unit-scaled signatures) of all motions and of the family; one
+    report per motion; statements in plain English that name what cannot be separated.
+    """
+
+    rank: int
+    singular_values: Array
+    family: tuple[str, ...]
+    family_rank: int
+    family_singular_values: Array
+    motions: tuple[MotionReport, ...]
+    statements: tuple[str, ...]
+
+
+def observability(
+    motion_names: Sequence[str],
+    spot_jacobian: ArrayLike,
+    parameter_jacobian: ArrayLike,
+    scales: ArrayLike,
+    covariance: ArrayLike,
+    family: Sequence[int],
+    rank_tolerance: float = 1e-8,
+) -> ObservabilityReport:
+    """What can be told apart. motion_names: M names. spot_jacobian, parameter_jacobian: (4, M) per SI unit of motion.
+
+    scales: (M,) size of one unit of each motion in SI (1e-6 for one micrometre). covariance: (4, 4) px^2 of the
+        shifts, positive
+    definite. family: indices of the motions that the model fits. Raises RankError if the family itself is degenerate.
+    """
+    spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limit=None)
+    names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)
+    count = spots.shape[1]
+    chosen = [int(k) for k in family]
+    if len(names) != count or size.shape != (count,) or not np.all(size > 0):
+        raise ValueError(f"observability: {count} motions need {count} names and positive scales")
+    if not 1 <= len(set(chosen)) == len(chosen) <= 4 or not all(0 <= k < count for k in chosen):
+        raise ValueError(f"observability: family must be 1 to 4 different indices below {count}, found {chosen}")
+    try:
+        root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
+    except np.linalg.LinAlgError as error:
+        raise ValueError("observability: covariance of the shifts is not positive definite") from error
+    spots, parameters = spots * size, parameters * size
+    own = [names[k] for k in chosen]
+    _check_rank(spots[:, chosen], own, rank_tolerance)
+    white = np.linalg.solve(root, spots)
+    members = white[:, chosen]
+    length = np.linalg.norm(white, axis=0)
+    inverse = np.linalg.pinv(members / length[chosen]) / length[chosen][:, None]
+    reports = []
+    for k, name in enumerate(names):
+        visible = float(np.max(np.abs(spots[:, k]))) > _INVISIBLE_PX
+        imitation = inverse @ white[:, k]
+        left = np.linalg.norm(white[:, k] - members @ imitation) / length[k] if visible else 0.0
+        others = [j for j in chosen if j != k]
+        cosines = [float(white[:, k] @ white[:, j] / (length[k] * length[j])) if visible else 0.0 for j in others]
+        best = int(np.argmax(np.abs(cosines))) if cosines else -1
+        reports.append(
+            MotionReport(
+                name=name,
+                scale=float(size[k]),
+                signature_px=spots[:, k],
+                explained=float(1 - left**2) if visible else 0.0,
+                imitation=imitation,
+                reported=parameters[:, chosen] @ imitation,
+                true=parameters[:, k],
+                nearest=names[others[best]] if visible and best >= 0 else None,
+                cosine=cosines[best] if best >= 0 else 0.0,
+            )
+        )
+    values = np.linalg.svd(white, compute_uv=False)
+    own_values = np.linalg.svd(members, compute_uv=False)
+    rank = int(np.sum(values > rank_tolerance * values[0]))
+    return ObservabilityReport(
+        rank=rank,
+        singular_values=np.asarray(values, dtype=np.float64),
+        family=tuple(own),
+        family_rank=int(np.sum(own_values > rank_tolerance * own_values[0])),
+        family_singular_values=np.asarray(own_values, dtype=np.float64),
+        motions=tuple(reports),
+        statements=tuple(_statements(reports, own, rank)),
+    )
+
+
+def _statements(reports: list[MotionReport], family: list[str], rank: int) -> list[str]:
+    """Sentences on the family as a whole, then on each motion that is not reported as what it is."""
+    lines = [
+        f"Four spot coordinates see {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} motions;"
+        f" the model fits {len(family)}: {', '.join(family)}."
+    ]
+    reach = {report.name: float(np.max(np.abs(report.signature_px))) for report in reports}
+    for report in reports:
+        name = report.name
+        if name in family:
+            if abs(report.cosine) > 0.99 and report.nearest is not None:
+                lines.append(f"{name}: looks almost like {report.nearest} (cosine {report.cosine:+.6f}).")
+            continue
+        if reach[name] <= _INVISIBLE_PX:
+            true = _show(report.true)
+            lines.append(
+                f"{name}: moves no spot and is invisible; its true change is {true}."
+                if true
+                else f"{name}: moves no spot and changes no parameter."
+            )
+            continue
+        if report.explained > 1 - 1e-6:
+            text = "cannot be told from the family"
+        else:
+            text = f"is {100 * report.explained:.3g}% like the family and leaves a residual"
+        amounts = [(float(a), other) for a, other in zip(report.imitation, family, strict=True)]
+        shown = [(a, other) for a, other in amounts if abs(a) * reach[other] > _NEGLIGIBLE * reach[name]]
+        mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * reach[item[1]])) or "nothing"
+        floor = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
+        lines.append(
+            f"{name}: {text}; one unit moves a spot by {reach[name]:.3g} px and reads as {mix}: the model says"
+            f" {_show(report.reported, floor) or 'no change'}; true is {_show(report.true, floor) or 'no change'}."
+        )
+    return lines
+
+
+def _sum(terms: Sequence[tuple[float, str]]) -> str:
+    """A sum such as ``-0.755 x one + 0.535 x other``."""
+    text = ""
+    for amount, name in terms:
+        sign = (" - " if amount < 0 else " + ") if text else ("-" if amount < 0 else "")
+        text += f"{sign}{abs(amount):.3g} x {name}"
+    return text
+
+
+def _table(values: Array) -> Array:
+    """(4,) rad and m in the units of ``_SHOWN``."""
+    return values * np.array([factor for _, factor, _ in _SHOWN])
+
+
+def _show(values: Array, floor: float = 0.0) -> str:
+    """The components above ``floor`` (arcsec, um) and above rounding, empty when there is none."""
+    return ", ".join(
+        f"{name} {value:+.3g}{unit}"
+        for value, (name, _, unit) in zip(_table(values), _SHOWN, strict=True)
+        if abs(value) > max(floor, _ROUNDING)
+    )
+
+
+def _check_rank(spots: Array, names: Sequence[str] | None, tolerance: float) -> None:
+    """RankError when the columns of (4, P) are dependent, naming the null vectors in units of the motions."""
+    count = spots.shape[1]
+    length = np.linalg.norm(spots, axis=0)
+    scaled = spots / np.where(length > 0, length, 1.0)
+    _, values, vt = np.linalg.svd(scaled, full_matrices=True)
+    values = np.pad(values, (0, count - values.size))
+    null = vt[values <= tolerance * max(values[0], 1e-300)]
+    if not null.size:
+        return
+    labels = list(names) if names is not None else [f"motion {k}" for k in range(count)]
+    vectors = null / np.where(length > 0, length, 1.0)
+    vectors /= np.abs(vectors).max(axis=1, keepdims=True)
+    shown = "; ".join(
+        " ".join(f"{v:+.6g} x {label}" for v, label in zip(vector, labels, strict=True) if abs(v) > 1e-12)
+        for vector in vectors
+    )
+    raise RankError(
+        f"model fit: the spots cannot separate the motions; this combination moves no spot: {shown}", vectors
+    )
+
+
+def _jacobians(spots: ArrayLike, parameters: ArrayLike, limit: int | None = 4) -> tuple[Array, Array]:
+    one, two = np.asarray(spots, dtype=np.float64), np.asarray(parameters, dtype=np.float64)
+    if one.ndim != 2 or one.shape[0] != 4 or one.shape != two.shape or one.shape[1] < 1:
+        raise ValueError(f"model fit: both Jacobians must be (4, P), found {one.shape} and {two.shape}")
+    if limit is not None and one.shape[1] > limit:
+        raise ValueError(f"model fit: four spot coordinates cannot fix {one.shape[1]} motions; choose at most {limit}")
+    if not (np.all(np.isfinite(one)) and np.all(np.isfinite(two))):
+        raise ValueError("model fit: Jacobians must be finite")
+    return one, two

@@ -1,0 +1,1 @@
+"""Centres of spots with their covariance."""

@@ -1,0 +1,189 @@
+"""Maximum-likelihood fit of the calibrated spot shape, and the bound that no unbiased estimator can beat.
+
+Model of a pixel: background + flux * shape(row, column); normal likelihood with the variance temporal / frames + fixed
+pattern at the model's grey value. Fisher scoring (Kay, Estimation Theory, 1993, sec. 7.7). The two functions are
+public through `centroid`. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.spots import spot_image
+from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
+
+__all__ = ["cramer_rao_bound", "maximum_likelihood_fit"]
+
+Array = NDArray[np.float64]
+_REST_PX = 1e-6
+_FLUX_SIGMAS = 5.0
+# Side of the part of the image that the start is sought in, and the number of steps there; they cost a ninth each.
+_NEAR_PX = 32
+_NEAR_STEPS = 2
+
+
+def maximum_likelihood_fit(
+    mean: ArrayLike,
+    frames: int,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    index: NDArray[np.intp] | None = None,
+    edge_px: float = 10.0,
+    weights: str = "total",
+    keep_maps: bool = True,
+    threads: int = 1,
+    max_iterations: int = 30,
+) -> SpotPositions:
+    """Fit row, column, flux and background of the calibrated shape by Fisher scoring.
+
+    The variance of a pixel is temporal / frames + fixed pattern, at the model's grey value; the score is that of a
+    normal likelihood with known variance, which for shot noise equals the Poisson score.
+
+    template, index: shapes, and which of them each spot has (default: spot b has shape b modulo the number of shapes).
+    edge_px: least distance of a centre from the image's outermost pixel centres.
+    weights: "total" weighs by temporal and fixed variance (best for one image by itself); "temporal" leaves out the
+        fixed pattern (best for the difference of two images in which the spot has hardly moved). The covariance is
+        right for both.
+    threads: the batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
+    """
+    image = spot_image.as_images(mean)
+    count, height, width = image.shape
+    if (height, width) != template.shape:
+        raise ValueError(f"maximum likelihood: images are {height} x {width} px, the template is for {template.shape}")
+    if weights not in ("total", "temporal"):
+        raise ValueError(f"maximum likelihood: weights must be 'total' or 'temporal', found {weights!r}")
+    if threads < 1 or max_iterations < 1:
+        raise ValueError(f"maximum likelihood: threads {threads} and max_iterations {max_iterations} must be >= 1")
+    which = np.arange(count) % template.count if index is None else np.asarray(index, dtype=np.intp)
+    if which.shape != (count,) or np.any((which < 0) | (which >= template.count)):
+        raise ValueError(f"maximum likelihood: index must be ({count},) of 0 to {template.count - 1}")
+
+    def measure(part: slice) -> SpotPositions:
+        try:
+            return _score(
+                image[part], which[part], template, noise, frames, weights, edge_px, keep_maps, max_iterations
+            )
+        except TemplateRangeError as error:
+            reason = "the fit left the range of the template; calibrate it with a larger margin"
+            raise SpotError(dict.fromkeys(error.indices, reason)) from error
+
+    return spot_image.in_pieces(measure, count, threads)
+
+
+def _score(
+    image: Array,
+    which: NDArray[np.intp],
+    template: SpotTemplate,
+    noise: NoiseModel,
+    frames: int,
+    weights: str,
+    edge_px: float,
+    keep_maps: bool,
+    max_iterations: int,
+) -> SpotPositions:
+    """Fisher scoring of a few spots together; arguments as `maximum_likelihood_fit`."""
+    count, height, width = image.shape
+    row, column, background, _, _ = spot_image.coarse(image, frames, noise)
+    # The first step finds flux and background exactly for a given place (the model is linear in them).
+    flux = np.maximum(image.sum(axis=(1, 2)) - background * height * width, 1.0)
+    theta = np.stack([row, column, flux, background], axis=1)
+    spot_image.check_edge(theta[:, :2], height, width, edge_px)
+    theta = _start(image, theta, which, template, noise, frames)
+    flat = image.reshape(count, -1)
+    steps = np.full(count, max_iterations + 1)
+    before = np.full(count, _REST_PX)
+    design, weighted = np.empty((2, count, 4, height * width))
+    for iteration in range(1, max_iterations + 1):
+        _, level = spot_image.template_model(theta, which, template, out=design)
+        weight = 1.0 / spot_image.variance(level, noise, frames, weights)
+        residual = flat - level
+        theta, length, inverse, weighted = _step(theta, design, weight, residual, weighted)
+        # Steps shrink at least as fast as the last one did, so that the one after this is known to be negligible.
+        still = length * np.minimum(length / before, 1.0) < _REST_PX
+        before = length
+        steps = np.where(still, np.minimum(steps, iteration), max_iterations + 1)
+        if np.all(still):
+            break
+    # The last design is one step old, below 1e-3 px; a fresh one would cost half as much again.
+    influence = inverse[:, :2] @ weighted
+    temporal, fixed = spot_image.propagate(influence, level, noise, frames)
+    chi = np.einsum("bp,bp,bp->b", residual, residual, weight) / (flat.shape[1] - 4)
+    spot_image.check_edge(theta[:, :2], height, width, edge_px)
+    weak = theta[:, 2] < _FLUX_SIGMAS * np.sqrt(inverse[:, 2, 2])
+    spot_image.reject(weak, f"no spot: the flux is not significant (below {_FLUX_SIGMAS:g} sigma)")
+    return SpotPositions(
+        row=theta[:, 0],
+        column=theta[:, 1],
+        temporal_covariance=temporal,
+        fixed_covariance=fixed,
+        flux=theta[:, 2],
+        background=theta[:, 3],
+        converged=steps <= max_iterations,
+        iterations=iteration,
+        reduced_chi_square=chi,
+        gain_maps=influence.reshape(count, 2, height, width) if keep_maps else None,
+        light_dn=noise.light_signal_dn(level).reshape(count, height, width) if keep_maps else None,
+    )
+
+
+def _start(
+    image: Array, theta: Array, which: NDArray[np.intp], template: SpotTemplate, noise: NoiseModel, frames: int
+) -> Array:
+    """A better start from the few pixels about each spot, (B, 4): they hold most of what the image knows."""
+    height, width = image.shape[1:]
+    size = (min(_NEAR_PX, height), min(_NEAR_PX, width))
+    corner = np.rint(theta[:, :2] - 0.5 * (np.array(size) - 1)).astype(np.intp)
+    corner = np.clip(corner, 0, np.array([height, width]) - size)
+    near = np.stack([one[r : r + size[0], c : c + size[1]] for one, (r, c) in zip(image, corner, strict=True)])
+    flat = near.reshape(len(image), -1)
+    for _ in range(_NEAR_STEPS):
+        design, level = spot_image.template_model(theta, which, template, (corner, size))
+        weight = 1.0 / spot_image.variance(level, noise, frames, "temporal")
+        theta = _step(theta, design, weight, flat - level)[0]
+    return theta
+
+
+def _step(
+    theta: Array, design: Array, weight: Array, residual: Array, out: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """One step of Fisher scoring: parameters (B, 4), length of the step (B,) px, inverse information (B, 4, 4), design
+    times weight (B, 4, P), which goes to `out` if that is given.
+    """
+    weighted = np.multiply(design, weight[:, None], out=out)
+    inverse: Array = np.asarray(np.linalg.inv(weighted @ design.transpose(0, 2, 1)), dtype=np.float64)
+    step: Array = np.asarray(inverse @ (weighted @ residual[:, :, None]), dtype=np.float64)[:, :, 0]
+    # At most one pixel at once, and flux stays positive: a first guess may be wrong by more than the linear range.
+    length = np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-300)
+    short = np.minimum(1.0, 1.0 / length)
+    short = np.where(step[:, 2] < -0.9 * theta[:, 2], np.minimum(short, -0.9 * theta[:, 2] / step[:, 2]), short)
+    return theta + step * short[:, None], length, inverse, weighted
+
+
+def cramer_rao_bound(
+    template: SpotTemplate,
+    row: ArrayLike,
+    column: ArrayLike,
+    flux: ArrayLike,
+    background: ArrayLike,
+    noise: NoiseModel,
+    frames: int,
+    index: NDArray[np.intp] | None = None,
+) -> Array:
+    """Least covariance (B, 2, 2) px^2 of (row, column) that any unbiased estimator can reach when all four are
+    unknown.
+
+    flux: (B,) DN; background: (B,) DN with black level. The fixed pattern counts as noise: the bound is for one image
+        by itself.
+    Inverse Fisher information of the normal likelihood (Kay, Estimation Theory, 1993, eq. 3.31) without the term of
+    the variance's own derivative, which Poisson noise does not have.
+    """
+    values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, np.float64)) for v in (row, column, flux, background)))
+    theta = np.stack(values, axis=1)
+    which = np.arange(theta.shape[0]) % template.count if index is None else np.asarray(index, dtype=np.intp)
+    design, level = spot_image.template_model(theta, which, template)
+    design = design / np.sqrt(spot_image.variance(level, noise, frames, "total"))[:, None]
+    information = design @ design.transpose(0, 2, 1)
+    return np.asarray(np.linalg.inv(information)[:, :2, :2], dtype=np.float64)

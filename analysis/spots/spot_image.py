@@ -1,0 +1,269 @@
+"""What the spot estimators of `centroid` share: checks, a first guess, windows, models with their derivatives, noise
+propagation.
+
+Shapes: images (B, H, W) in DN; places (B, 2) as (row, column) in px, the centre of the first pixel being (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_template import SpotTemplate
+
+Array = NDArray[np.float64]
+_BIN = 4
+# A 4 x 4 bin must stand this many sigmas above the background to be called a spot: with some 600 bins in an image the
+# chance that noise alone does so is below 1e-6.
+_DETECTION_SIGMAS = 6.0
+_SATURATION_SIGMAS = 4.0
+# Spots measured together: few enough that their arrays stay in the processor's cache.
+_PIECE = 16
+
+
+def as_images(mean: ArrayLike) -> Array:
+    """(B, H, W) float64 from (B, H, W) or (H, W); ValueError if not finite or smaller than 24 x 24 px."""
+    image = np.asarray(mean, dtype=np.float64)
+    if image.ndim == 2:
+        image = image[None]
+    if image.ndim != 3 or image.shape[0] < 1 or min(image.shape[1:]) < 24:
+        raise ValueError(f"spots: mean images must be (B, H, W) of at least 24 x 24 px, found shape {image.shape}")
+    if not np.isfinite(image.sum()):
+        raise ValueError("spots: mean images hold values that are not finite")
+    return image
+
+
+def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: int = 1) -> SpotPositions:
+    """Measure `count` spots a few at a time and join the results; SpotError then names the bad spots of all pieces."""
+    reasons: dict[int, str] = {}
+
+    def piece(start: int, size: int = _PIECE) -> SpotPositions | None:
+        end = min(start + size, count)
+        try:
+            return measure(slice(start, end))
+        except SpotError as error:
+            reasons.update({start + n: reason for n, reason in error.reasons.items()})
+        if size > 1:
+            # spots that are bad for another reason are not named yet
+            for n in range(start, end):
+                piece(n, 1)
+        return None
+
+    starts = range(0, count, _PIECE)
+    if threads == 1:
+        parts = [piece(start) for start in starts]
+    else:
+        with ThreadPoolExecutor(max_workers=threads) as pool:
+            parts = list(pool.map(piece, starts))
+    if reasons:
+        raise SpotError(reasons)
+    joined = {}
+    for field in fields(SpotPositions):
+        values = [getattr(part, field.name) for part in parts if part is not None]
+        if field.name == "iterations":
+            joined[field.name] = max(values)
+        else:
+            joined[field.name] = None if values[0] is None else np.concatenate(values)
+    return SpotPositions(**joined)
+
+
+def reject(bad: NDArray[np.bool_], reason: str) -> None:
+    """Raise SpotError with one reason for all spots that are marked in `bad` (B,)."""
+    if np.any(bad):
+        raise SpotError({int(n): reason for n in np.flatnonzero(bad)})
+
+
+def check_edge(place: Array, height: int, width: int, distance: float) -> None:
+    """Raise SpotError for centres nearer than `distance` px to the outermost pixel centres."""
+    high = np.array([height, width]) - 1 - distance
+    bad = ~np.all((place >= distance) & (place <= high), axis=1)
+    if np.any(bad):
+        raise SpotError(
+            {
+                int(
+                    n
+                ): f"too near the edge: ({place[n, 0]:.2f}, {place[n, 1]:.2f}) px is less than {distance:g} px from"
+                f" the edge of the {height} x {width} image"
+                for n in np.flatnonzero(bad)
+            }
+        )
+
+
+def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, Array, Array, Array]:
+    """First guess: row, column (px, good to about 0.5), background (DN), peak (DN above it), area above half peak
+    (px^2).
+
+    Works on 4 x 4 bins, so that one hot pixel does not make a spot. Raises SpotError for saturated and for absent
+    spots.
+    """
+    count, height, width = image.shape
+    rows, columns = height // _BIN, width // _BIN
+    brightest = image.reshape(count, -1).max(axis=1)
+    # The mean of frames of which some are clipped lies below the clipping level, hence the allowance of a few sigmas.
+    reach = brightest + _SATURATION_SIGMAS * np.sqrt(noise.temporal_variance_dn2(brightest, 1))
+    if np.any(reach >= noise.saturation_dn):
+        raise SpotError(
+            {
+                int(
+                    n
+                ): f"saturated: its brightest pixel, {brightest[n]:.0f} DN, is within {_SATURATION_SIGMAS:g} sigma of"
+                f" saturation at {noise.saturation_dn:.0f} DN; lower the light or the exposure"
+                for n in np.flatnonzero(reach >= noise.saturation_dn)
+            }
+        )
+    bins = image[:, : rows * _BIN, : columns * _BIN].reshape(count, rows, _BIN, columns * _BIN).sum(axis=2)
+    bins = bins.reshape(count, rows, columns, _BIN).sum(axis=3) / _BIN**2
+    ring = np.ones((rows, columns), dtype=bool)
+    ring[1:-1, 1:-1] = False
+    background = np.median(bins[:, ring], axis=1)
+    top = bins.reshape(count, -1).argmax(axis=1)
+    peak = bins.reshape(count, -1).max(axis=1) - background
+    variance = noise.temporal_variance_dn2(background, frames) + noise.fixed_variance_dn2(background)
+    absent = peak < _DETECTION_SIGMAS * np.sqrt(variance) / _BIN
+    reject(absent, f"no spot: nothing stands {_DETECTION_SIGMAS:g} sigma above the background")
+    i, j = np.arange(rows), np.arange(columns)
+    bright = bins - background[:, None, None]
+    bright *= bright > 0.5 * peak[:, None, None]
+    # Only around the brightest bin, lest a second light pulls the guess away.
+    bright *= (np.abs(i - (top // columns)[:, None]) <= 4)[:, :, None]
+    bright *= (np.abs(j - (top % columns)[:, None]) <= 4)[:, None, :]
+    total = bright.sum(axis=(1, 2))
+    centre = (_BIN - 1) / 2.0
+    row = _BIN * (bright.sum(axis=2) @ i) / total + centre
+    column = _BIN * (bright.sum(axis=1) @ j) / total + centre
+    area = np.count_nonzero(bright, axis=(1, 2)) * float(_BIN**2)
+    return row, column, background, peak, area
+
+
+def arms(place: Array, height: int, width: int) -> Array:
+    """(B, 2, H, W) px, each pixel's row and column minus the centre's."""
+    out = np.empty((place.shape[0], 2, height, width))
+    out[:, 0] = (np.arange(height) - place[:, :1])[:, :, None]
+    out[:, 1] = (np.arange(width) - place[:, 1:])[:, None, :]
+    return out
+
+
+def soft_window(place: Array, height: int, width: int, radius: float, kind: str) -> tuple[Array, Array]:
+    """Window about each centre, falling from 1 to 0 over one pixel at `radius`: (B, H, W), and d window / d centre (B,
+    2, H, W).
+    """
+    arm = arms(place, height, width)
+    if kind == "circle":
+        distance = np.hypot(arm[:, 0], arm[:, 1])
+        mask = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+        edge = (mask > 0) & (mask < 1)
+        return mask, arm * (edge / np.maximum(distance, 1e-9))[:, None]
+    side = np.clip(radius + 0.5 - np.abs(arm), 0.0, 1.0)
+    edge2 = np.where((side > 0) & (side < 1), np.sign(arm), 0.0)
+    return side[:, 0] * side[:, 1], edge2 * side[:, ::-1]
+
+
+def sane(theta: Array) -> NDArray[np.bool_]:
+    """Which Gaussians (see `gaussian`) are finite, bright, and of positive size in every direction."""
+    good = np.all(np.isfinite(theta), axis=1) & (theta[:, 2] > 0) & (theta[:, 4] > 0)
+    if theta.shape[1] > 5:
+        good &= theta[:, 4] * theta[:, 6] > theta[:, 5] ** 2
+    return np.asarray(good)
+
+
+def gaussian(
+    theta: Array, height: int, width: int, radius: float, noise: NoiseModel, frames: int
+) -> tuple[Array, Array, Array]:
+    """Gaussian of parameters row, column, amplitude, background, a[, b, c]: design (B, K, P), design * weight, model
+    (B, P).
+
+    The weight is the soft circular window over the model's total variance.
+    """
+    count, size = theta.shape
+    arm = arms(theta[:, :2], height, width).reshape(count, 2, -1)
+    amplitude, background, a = (theta[:, k, None] for k in (2, 3, 4))
+    b, c = (theta[:, 5, None], theta[:, 6, None]) if size > 5 else (np.zeros_like(a), a)
+    x, y = arm[:, 0], arm[:, 1]
+    u, v = a * x + b * y, b * x + c * y
+    bell = np.exp(-0.5 * np.maximum(u * x + v * y, 0.0))
+    light = amplitude * bell
+    rest = [-0.5 * x * x * light, -x * y * light, -0.5 * y * y * light]
+    if size == 5:
+        rest = [rest[0] + rest[2]]
+    design = np.stack([light * u, light * v, bell, np.ones_like(bell), *rest], axis=1)
+    model = background + light
+    mask, _ = soft_window(theta[:, :2], height, width, radius, "circle")
+    return design, design * (mask.reshape(count, -1) / variance(model, noise, frames, "total"))[:, None], model
+
+
+def variance(level: Array, noise: NoiseModel, frames: int, weights: str) -> Array:
+    """Variance of a mean of frames at grey value `level`, DN^2: "temporal" only, or "total" with the fixed pattern."""
+    out: Array = noise.temporal_variance_dn2(level, frames)
+    if weights == "total":
+        out += noise.fixed_variance_dn2(level)
+    return out
+
+
+def template_model(
+    theta: Array,
+    which: NDArray[np.intp],
+    template: SpotTemplate,
+    part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
+    out: Array | None = None,
+) -> tuple[Array, Array]:
+    """Model of row, column, flux, background (B, 4): its design (B, 4, P) and grey values (B, P).
+
+    part: as for `SpotTemplate.evaluate`. out: where the design goes, if given.
+    """
+    count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
+    design = np.empty((count, 4, height * width)) if out is None else out
+    template.fill_design(design.reshape(count, 4, height, width), theta, which, part)
+    level = design[:, 2] * theta[:, 2, None]
+    level += theta[:, 3, None]
+    return design, level
+
+
+def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tuple[Array, Array]:
+    """Temporal and fixed covariance (B, 2, 2) px^2 of estimators with influence `maps` (B, 2, P) at grey values
+    `level` (B, P).
+    """
+    turned = maps.transpose(0, 2, 1)
+    temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ turned
+    fixed = (maps * noise.fixed_variance_dn2(level)[:, None]) @ turned
+    return temporal, fixed
+
+
+def positions(
+    place: Array,
+    maps: Array,
+    image: Array,
+    frames: int,
+    noise: NoiseModel,
+    keep_maps: bool,
+    flux: Array,
+    background: Array,
+    converged: NDArray[np.bool_],
+    iterations: int,
+    chi: Array,
+) -> SpotPositions:
+    """SpotPositions of an estimator without a model of the light.
+
+    The noise is taken at the measured image itself: the variance is nearly linear in the grey value, so pixel noise
+    averages out, while smoothing would fill the dark rings, where a Gaussian fit puts much weight.
+    """
+    count = place.shape[0]
+    temporal, fixed = propagate(maps.reshape(count, 2, -1), image.reshape(count, -1), noise, frames)
+    return SpotPositions(
+        row=place[:, 0].copy(),
+        column=place[:, 1].copy(),
+        temporal_covariance=temporal,
+        fixed_covariance=fixed,
+        flux=flux,
+        background=background,
+        converged=converged,
+        iterations=iterations,
+        reduced_chi_square=chi,
+        gain_maps=maps if keep_maps else None,
+        light_dn=noise.light_signal_dn(image) if keep_maps else None,
+    )

@@ -1,0 +1,1 @@
+"""Optimisation of prescriptions with exact derivatives."""

@@ -1,0 +1,240 @@
+"""Convex polygons in batches: hulls, cuts, differences, and quadrature over them.
+
+A batch holds N polygons of V corners, (N, V, D): the first two of D numbers are the place in the plane, others ride
+along (the corner in space, say). A polygon of fewer corners repeats one; a polygon without area is empty.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from optics.numerics.quadrature import gauss
+
+_NO_LIMIT = 1e30
+"""Of a side without length: finite, so that it can be multiplied."""
+
+_AT_ONCE = 2**13
+"""Nodes on boundaries worked on together: their polynomials stay in the cache."""
+
+_SAME = 1e-13
+"""Distance below which two corners are one."""
+
+
+def area(polygons: np.ndarray) -> np.ndarray:
+    """Areas, positive counterclockwise, (...), of polygons (..., V, D)."""
+    x, y = polygons[..., 0] - polygons[..., :1, 0], polygons[..., 1] - polygons[..., :1, 1]
+    return np.asarray(0.5 * np.sum(x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1], axis=-1))
+
+
+def hull(points: np.ndarray) -> np.ndarray:
+    """Convex hulls of N sets of P points, (N, P, D), counterclockwise, (N, V, D)."""
+    x, y = points[..., 0], points[..., 1]
+    rows = np.arange(len(points))
+    start = np.lexsort((y, x), axis=-1)[:, 0]
+    order, here, done = [start], start, np.zeros(len(points), bool)
+    way = np.broadcast_to([0.0, -1.0], (len(points), 2))
+    for _ in range(points.shape[1] - 1):
+        dx, dy = x - x[rows, here][:, None], y - y[rows, here][:, None]
+        turn = np.arctan2(way[:, :1] * dy - way[:, 1:] * dx, way[:, :1] * dx + way[:, 1:] * dy)
+        turn[turn < -0.5 * np.pi] = np.pi  # points of the side before, but for rounding
+        turn[(dx == 0.0) & (dy == 0.0)] = np.inf
+        best = np.argmin(turn, axis=-1)
+        done |= (best == start) | np.isinf(turn[rows, best])
+        here = np.where(done, here, best)
+        if np.all(done):
+            break
+        way = np.stack([dx[rows, best], dy[rows, best]], axis=-1)
+        order.append(here)
+    return np.asarray(points[rows[:, None], np.stack(order, axis=-1)])
+
+
+def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """The part of each polygon where normal . (x, y) <= limit (Sutherland and Hodgman, Commun. ACM 17, 32 (1974)).
+
+    Args:
+        polygons: (N, V, D).
+        normal: (N, 2).
+        limit: (N,).
+
+    Returns:
+        (N, W, D), corners in the order they had.
+    """
+    depth = limit[:, None] - polygons[..., 0] * normal[:, :1] - polygons[..., 1] * normal[:, 1:]
+    inside = depth >= 0.0
+    if np.all(inside):
+        return polygons
+    after, depth_after, inside_after = (np.roll(a, -1, axis=1) for a in (polygons, depth, inside))
+    crossing = inside != inside_after
+    share = depth / np.where(crossing, depth - depth_after, 1.0)
+    count, corners, numbers = polygons.shape
+    both = np.empty((count, 2 * corners, numbers))
+    both[:, 0::2], both[:, 1::2] = polygons, polygons + share[..., None] * (after - polygons)
+    kept = np.empty((count, 2 * corners), bool)
+    kept[:, 0::2], kept[:, 1::2] = inside, crossing
+    return _packed(both, kept)
+
+
+def widened(polygons: np.ndarray, corners: int) -> np.ndarray:
+    """The same polygons (N, V, D) with at least ``corners`` corners."""
+    missing = corners - polygons.shape[1]
+    if missing <= 0:
+        return polygons
+    return np.concatenate([polygons, np.repeat(polygons[:, -1:], missing, axis=1)], axis=1)
+
+
+def compact(polygons: np.ndarray) -> np.ndarray:
+    """The same polygons (N, V, D) without corners that repeat the one before them but for rounding."""
+    step = polygons[..., :2] - np.roll(polygons[..., :2], 1, axis=1)
+    kept = np.hypot(step[..., 0], step[..., 1]) > _SAME
+    return _packed(polygons, kept)
+
+
+def _packed(corners: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Those of the corners (N, V, D) that are kept, (N, V), in polygons of as few corners as all allow; of a polygon
+    that keeps none the first corner stays.
+    """
+    many = np.maximum(np.sum(kept, axis=1), 1)
+    order = np.argsort(~kept, axis=1, kind="stable")
+    which = np.take_along_axis(order, np.minimum(np.arange(np.max(many, initial=1)), many[:, None] - 1), axis=1)
+    return np.take_along_axis(corners, which[..., None], axis=1)
+
+
+def sides(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Outward unit normals (N, W, 2) and limits (N, W) of counterclockwise polygons. A side without length, the
+    direction of which is rounding, has none.
+    """
+    step = np.roll(windows[..., :2], -1, axis=1) - windows[..., :2]
+    length = np.hypot(step[..., 0], step[..., 1])
+    normal = np.stack([step[..., 1], -step[..., 0]], axis=-1) / np.where(length > _SAME, length, 1.0)[..., None]
+    limit = np.where(length > _SAME, np.sum(normal * windows[..., :2], axis=-1), _NO_LIMIT)
+    return normal, limit
+
+
+def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Cut each polygon by W half-planes.
+
+    Args:
+        polygons: (N, V, D).
+        normal: (N, W, 2).
+        limit: (N, W).
+
+    Returns:
+        (N, U, D).
+    """
+    height = np.einsum("nvx,nwx->nwv", polygons[..., :2], normal)
+    beyond = np.sum(height > limit[..., None], axis=-1)
+    # of each polygon first what leaves it the fewest corners
+    order = np.argsort(-beyond, axis=1, kind="stable")[:, : np.max(np.count_nonzero(beyond, axis=1), initial=0)]
+    for column in order.T:
+        some = np.flatnonzero(np.take_along_axis(beyond, column[:, None], axis=1)[:, 0])
+        cut = clip(polygons[some], normal[some, column[some]], limit[some, column[some]])
+        if len(some) == len(polygons):
+            polygons = cut
+        else:
+            polygons = widened(polygons, cut.shape[1]).copy()
+            polygons[some] = widened(cut, polygons.shape[1])
+    return polygons
+
+
+def difference(polygons: np.ndarray, holes: np.ndarray) -> list[np.ndarray]:
+    """What is left of each convex polygon (N, V, D) outside of a counterclockwise convex one (N, W, D): some convex
+    pieces, (N, ., D) each, many of them empty.
+    """
+    normal, limit = sides(holes)
+    out = []
+    for w in range(limit.shape[1]):
+        out.append(clip(polygons, -normal[:, w], -limit[:, w]))
+        polygons = clip(polygons, normal[:, w], limit[:, w])
+    return out
+
+
+def quadrature(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes that integrate polynomials of degree below ``count`` in x and in y exactly over each polygon.
+
+    They are Gauss' in the polygon's bounding box; the weights are the integrals of Lagrange's polynomials, by Green's
+    theorem along the sides.
+
+    Args:
+        polygons: (N, V, D), of either sense.
+        count: nodes along each side of the box.
+
+    Returns:
+        Points x + iy and weights of the area, (N, count^2) each.
+    """
+    place = polygons[..., :2]
+    step = np.roll(place, -1, axis=1) - place
+    points, weights = gauss(count)
+    on = place[:, :, None] + step[:, :, None] * (0.5 * (points + 1.0))[:, None]
+    rise = 0.5 * weights * step[..., 1:]
+    corners = polygons.shape[1] * count
+    on, rise = on.reshape(len(on), corners, 2), rise.reshape(len(rise), corners)
+    return from_boundary(on, rise, place.min(axis=1), place.max(axis=1), count)
+
+
+def from_boundary(
+    place: np.ndarray, rise: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """``quadrature`` over regions whose boundary is given by nodes of integrals along it.
+
+    Args:
+        place: nodes on the boundary, (N, P, 2).
+        rise: their weights in integrals over dy, (N, P).
+        low: corners of boxes about the regions, (N, 2).
+        high: the opposite ones.
+        count: nodes along each side of the box.
+    """
+    rows = len(place)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    half = np.where(half > 0.0, half, 1.0)
+    at = (place - middle[:, None]) / half[:, None]
+    rise = rise / half[:, 1:]
+    step = max(1, _AT_ONCE // max(place.shape[1], 1))
+    some = [slice(k, k + step) for k in range(0, rows, step)]
+    moments = np.concatenate([np.zeros((0, count, count)), *(_moments(at[s], rise[s], count) for s in some)])
+    moments *= (np.sign(moments[:, 0, 0]) * half[:, 0] * half[:, 1])[:, None, None]
+    own, to_weights = gauss(count)[0], _lagrange(count)
+    weights = to_weights @ moments @ to_weights.T
+    points = (middle[:, :1] + half[:, :1] * own)[:, :, None] + 1j * (middle[:, 1:] + half[:, 1:] * own)[:, None]
+    return points.reshape(rows, count**2), weights.reshape(rows, count**2)
+
+
+def _moments(at: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
+    """Integrals of Legendre's P_i(x) P_j(y) over N regions with nodes (N, P, 2) on their boundaries, (N, count, count).
+
+    Args:
+        at: the nodes.
+        rise: their weights in integrals over dy, (N, P).
+        count: of polynomials.
+    """
+    x, y = _legendre(at[..., 0], count + 1), _legendre(at[..., 1], count)
+    primitive = np.empty((count, *rise.shape))  # of P_0, P_1, ... along x
+    primitive[0] = x[1]
+    np.subtract(x[2:], x[:-2], out=primitive[1:])
+    primitive[1:] /= (2 * np.arange(1, count) + 1)[:, None, None]
+    primitive *= rise
+    return np.asarray(primitive.transpose(1, 0, 2) @ y.transpose(1, 2, 0))
+
+
+@cache
+def _lagrange(count: int) -> np.ndarray:
+    """From integrals of Legendre's polynomials to weights of Gauss' points, (count, count)."""
+    points, weights = gauss(count)
+    out = np.asarray(weights[:, None] * _legendre(points, count).T * (np.arange(count) + 0.5))
+    out.setflags(write=False)
+    return out
+
+
+def _legendre(x: np.ndarray, count: int) -> np.ndarray:
+    """P_0 .. P_(count - 1) at x, (count, ...)."""
+    out = np.empty((count, *x.shape))
+    out[0] = 1.0
+    if count > 1:
+        out[1] = x
+    before = np.empty_like(x)
+    for n in range(2, count):
+        np.multiply(x, out[n - 1], out=out[n])
+        out[n] *= (2 * n - 1) / n
+        out[n] -= np.multiply(out[n - 2], (n - 1) / n, out=before)
+    return out

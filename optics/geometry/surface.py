@@ -1,0 +1,197 @@
+"""A surface: its ideal shape and its figure error, on NumPy arrays and in kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import map_coordinates, spline_filter
+
+from optics.geometry import zernike
+from optics.geometry.zernike import triangle_index
+from optics.numerics.frozen_map import FrozenMap
+
+
+@dataclass(frozen=True)
+class ZernikeFigure:
+    """Sag error sum a_j Z_j((x - cx)/radius, (y - cy)/radius), Noll order, a_j = rms over the disk in metres.
+
+    Terms may be perturbed per state (``Motion.figure``); the disk stays.
+    """
+
+    radius: float
+    centre: tuple[float, float] = (0.0, 0.0)
+    terms: Mapping[int, float] = field(default_factory=FrozenMap)
+
+    def __post_init__(self) -> None:
+        """Freeze the terms."""
+        if not self.radius > 0.0:
+            raise ValueError(f"a figure needs a positive radius, found {self.radius}")
+        object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:
+        """Sag error at x, y (metres), NumPy."""
+        u = (np.asarray(x) - self.centre[0]) / self.radius
+        v = (np.asarray(y) - self.centre[1]) / self.radius
+        return np.asarray(sum((a * zernike.zernike(j, u, v) for j, a in self.terms.items()), np.zeros_like(u)))
+
+
+@dataclass(frozen=True, eq=False)
+class GridFigure:
+    """Sag error on a regular grid, interpolated by a cubic B-spline (twice continuously differentiable).
+
+    Attributes:
+        values: sag error in metres, shape (rows along y, columns along x), at least 4 x 4.
+        bounds: x_min, x_max, y_min, y_max of the first and last samples, metres. The spline arrives at its edges with
+            zero slope (mirror condition) and stays at the edge's value outside: give a grid that reaches a few samples
+            beyond the clear aperture.
+    """
+
+    values: np.ndarray
+    bounds: tuple[float, float, float, float]
+
+    def __post_init__(self) -> None:
+        """Copy, freeze and check."""
+        values = np.array(self.values, dtype=np.float64)
+        if values.ndim != 2 or min(values.shape) < 4 or not np.all(np.isfinite(values)):
+            raise ValueError("a grid figure needs a finite array of at least 4 x 4 values")
+        x0, x1, y0, y1 = self.bounds
+        if not (x1 > x0 and y1 > y0):
+            raise ValueError(f"a grid figure needs x_min < x_max and y_min < y_max, found {self.bounds}")
+        values.setflags(write=False)
+        object.__setattr__(self, "values", values)
+
+    @cached_property
+    def spline(self) -> np.ndarray:
+        """B-spline coefficients with a mirrored margin of two samples on every side, shape (rows + 4, columns + 4)."""
+        coefficients = spline_filter(self.values, order=3, mode="mirror")
+        return np.pad(coefficients, 2, mode="reflect")
+
+    @property
+    def spacing(self) -> tuple[float, float]:
+        """Sample distance along x and y, metres."""
+        x0, x1, y0, y1 = self.bounds
+        return (x1 - x0) / (self.values.shape[1] - 1), (y1 - y0) / (self.values.shape[0] - 1)
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:
+        """Sag error at x, y (metres), NumPy."""
+        dx, dy = self.spacing
+        column = (np.asarray(x) - self.bounds[0]) / dx
+        row = (np.asarray(y) - self.bounds[2]) / dy
+        rows, columns = self.values.shape
+        place = [np.clip(row, 0.0, rows - 1.0), np.clip(column, 0.0, columns - 1.0)]
+        return np.asarray(map_coordinates(self.values, place, order=3, mode="mirror"))
+
+
+Figure = ZernikeFigure | GridFigure
+
+
+def polynomial_figure(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
+    """Sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
+
+    ``coefficients`` is ordered by ``zernike.triangle_index``.
+    """
+    height: Any = 0.0 * x
+    slope_x: Any = 0.0 * x
+    slope_y: Any = 0.0 * x
+    for a in range(order, -1, -1):
+        row: Any = 0.0 * x
+        row_slope: Any = 0.0 * x
+        for b in range(order - a, -1, -1):
+            row_slope = row_slope * y + row
+            row = row * y + coefficients[triangle_index(a, b)]
+        slope_x = slope_x * x + height
+        height = height * x + row
+        slope_y = slope_y * x + row_slope
+    return height, slope_x, slope_y
+
+
+def grid_figure(x: Any, y: Any, g: Mapping[str, Any], table: Any) -> tuple[Any, Any, Any]:
+    """Cubic B-spline of a ``GridFigure`` and its slopes; ``table`` holds its padded coefficients, row by row."""
+    import drjit as dr
+
+    float_type = type(x)
+    index_type = dr.uint32_array_t(float_type)
+    columns, rows = g["gnx"], g["gny"]
+    u = dr.clip((x - g["gx0"]) * g["gix"], 0.0, columns - 1.0)
+    v = dr.clip((y - g["gy0"]) * g["giy"], 0.0, rows - 1.0)
+    iu = dr.minimum(dr.floor(u), columns - 2.0)
+    iv = dr.minimum(dr.floor(v), rows - 2.0)
+    wu, du = _weights(u - iu)
+    wv, dv = _weights(v - iv)
+    width = index_type(columns + 4.0)
+    # the table has two extra samples on every side, so that sample -1 of the stencil is at +1
+    start = (index_type(iv) + 1) * width + index_type(iu) + 1
+    height: Any = 0.0 * x
+    slope_x: Any = 0.0 * x
+    slope_y: Any = 0.0 * x
+    for j in range(4):
+        row: Any = 0.0 * x
+        row_slope: Any = 0.0 * x
+        for i in range(4):
+            c = dr.gather(float_type, table, start + j * width + i)
+            row = row + wu[i] * c
+            row_slope = row_slope + du[i] * c
+        height = height + wv[j] * row
+        slope_x = slope_x + wv[j] * row_slope
+        slope_y = slope_y + dv[j] * row
+    return height, slope_x * g["gix"], slope_y * g["giy"]
+
+
+def _weights(f: Any) -> tuple[list[Any], list[Any]]:
+    """Cubic B-spline weights of samples -1, 0, 1, 2 at fraction f, and their derivatives."""
+    e = 1.0 - f
+    values = [
+        e * e * e / 6.0,
+        2.0 / 3.0 - f * f * (2.0 - f) / 2.0,
+        2.0 / 3.0 - e * e * (2.0 - e) / 2.0,
+        f * f * f / 6.0,
+    ]
+    slopes = [-0.5 * e * e, f * (1.5 * f - 2.0), -e * (1.5 * e - 2.0), 0.5 * f * f]
+    return values, slopes
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Rotationally symmetric surface z = c r^2 / (1 + sqrt(1 - (1+k) c^2 r^2)) + A4 r^4 + A6 r^6 + ... + figure.
+
+    Attributes:
+        curvature: c = 1/R in 1/m; 0 is a plane. Positive: centre of curvature on the +z side.
+        conic: k, Schwarzschild's constant (0 sphere, -1 paraboloid).
+        even: (A4, A6, A8, ...) in m^-3, m^-5, m^-7, ...
+        figure: departure from that shape.
+    """
+
+    curvature: float = 0.0
+    conic: float = 0.0
+    even: tuple[float, ...] = ()
+    figure: Figure | None = None
+
+    @property
+    def is_plane(self) -> bool:
+        """True when the ideal shape is flat."""
+        return self.curvature == 0.0 and not any(self.even)
+
+    def with_figure(self, figure: Figure | None) -> Surface:
+        """The same shape with another figure."""
+        return replace(self, figure=figure)
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:
+        """Height z at x, y (metres, any shape); NaN outside the conic's domain."""
+        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        r2 = x * x + y * y
+        with np.errstate(invalid="ignore"):
+            z = self.curvature * r2 / (1.0 + np.sqrt(1.0 - (1.0 + self.conic) * self.curvature**2 * r2))
+        for i, a in enumerate(self.even):
+            z = z + a * r2 ** (i + 2)
+        if self.figure is not None:
+            z = z + self.figure.sag(x, y)
+        return np.asarray(z)
+
+
+def plane() -> Surface:
+    """A flat surface."""
+    return Surface()

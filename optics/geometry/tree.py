@@ -1,0 +1,262 @@
+"""The rigid-body tree: bodies with poses relative to their parents, named pivots, and small motions of any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from optics.geometry.pose import Pose, rotation_matrix, triple
+from optics.numerics.array_math import product, turned
+from optics.numerics.frozen_map import FrozenMap
+
+ORIGIN = "origin"
+
+
+@dataclass(frozen=True)
+class Body:
+    """One node of the tree.
+
+    Attributes:
+        path: full name, parts joined by ``/``; the parent is the path without its last part.
+        pose: pose relative to the parent.
+        pivots: named points in the body's own frame, metres; ``origin`` always exists.
+        scales: whether a scale applied to an ancestor also scales the interior of this body (a focal plane moves with
+            the structure that carries it but its detectors keep their size).
+    """
+
+    path: str
+    pose: Pose = field(default_factory=Pose)
+    pivots: Mapping[str, tuple[float, float, float]] = field(default_factory=FrozenMap)
+    scales: bool = True
+
+    def __post_init__(self) -> None:
+        """Freeze the pivots."""
+        pivots = {
+            ORIGIN: (0.0, 0.0, 0.0),
+            **{k: (float(v[0]), float(v[1]), float(v[2])) for k, v in self.pivots.items()},
+        }
+        object.__setattr__(self, "pivots", FrozenMap(pivots))
+
+    @property
+    def parent(self) -> str:
+        """Path of the parent, empty for a root."""
+        return self.path.rpartition("/")[0]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A small motion of one body about a pivot, in its own frame: first the rotation vector, then the shift.
+
+    Attributes:
+        rotate: rotation vector, radians.
+        shift: metres.
+        pivot: name of one of the body's pivots.
+        scale: relative growth of the body and all it carries about the pivot (isotropic expansion), e.g. 20e-6.
+        figure: surface error of a mirror or face, Noll index -> amplitude in metres of sag (see
+            ``optics.geometry.surface``).
+        stretch: relative growth of the body itself about the pivot: its surface, and the distances to what it carries;
+            unlike ``scale`` it does not enlarge the bodies that it carries (each has a temperature of its own).
+        index: change of the refractive index of a glass body.
+        index_gradient: gradient of that change in the body's frame, zero at its origin, 1/m.
+    """
+
+    rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pivot: str = ORIGIN
+    scale: float = 0.0
+    figure: Mapping[int, float] = field(default_factory=FrozenMap)
+    stretch: float = 0.0
+    index: float = 0.0
+    index_gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Freeze the figure."""
+        object.__setattr__(self, "figure", FrozenMap(self.figure))
+
+
+AT_REST = Motion()
+"""Of a body that a state does not name."""
+
+State = Mapping[str, Motion]
+"""A perturbed state: body path -> motion; bodies not named stand at their nominal pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBodies:
+    """World poses of every body for a batch of S states (complex when a complex-step derivative is taken).
+
+    Attributes:
+        index: body path -> position along the second axis.
+        rotation: (S, bodies, 3, 3); translation: (S, bodies, 3), metres.
+        scale: (S, bodies), size of the body itself relative to nominal.
+    """
+
+    index: Mapping[str, int]
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: np.ndarray
+
+    def pose(self, path: str, state: int = 0) -> Pose:
+        """World pose of one body in one state (real part)."""
+        i = self.index[path]
+        return Pose(self.rotation[state, i].real, self.translation[state, i].real)
+
+    def size(self, path: str) -> np.ndarray:
+        """Size of one body relative to nominal in each state, (S,) (real part)."""
+        return np.asarray(self.scale[:, self.index[path]].real)
+
+
+@dataclass(frozen=True)
+class RigidTree:
+    """Bodies in an order in which parents come before their children."""
+
+    bodies: tuple[Body, ...]
+
+    def __post_init__(self) -> None:
+        """Check names and the order."""
+        seen: set[str] = set()
+        for body in self.bodies:
+            if body.path in seen:
+                raise ValueError(f"body {body.path!r} appears twice")
+            if body.parent and body.parent not in seen:
+                raise ValueError(f"body {body.path!r} comes before its parent {body.parent!r}")
+            seen.add(body.path)
+
+    def __getitem__(self, path: str) -> Body:
+        """The body of that path; KeyError when unknown."""
+        for body in self.bodies:
+            if body.path == path:
+                return body
+        raise KeyError(path)
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """All body paths, parents first."""
+        return tuple(body.path for body in self.bodies)
+
+    def place(
+        self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
+    ) -> PlacedBodies:
+        """World poses for each state.
+
+        Args:
+            states: S perturbed states.
+            step: optional, one (path, kind, axis) per state with kind ``rotate``, ``shift``, ``scale`` or ``figure``
+                (the axis is then the Noll index): adds an imaginary step of ``COMPLEX_STEP`` to that component, so that
+                imag/COMPLEX_STEP is the exact derivative.
+
+        Raises:
+            KeyError: a state names an unknown body or pivot.
+        """
+        known = set(self.paths)
+        for state in states:
+            for path in state:
+                if path not in known:
+                    raise KeyError(path)
+        count = len(states)
+        dtype: Any = np.complex128 if step is not None else np.float64
+        index = {path: i for i, path in enumerate(self.paths)}
+        rotation = np.empty((count, len(index), 3, 3), dtype)
+        translation = np.empty((count, len(index), 3), dtype)
+        scale = np.ones((count, len(index)), dtype)
+        passed_on = np.ones((count, len(index)), dtype)
+        for i, body in enumerate(self.bodies):
+            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
+            position = body.pose.translation
+            if body.parent:
+                p = index[body.parent]
+                base_rotation, base_translation = rotation[:, p], translation[:, p]
+                inherited, distances = passed_on[:, p], scale[:, p]
+            else:
+                base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3))
+                base_translation = np.zeros((count, 3), dtype)
+                inherited = distances = np.ones(count, dtype)
+            here = product(base_rotation, body.pose.rotation)
+            inner = inherited if body.scales else np.ones(count, dtype)
+            rotation[:, i] = product(here, motion)
+            translation[:, i] = (
+                np.einsum("sij,sj->si", base_rotation, distances[:, None] * position)
+                + base_translation
+                + np.einsum("sij,sj->si", here, offset)
+            )
+            passed_on[:, i] = inner * growth
+            scale[:, i] = inner * growth * stretch
+        return PlacedBodies(FrozenMap(index), rotation, translation, scale)
+
+
+FIGURE = "figure"
+COMPLEX_STEP = 1e-40
+"""Imaginary step of the complex-step derivative; products of two steps vanish in float64, so it is exact."""
+
+
+def _local_motion(
+    body: Body, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, dtype: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation (S,3,3), translation (S,3) in the body's frame, growth (S,) and stretch (S,) of one body's motion."""
+    count = len(states)
+    rotate = np.zeros((count, 3), dtype)
+    shift = np.zeros((count, 3), dtype)
+    growth = np.ones(count, dtype)
+    stretch = np.ones(count, dtype)
+    pivot = np.zeros((count, 3))
+    for s, state in enumerate(states):
+        motion = state.get(body.path)
+        if motion is not None:
+            rotate[s], shift[s], growth[s] = motion.rotate, motion.shift, 1.0 + motion.scale
+            stretch[s] = 1.0 + motion.stretch
+            if motion.pivot not in body.pivots:
+                raise KeyError(f"{body.path}: pivot {motion.pivot!r}")
+            pivot[s] = body.pivots[motion.pivot]
+        if step is not None and step[s][0] == body.path:
+            kind, axis = step[s][1], step[s][2]
+            if kind == "rotate":
+                rotate[s, axis] += 1j * COMPLEX_STEP
+            elif kind == "shift":
+                shift[s, axis] += 1j * COMPLEX_STEP
+            elif kind == "scale":
+                growth[s] += 1j * COMPLEX_STEP
+            elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.raytrace.system``
+                raise ValueError(f"unknown kind of motion {kind!r}")
+    turned = rotation_matrix(rotate)
+    offset = pivot + shift - (growth * stretch)[:, None] * np.einsum("sij,sj->si", turned, pivot)
+    return turned, offset, growth, stretch
+
+
+def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
+    """One state that does ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
+
+    Exact for the rigid parts; figures and indices add.
+    """
+    out = dict(first)
+    for path, motion in then.items():
+        before = out.get(path)
+        if before is None:
+            out[path] = motion
+            continue
+        body = bodies[path]
+        turn_1, offset_1 = _affine(before, body)
+        turn_2, offset_2 = _affine(motion, body)
+        growth = (1.0 + before.stretch) * (1.0 + before.scale)
+        turn, offset = product(turn_1, turn_2), turned(turn_1, growth * offset_2) + offset_1
+        out[path] = Motion(
+            rotate=triple(Rotation.from_matrix(turn).as_rotvec()),
+            shift=triple(offset),
+            scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
+            figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
+            stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
+            index=before.index + motion.index,
+            index_gradient=triple(np.array(before.index_gradient) + np.array(motion.index_gradient)),
+        )
+    return out
+
+
+def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and offset (3,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
+    turn = rotation_matrix(np.array(motion.rotate))
+    pivot = np.array(body.pivots[motion.pivot])
+    growth = (1.0 + motion.scale) * (1.0 + motion.stretch)
+    return turn, pivot + np.array(motion.shift) - growth * turned(turn, pivot)

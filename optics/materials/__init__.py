@@ -1,0 +1,1 @@
+"""Glasses, structural materials, and what surfaces do with light."""

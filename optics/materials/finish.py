@@ -1,0 +1,111 @@
+"""What a surface does with light in the path tracer: Fresnel's laws and finishes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from optics.materials.scatter import ABg, Scatter
+from optics.numerics.array_math import select, sqrt
+
+GRAZING = 1e-12
+"""Smallest cosine of incidence that is told from zero; below it the formulas are 0/0."""
+
+
+def cosine_after(cosine: Any, before: Any, after: Any) -> Any:
+    """Cosine of the angle of refraction by Snell's law, 0 where the light is totally reflected.
+
+    Args:
+        cosine: of the angle of incidence, 0 to 1; float, NumPy or Dr.Jit array, as the others.
+        before: refractive index on the side of the incident light.
+        after: on the side of the refracted light.
+    """
+    ratio = before / after
+    square = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
+    return sqrt(select(square > 0.0, square, 0.0 * square))
+
+
+def reflectance(cosine: Any, before: Any, after: Any) -> Any:
+    """Share of unpolarised power that is reflected, 0 to 1; exactly 1 beyond the critical angle.
+
+    Arguments as ``cosine_after``. What is not reflected is transmitted.
+    """
+    cosine = select(cosine > GRAZING, cosine, 0.0 * cosine + GRAZING)
+    bent = cosine_after(cosine, before, after)
+    s = (before * cosine - after * bent) / (before * cosine + after * bent)
+    p = (after * cosine - before * bent) / (after * cosine + before * bent)
+    return 0.5 * (s * s + p * p)
+
+
+@dataclass(frozen=True)
+class Finish:
+    """Optical finish of one side of a surface.
+
+    Attributes:
+        reflectance: share reflected, specular or into the scatter lobe around the specular direction.
+        transmission: share that goes through (refracted); beyond the critical angle all of it is reflected instead.
+        diffuse: share diffused by Lambert's law to the side the light came from.
+        scatter: lobe around the specular and the refracted direction, which takes its share out of them.
+        bare: bare glass: reflectance and transmission are Fresnel's and must be given as 0.
+        records: whether the light that is absorbed counts as detected.
+
+    Raises:
+        ValueError: the shares are impossible.
+    """
+
+    reflectance: float = 0.0
+    transmission: float = 0.0
+    diffuse: float = 0.0
+    scatter: Scatter | None = None
+    bare: bool = False
+    records: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the shares."""
+        shares = (self.reflectance, self.transmission, self.diffuse)
+        if min(shares) < 0.0 or sum(shares) > 1.0 + 1e-12:
+            raise ValueError(
+                f"reflected, transmitted and diffused shares must be 0 or more and at most 1, found {shares}"
+            )
+        if self.bare and any(shares):
+            raise ValueError("a bare glass surface takes its shares from Fresnel's formulas; give none")
+
+    @property
+    def absorptance(self) -> float:
+        """Share that stays in the surface (below the critical angle)."""
+        return 0.0 if self.bare else max(0.0, 1.0 - self.reflectance - self.transmission - self.diffuse)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """reflectance, transmission, bare, diffuse, and the lobe's share, scale, exponent, kind."""
+        lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers
+        return (self.reflectance, self.transmission, float(self.bare), self.diffuse, *lobe)
+
+
+POLISH = ABg(2.0e-6, 1.0e-6, 2.0)
+"""A polished mirror of about 1 nm rms roughness: total integrated scatter 9e-5 (4 pi sigma / lambda squared would be
+3.7e-4 at 650 nm over all spatial periods; about a quarter of it falls into the angles the lobe covers)."""
+
+PAINT = ABg(5.0e-3, 0.1, 2.0)
+"""The forward lobe of black paint around its weak gloss."""
+
+MIRROR = Finish(reflectance=0.98, scatter=POLISH)
+"""A metal mirror with a protected coating."""
+
+COATED = Finish(reflectance=0.0025, transmission=0.9975)
+"""Glass with an anti-reflection coating: a residual reflectance of a quarter of a percent."""
+
+BARE = Finish(bare=True)
+"""Polished bare glass."""
+
+GROUND = Finish(diffuse=0.04)
+"""Glass ground and blackened, seen from either side."""
+
+BLACK = Finish(reflectance=0.005, diffuse=0.035, scatter=PAINT)
+"""Diffuse black paint: 4 % of the light comes back, most of it by Lambert's law."""
+
+SILICON = Finish(reflectance=0.3, records=True)
+"""A bare silicon detector: what it does not reflect it records."""
+
+ABSORBER = Finish()
+"""Perfectly black."""

@@ -1,0 +1,160 @@
+"""Optical glasses: refractive index by wavelength and temperature.
+
+Dispersion is Sellmeier's formula n^2 - 1 = sum B_i w^2 / (w^2 - C_i), w in micrometres. Temperature enters by Schott's
+formula (Hoffmann, Jochs and Westenberger 1990; Hartmann, "Optical Glass", SPIE Press 2014, eq. 3.18 and 3.19)
+
+    dn_abs = (n0^2 - 1) / (2 n0) * (D0 t + D1 t^2 + D2 t^3 + (E0 t + E1 t^2) / (w^2 - w_TK^2)),   t = T - 20 C.
+
+Makers state indices against air of 20 C and 1013 hPa (``Glass.index``); in vacuum light sees ``Glass.vacuum_index``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import sqrt
+
+from optics.materials.names import unknown_name
+from optics.numerics.frozen_map import FrozenMap
+
+REFERENCE_TEMPERATURE = 293.15
+"""Temperature at which the dispersion formulas hold, kelvin (20 C)."""
+
+
+@dataclass(frozen=True)
+class ThermalDispersion:
+    """Constants of Schott's formula for dn/dT, in the units of its data sheets.
+
+    Attributes:
+        d0, d1, d2: 1/K, 1/K^2, 1/K^3.
+        e0, e1: um^2/K, um^2/K^2.
+        lambda_tk: um.
+    """
+
+    d0: float
+    d1: float
+    d2: float
+    e0: float
+    e1: float
+    lambda_tk: float
+
+
+@dataclass(frozen=True)
+class Glass:
+    """One glass.
+
+    Attributes:
+        name: as in the catalogue.
+        b: Sellmeier's B1, B2, B3.
+        c: C1, C2, C3, um^2.
+        shortest, longest: wavelengths between which the formula holds, metres.
+        source: where the numbers come from.
+        thermal: dn/dT, None when no constants are published.
+    """
+
+    name: str
+    b: tuple[float, float, float]
+    c: tuple[float, float, float]
+    shortest: float
+    longest: float
+    source: str
+    thermal: ThermalDispersion | None = None
+
+    def index(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
+        """Refractive index relative to air of 20 C and 1013 hPa.
+
+        The change with temperature is that of the absolute index (the air of reference does not change).
+
+        Args:
+            wavelength_m: in air, metres.
+            temperature_k: of the glass, kelvin.
+
+        Raises:
+            ValueError: the wavelength is outside the formula's range, the temperature is not above 0 K, or the glass
+                has no temperature constants and another temperature than 293.15 K is asked for.
+        """
+        if not self.shortest <= wavelength_m <= self.longest:
+            raise ValueError(
+                f"{self.name}: wavelength {wavelength_m * 1e9:.6g} nm is outside the range of its dispersion formula, "
+                f"{self.shortest * 1e9:.6g} to {self.longest * 1e9:.6g} nm"
+            )
+        w2 = (wavelength_m * 1e6) ** 2
+        n = sqrt(1.0 + sum(b * w2 / (w2 - c) for b, c in zip(self.b, self.c, strict=True)))
+        if not 0.0 < temperature_k < float("inf"):
+            raise ValueError(f"{self.name}: a temperature must be above 0 K and finite, found {temperature_k} K")
+        t = temperature_k - REFERENCE_TEMPERATURE
+        if t == 0.0:
+            return n
+        k = self._constants()
+        polynomial = k.d0 * t + k.d1 * t**2 + k.d2 * t**3 + (k.e0 * t + k.e1 * t**2) / (w2 - k.lambda_tk**2)
+        return n + (n * n - 1.0) / (2.0 * n) * polynomial
+
+    def vacuum_index(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
+        """Absolute refractive index, for glass in vacuum; arguments and errors as ``index``, wavelength in air."""
+        at_reference = self.index(wavelength_m)
+        change = self.index(wavelength_m, temperature_k) - at_reference
+        return at_reference * air_index(wavelength_m) + change
+
+    def dn_dt(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
+        """Derivative of the absolute index by temperature, 1/K; errors as ``index``."""
+        n = self.index(wavelength_m)
+        k = self._constants()
+        t = temperature_k - REFERENCE_TEMPERATURE
+        w2 = (wavelength_m * 1e6) ** 2
+        slope = k.d0 + 2.0 * k.d1 * t + 3.0 * k.d2 * t**2 + (k.e0 + 2.0 * k.e1 * t) / (w2 - k.lambda_tk**2)
+        return (n * n - 1.0) / (2.0 * n) * slope
+
+    def _constants(self) -> ThermalDispersion:
+        if self.thermal is None:
+            raise ValueError(f"{self.name}: no constants for the change of its index with temperature are known")
+        return self.thermal
+
+
+def air_index(wavelength_m: float) -> float:
+    """Refractive index of dry air at 20 C and 1013 hPa (Kohlrausch, Praktische Physik; Schott TIE-19)."""
+    w2 = (wavelength_m * 1e6) ** 2
+    at_15 = 1e-8 * (6432.8 + 2949810.0 * w2 / (146.0 * w2 - 1.0) + 25540.0 * w2 / (41.0 * w2 - 1.0))
+    return 1.0 + at_15 / (1.0 + 3.4785e-3 * 5.0)
+
+
+FUSED_SILICA = Glass(
+    "fused silica",
+    (0.6961663, 0.4079426, 0.8974794),
+    (0.0684043**2, 0.1162414**2, 9.896161**2),
+    0.21e-6,
+    3.71e-6,
+    "dispersion: Malitson, JOSA 55, 1205 (1965); dn/dT: Schott Lithosil-Q, Zemax catalogue of 2017-01-20 (checked); "
+    "Corning 7980 has a dn/dT some 5 % higher (Rego, Sensors 23, 6023 (2023))",
+    ThermalDispersion(2.06e-5, 2.51e-8, -2.47e-11, 3.12e-7, 4.22e-10, 0.16),
+)
+N_BK7 = Glass(
+    "N-BK7",
+    (1.03961212, 0.231792344, 1.01046945),
+    (0.00600069867, 0.0200179144, 103.560653),
+    0.3e-6,
+    2.5e-6,
+    "Schott, Zemax catalogue of 2017-01-20 (checked)",
+    ThermalDispersion(1.86e-6, 1.31e-8, -1.37e-11, 4.34e-7, 6.27e-10, 0.17),
+)
+ZERODUR = Glass(
+    "Zerodur",
+    (1.3182408, 0.0244, 1.08915181),
+    (0.00879, 0.0609, 110.0),
+    0.365e-6,
+    2.325e-6,
+    "Schott TIE-43, Optical Properties of ZERODUR, November 2007 (no constants of Schott's dn/dT formula published)",
+)
+GLASSES: Mapping[str, Glass] = FrozenMap({g.name: g for g in (FUSED_SILICA, N_BK7, ZERODUR)})
+"""The catalogue, by name."""
+
+
+def glass(name: str) -> Glass:
+    """The catalogue's glass of that name; a case-insensitive match is enough.
+
+    Raises:
+        KeyError: unknown, with the nearest name.
+    """
+    for known, entry in GLASSES.items():
+        if known.lower() == name.lower():
+            return entry
+    raise unknown_name("glass", name, GLASSES)

@@ -1,0 +1,1 @@
+"""Arrays and kernels: backends, fixed sums, quadrature, immutable maps."""

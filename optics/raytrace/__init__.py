@@ -1,0 +1,1 @@
+"""Elements on bodies, the exact trace through them, its derivatives, chief rays."""

@@ -1,0 +1,169 @@
+"""Ray aiming: find the rays that pass given points of a given element (stop, prism aperture) exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from optics.raytrace.assembly import Assembly, Element
+from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import make_rays, trace
+
+DEFAULT_TOLERANCE = 1e-11
+MAX_ITERATIONS = 25
+
+
+class AimError(RuntimeError):
+    """No ray from the given place reaches the given point."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayFan:
+    """A two-parameter family of rays per ray to be aimed: q = (a, b) moves the direction or the launch point.
+
+    Attributes:
+        position: launch points, world, (B, N, 3), metres.
+        direction: unit directions, world, (B, N, 3).
+        axes: two vectors per ray or per system, broadcastable to (B, N, 2, 3).
+        moves_position: True: launch point = position + a e1 + b e2 (a collimated beam); False: direction =
+            normalised (direction + a e1 + b e2) (a point source).
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    axes: np.ndarray
+    moves_position: bool = False
+
+    def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Launch points and directions for parameters q (B, N, 2)."""
+        start = self.position if self.moves_position else self.direction
+        # component by component: each is one block of memory
+        moved = np.empty((3, *q.shape[:2]))
+        for x in range(3):
+            np.multiply(q[..., 0], self.axes[..., 0, x], out=moved[x])
+            moved[x] += q[..., 1] * self.axes[..., 1, x]
+            moved[x] += start[..., x]
+        shape = (*q.shape[:2], 3)
+        if self.moves_position:
+            return np.moveaxis(moved, 0, -1), np.broadcast_to(self.direction, shape)
+        moved /= np.sqrt(moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2)
+        return np.broadcast_to(self.position, shape), np.moveaxis(moved, 0, -1)
+
+
+def transverse_axes(direction: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Two unit vectors square to ``direction`` (..., 3), the first near ``first``; shape (..., 2, 3)."""
+    e1 = first - direction * np.sum(first * direction, axis=-1, keepdims=True)
+    e1 = e1 / np.linalg.norm(e1, axis=-1, keepdims=True)
+    return np.stack([e1, np.cross(direction, e1)], axis=-2)
+
+
+# what is no number is told by AimError alone
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def aim(
+    backend: Backend,
+    systems: SystemBatch,
+    fan: RayFan,
+    target: np.ndarray,
+    start: np.ndarray | None = None,
+    jacobian: np.ndarray | None = None,
+    tolerance: float = DEFAULT_TOLERANCE,
+    step: float = 1e-6,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve for the rays that meet the last element of ``systems`` at ``target``.
+
+    Newton's method with one difference Jacobian per ray, improved by Broyden's rank-one update.
+
+    Args:
+        backend: where to trace.
+        systems: B systems that end at the element to be hit; apertures are not looked at.
+        fan: the families of rays.
+        target: x, y on that element, metres of its nominal size, broadcastable to (B, N, 2): points of an aperture,
+            which grows with its body.
+        start: parameters to start from, broadcastable to (B, N, 2); default 0.
+        jacobian: d(hit)/dq to start from, broadcastable to (B, N, 2, 2); default by differences of size ``step``.
+        tolerance: largest distance from the target there, metres.
+        step: difference step of the parameters (metres or radians).
+
+    Returns:
+        Parameters (B, N, 2) and the Jacobian (B, N, 2, 2).
+
+    Raises:
+        AimError: not converged.
+    """
+    uploaded = systems.upload(backend)
+
+    def hit(q: np.ndarray) -> np.ndarray:
+        position, direction = fan.at(q)
+        return trace(backend, uploaded, make_rays(backend, position, direction)).place()
+
+    count = max(systems.count, fan.position.shape[0], fan.direction.shape[0])
+    rays = max(fan.position.shape[1], fan.direction.shape[1], np.shape(target)[-2] if np.ndim(target) > 1 else 1)
+    shape = (count, rays, 2)
+    q = np.array(np.broadcast_to(0.0 if start is None else start, shape), dtype=np.float64)
+    goal = np.broadcast_to(target, shape) * systems.size[:, None, None]
+    here = hit(q)
+    if jacobian is None:
+        columns = [(hit(q + step * np.eye(2)[k]) - here) / step for k in range(2)]
+        slope = np.stack(columns, axis=-1)
+    else:
+        slope = np.array(np.broadcast_to(jacobian, (*shape, 2)), dtype=np.float64)
+    for _ in range(MAX_ITERATIONS):
+        miss = goal - here
+        worst = float(np.max(np.abs(miss)))
+        if worst <= tolerance:
+            return q, slope
+        if not np.isfinite(worst):
+            break  # also after a step along a singular Jacobian
+        change = _solve(slope, miss)
+        q = q + change
+        there = hit(q)
+        error = (there - here) - np.einsum("bnij,bnj->bni", slope, change)
+        norm = np.sum(change**2, axis=-1)[..., None, None]
+        # rays that have arrived take no meaningful step; their slope stays
+        moving = np.max(np.abs(miss), axis=-1)[..., None, None] > tolerance
+        update = error[..., :, None] * change[..., None, :] / np.where(moving, norm, 1.0)
+        slope = np.where(moving, slope + update, slope)
+        here = there
+    raise AimError(
+        f"aiming at the last element did not converge: {float(np.max(np.abs(goal - here))):.3g} m off after "
+        f"{MAX_ITERATIONS} steps; the perturbation may move the beam off the mirrors"
+    )
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions (..., 2) of 2 x 2 systems by Cramer's rule, in a few passes; not finite where singular."""
+    (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    x, y = np.moveaxis(right, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
+
+
+def alive_along(
+    backend: Backend,
+    assembly: Assembly,
+    names: Sequence[str],
+    position: np.ndarray,
+    direction: np.ndarray,
+    state: State | None = None,
+) -> Iterator[tuple[Element, np.ndarray]]:
+    """Which rays are still alive after each element of a sequence, to tell where they get lost; traced step by step.
+
+    Args:
+        backend: where to trace.
+        assembly: the instrument.
+        names: elements in the order in which light meets them.
+        position: of the rays, world, metres, broadcastable to (N, 3).
+        direction: unit vectors, likewise.
+        state: what is perturbed.
+
+    Yields:
+        The element and a mask (N,).
+    """
+    rays = make_rays(backend, position, direction)
+    for count in range(1, len(names) + 1):
+        traced = trace(backend, assemble(assembly, [names[:count]], [state or {}]), rays)
+        yield assembly.elements[names[count - 1]], traced.numpy()[3][0]

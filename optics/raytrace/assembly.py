@@ -1,0 +1,132 @@
+"""Elements on the tree of bodies, and the sequences in which light meets them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface
+from optics.geometry.tree import PlacedBodies, RigidTree, State
+from optics.numerics.frozen_map import FrozenMap
+
+
+class Interaction(Enum):
+    """What happens to a ray at a surface."""
+
+    REFLECT = "reflect"
+    REFRACT = "refract"
+    PASS = "pass"
+    TOTAL = "total"
+    """Total reflection inside glass; a ray that is not beyond the critical angle is lost."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """One surface in the assembly.
+
+    Attributes:
+        name: unique name, e.g. ``forward/M1``.
+        body: path of the rigid body that carries it; the surface's frame is the body's frame.
+        surface: its shape.
+        interaction: reflect, refract or pass.
+        aperture: clear aperture in the surface's x, y; None is unlimited.
+        index_after: refractive index on the side the light goes to (the index before is that of the element before
+            it); for surfaces that are not faces of a solid.
+        solid: path of the glass body whose face this is, behind it (on its -z side). A refracted ray enters it when it
+            comes from outside and leaves it when it comes from inside; the index is the assembly's for that solid.
+    """
+
+    name: str
+    body: str
+    surface: Surface
+    interaction: Interaction
+    aperture: Aperture | None = None
+    index_after: float = 1.0
+    solid: str | None = None
+
+    def with_aperture(self, aperture: Aperture | None) -> Element:
+        """The same element with another aperture."""
+        return replace(self, aperture=aperture)
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Optical elements on a tree of rigid bodies; immutable, "with" methods return a changed copy.
+
+    Attributes:
+        tree: where everything stands.
+        elements: name -> element.
+        sequences: name -> element names in the order in which light meets them (an element may come twice).
+        media: path of a glass body -> its refractive index in vacuum.
+    """
+
+    tree: RigidTree
+    elements: Mapping[str, Element]
+    sequences: Mapping[str, tuple[str, ...]]
+    media: Mapping[str, float] = field(default_factory=FrozenMap)
+
+    def __post_init__(self) -> None:
+        """Freeze and check that every name exists."""
+        paths = set(self.tree.paths)
+        for name, element in self.elements.items():
+            if name != element.name:
+                raise ValueError(f"element {element.name!r} is filed under {name!r}")
+            if element.body not in paths:
+                raise ValueError(f"element {name!r} stands on unknown body {element.body!r}")
+            if element.solid is not None and element.solid not in self.media:
+                raise ValueError(f"element {name!r} is a face of {element.solid!r}, which has no refractive index")
+        for path in self.media:
+            if path not in paths:
+                raise ValueError(f"a refractive index is given for unknown body {path!r}")
+        for sequence, names in self.sequences.items():
+            for name in names:
+                if name not in self.elements:
+                    raise ValueError(f"sequence {sequence!r} names unknown element {name!r}")
+        object.__setattr__(self, "elements", FrozenMap(self.elements))
+        object.__setattr__(self, "media", FrozenMap(self.media))
+        object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
+
+    def sequence(self, name: str) -> tuple[Element, ...]:
+        """The elements of a named sequence.
+
+        Raises:
+            KeyError: unknown sequence.
+        """
+        return tuple(self.elements[n] for n in self.sequences[name])
+
+    def with_element(self, element: Element) -> Assembly:
+        """A copy in which the element of that name is replaced or added."""
+        return replace(self, elements={**self.elements, element.name: element})
+
+    def with_sequence(self, name: str, names: Sequence[str]) -> Assembly:
+        """A copy with one more sequence."""
+        return replace(self, sequences={**self.sequences, name: tuple(names)})
+
+    def place(
+        self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
+    ) -> PlacedBodies:
+        """World poses of all bodies for each state; see ``RigidTree.place``."""
+        return self.tree.place(states, step)
+
+    def nominal_pose(self, body: str) -> Pose:
+        """World pose of a body in the unperturbed assembly."""
+        return self.place().pose(body)
+
+
+def points_to_world(placed: PlacedBodies, body: str, points: np.ndarray) -> np.ndarray:
+    """Where points of a body are in each state, world, (S, P, 3), metres; complex where ``placed`` is.
+
+    Args:
+        placed: the bodies.
+        body: its path.
+        points: of its material, named by their places on the nominal body, (P, 3), metres in its frame: they move apart
+            as the body grows. A place in space that is told in the body's frame, as a ray's hit, takes its ``pose``.
+    """
+    i = placed.index[body]
+    grown = placed.scale[:, i, None, None] * points
+    return np.asarray(np.einsum("sij,spj->spi", placed.rotation[:, i], grown) + placed.translation[:, i, None])

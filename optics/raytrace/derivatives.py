@@ -1,0 +1,135 @@
+"""Derivatives of a ray trace: Jacobian-vector products (forward mode) and vector-Jacobian products (reverse mode).
+
+One backward pass gives the derivative of a weighted sum of ray coordinates by every number of every system, however
+many there are; forward mode (``optics.raytrace.derivatives``) gives all rays' derivatives by one parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optics.numerics.backend import Backend
+from optics.raytrace.system import SystemBatch
+from optics.raytrace.trace import Traced, make_rays, rows, trace
+
+
+@dataclass(frozen=True, eq=False)
+class RayTangents:
+    """Derivatives of rays at the last element of a sequence, in its own frame.
+
+    Attributes:
+        position, direction: (B, N, 3), metres and 1 per unit of the parameter.
+        path: optical path, (B, N).
+        hits: element index -> derivative of the local hit there, (B, N, 3), for those asked to be kept.
+        traced: the rays themselves.
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    hits: Mapping[int, np.ndarray]
+    traced: Traced
+
+
+def push_forward(
+    backend: Backend,
+    systems: SystemBatch,
+    position: np.ndarray,
+    direction: np.ndarray,
+    position_step: np.ndarray | float = 0.0,
+    direction_step: np.ndarray | float = 0.0,
+    keep: Collection[int] = (),
+) -> RayTangents:
+    """Trace rays and differentiate them by one parameter each.
+
+    Args:
+        backend: where to trace.
+        systems: B systems; derivatives that they carry (``assemble(..., step=...)``) are added.
+        position: launch points, world, (B, N, 3), metres.
+        direction: unit directions, (B, N, 3).
+        position_step: derivative of the launch points, broadcastable to (B, N, 3).
+        direction_step: derivative of the directions, square to them, broadcastable to (B, N, 3).
+        keep: indices of elements whose hits are differentiated too.
+    """
+    import drjit as dr
+
+    rays = make_rays(backend, position, direction)
+    for variable, step in ((rays.position, position_step), (rays.direction, direction_step)):
+        dr.enable_grad(variable)
+        dr.set_grad(variable, backend.vector(np.broadcast_to(step, direction.shape).reshape(-1, 3)))
+    traced = trace(backend, systems, rays, keep=keep, evaluate=False)
+    local = traced.local
+    # interior gradients are kept: a hit on the way is an input of the rays at the end
+    dr.forward_to(local.position, local.direction, local.path, list(traced.hits.values()), flags=dr.ADFlag.ClearEdges)
+
+    vectors = (local.position, local.direction, *traced.hits.values())
+    slopes, path = [dr.grad(vector) for vector in vectors], dr.grad(local.path)
+    # one launch for all: each array evaluated by itself would trace everything again in a kernel of its own
+    dr.eval(slopes, path, vectors, local.path, local.valid)
+    at_position, at_direction, *at_hits = (rows(slope, traced.count) for slope in slopes)
+    return RayTangents(
+        at_position,
+        at_direction,
+        path.numpy().reshape(traced.count, -1),
+        dict(zip(traced.hits, at_hits, strict=True)),
+        traced,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RayCotangents:
+    """Derivatives of S_b = sum_n w_bn . r_bn, with r the rays at the last element of system b and w given weights.
+
+    Attributes:
+        values: per element, parameter name -> dS_b/d(number of system b), (B,), for the names that were asked for.
+        position: dS_b/d(launch point), (B, N, 3), per metre.
+        direction: dS_b/d(launch direction), (B, N, 3); its part along the ray means nothing by itself.
+    """
+
+    values: tuple[Mapping[str, np.ndarray], ...]
+    position: np.ndarray
+    direction: np.ndarray
+
+
+def pull_back(
+    backend: Backend,
+    systems: SystemBatch,
+    position: np.ndarray,
+    direction: np.ndarray,
+    weight: np.ndarray,
+    names: Sequence[Collection[str]],
+) -> RayCotangents:
+    """Trace rays and differentiate a weighted sum of where they end by everything they depend on.
+
+    Args:
+        backend: where to trace.
+        systems: B systems; derivatives that they carry are left aside.
+        position: launch points, world, (B, N, 3), metres.
+        direction: unit directions, (B, N, 3).
+        weight: of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
+        names: per element, names of the numbers in ``systems.values`` to differentiate by (poses in the world, W and P,
+            do not enter the trace and have no derivative).
+
+    Returns:
+        Derivatives; rays that are stopped or lost count as if they went on.
+    """
+    import drjit as dr
+
+    uploaded = replace(replace(systems, tangents=None).upload(backend), differentiable=True)
+    wanted = [numbers[name] for numbers, own in zip(uploaded.values, names, strict=True) for name in own]
+    rays = make_rays(backend, position, direction)
+    for variable in (*wanted, rays.position, rays.direction):
+        dr.enable_grad(variable)
+    end = trace(backend, uploaded, rays, evaluate=False).local.position
+    dr.set_grad(end, backend.vector(np.broadcast_to(weight, direction.shape).reshape(-1, 3)))
+    dr.enqueue(dr.ADMode.Backward, end)
+    dr.traverse(dr.ADMode.Backward)
+
+    slopes = [dr.grad(variable) for variable in (*wanted, rays.position, rays.direction)]
+    dr.eval(slopes)  # one launch for all
+    at = iter(slope.numpy() for slope in slopes[:-2])
+    values = tuple({name: next(at) for name in own} for own in names)
+    return RayCotangents(values, rows(slopes[-2], systems.count), rows(slopes[-1], systems.count))

@@ -1,0 +1,399 @@
+"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optics.geometry.surface import grid_figure, polynomial_figure
+from optics.geometry.zernike import triangle_size
+from optics.numerics.backend import Backend
+from optics.raytrace.assembly import Interaction
+from optics.raytrace.graded_ray import GradedRay
+from optics.raytrace.system import Structure, SystemBatch, UploadedSystems
+
+NEWTON_STEPS = 3
+"""Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope
+below 1e-3, so that each step gains at least six digits; three reach rounding. A ray that has not converged is marked
+invalid."""
+
+CONVERGED = 1e-12
+"""Largest distance to the surface of a valid hit, metres."""
+
+
+class BeamMissedError(RuntimeError):
+    """No ray of a bundle gets through a sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still alive.
+
+    Attributes:
+        position, direction, path, valid: of width systems * N; a direction that all rays share is of width 1.
+        systems: number of systems that the rays are for, system by system; 1: every system gets all of them.
+    """
+
+    position: Any
+    direction: Any
+    path: Any
+    valid: Any
+    systems: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """Rays at the last element of a sequence.
+
+    Attributes:
+        local: rays in the last element's own frame, after the interaction.
+        world: the same rays in the world frame (position and direction), None unless asked for.
+        hits: element index -> local position on that element, for those asked to be kept.
+        count: B systems.
+    """
+
+    local: Rays
+    world: Rays | None
+    hits: Mapping[int, Any]
+    count: int
+
+    def numpy(self, rays: Rays | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position (B, N, 3), direction (B, N, 3), path (B, N), valid (B, N) of ``local`` (default) or ``world``."""
+        rays = self.local if rays is None else rays
+        return (
+            rows(rays.position, self.count),
+            rows(rays.direction, self.count),
+            rays.path.numpy().reshape(self.count, -1),
+            rays.valid.numpy().reshape(self.count, -1),
+        )
+
+    def hit(self, element: int) -> np.ndarray:
+        """Local positions (B, N, 3) on an element that was kept, metres."""
+        return rows(self.hits[element], self.count)
+
+    def place(self, element: int | None = None) -> np.ndarray:
+        """Local x, y (B, N, 2), metres, on the last element or on one that was kept."""
+        vector = self.local.position if element is None else self.hits[element]
+        return np.moveaxis(np.stack([c.numpy() for c in (vector.x, vector.y)]).reshape(2, self.count, -1), 0, -1)
+
+
+def rows(vector: Any, count: int) -> np.ndarray:
+    """Components of a ``Vector3`` of B * N rays as an array (B, N, 3); in memory one component after the other."""
+    return np.moveaxis(np.stack([c.numpy() for c in vector]).reshape(3, count, -1), 0, -1)
+
+
+def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, path: np.ndarray | None = None) -> Rays:
+    """Upload rays given by positions in metres and unit directions, broadcastable to each other.
+
+    Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own. A direction (3,)
+    is kept as one vector: a trace through conics is held up by the memory that it reads.
+    """
+    import drjit as dr
+
+    shared = np.ndim(direction) == 1
+    position, direction = np.broadcast_arrays(np.asarray(position, np.float64), np.asarray(direction, np.float64))
+    systems = position.shape[0] if position.ndim == 3 else 1
+    n = position.size // 3
+    start = dr.zeros(backend.Float, n) if path is None else backend.opaque(path)
+    heading = backend.vector(direction.reshape(-1, 3)[:1] if shared else direction)
+    return Rays(backend.vector(position), heading, start, dr.full(backend.Bool, True, n), systems)
+
+
+def trace(
+    backend: Backend,
+    systems: SystemBatch | UploadedSystems,
+    rays: Rays,
+    keep: Collection[int] = (),
+    world: bool = False,
+    evaluate: bool = True,
+) -> Traced:
+    """Send rays, given in the world frame, through each system.
+
+    Args:
+        backend: where to compute.
+        systems: B systems.
+        rays: for these systems, or rays that every system gets.
+        keep: indices of elements whose hit points are wanted.
+        world: also return the final rays in the world frame.
+        evaluate: launch the kernel now (False leaves a graph to build on).
+
+    Returns:
+        The rays at the last element. Rays that miss a surface or an aperture, or are totally reflected at a refracting
+        surface, are marked invalid; their numbers stay finite but mean nothing.
+
+    Raises:
+        ValueError: the rays are for another number of systems.
+    """
+    import drjit as dr
+
+    uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
+    rays, lookup = _spread(backend, rays, uploaded.count)
+    p, d, path, valid = rays.position, rays.direction, rays.path, rays.valid
+    hits: dict[int, Any] = {}
+    differentiable = uploaded.differentiable or dr.grad_enabled(p) or dr.grad_enabled(d)
+    for i, structure in enumerate(uploaded.structure):
+        g = {name: lookup(array) for name, array in uploaded.values[i].items() if name[0] not in "WPS"}
+        p, d = _into_frame(backend, p, d, g)
+        t, ok = _distance(backend, p, d, g, structure, uploaded.grids[i], differentiable)
+        if structure.graded[0]:
+            curve = GradedRay.start(p, d, g["n"], (g["nx"], g["ny"], g["nz"]))
+            tau = _solve(curve, t / curve.index, g, structure, uploaded.grids[i], differentiable)
+            p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
+            ok = _reached(p, g, structure, uploaded.grids[i])
+        else:
+            p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
+            path = dr.fma(g["n"], t, path)
+        valid = valid & ok & _inside(p, g, structure)
+        if structure.interaction is not Interaction.PASS:
+            d, ok = _redirect(backend, p, d, g, structure, uploaded.grids[i])
+            valid = valid & ok
+        if i in keep:
+            hits[i] = p
+    d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
+    local = Rays(p, d, path, valid, uploaded.count)
+    outside = None
+    if world:
+        g = {name: lookup(array) for name, array in uploaded.values[-1].items() if name[0] in "WP"}
+        outside = Rays(
+            backend.Vector3(
+                *(g[f"W{a}0"] * p.x + g[f"W{a}1"] * p.y + g[f"W{a}2"] * p.z + g[f"P{a}"] for a in range(3))
+            ),
+            backend.Vector3(*(g[f"W{a}0"] * d.x + g[f"W{a}1"] * d.y + g[f"W{a}2"] * d.z for a in range(3))),
+            path,
+            valid,
+            uploaded.count,
+        )
+    if evaluate:
+        dr.eval(
+            p, d, path, valid, list(hits.values()), [] if outside is None else [outside.position, outside.direction]
+        )
+    return Traced(local, outside, hits, uploaded.count)
+
+
+def require_some(valid: np.ndarray, what: str) -> None:
+    """Raise BeamMissedError when some system of ``valid`` (B, N) has no valid ray at all."""
+    alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
+    if not alive.all():
+        raise BeamMissedError(
+            f"no ray gets through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the "
+            "beam off a mirror or an aperture"
+        )
+
+
+def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
+    """Bring rays to full width and make the function that looks a system's number up for each ray."""
+    import drjit as dr
+
+    if count == 1:
+        return rays, lambda array: array
+    width = dr.width(rays.position)
+    if rays.systems not in (1, count):
+        raise ValueError(f"rays for {rays.systems} systems cannot go through {count}")
+    if rays.systems == 1:
+        shared = width
+        index = dr.arange(backend.UInt, count * shared)
+        ray = index % dr.opaque(backend.UInt, shared)
+        rays = Rays(
+            dr.gather(backend.Vector3, rays.position, ray),
+            rays.direction if dr.width(rays.direction) == 1 else dr.gather(backend.Vector3, rays.direction, ray),
+            dr.gather(backend.Float, rays.path, ray),
+            dr.gather(backend.Bool, rays.valid, ray),
+        )
+    else:
+        shared = width // count
+        index = dr.arange(backend.UInt, width)
+    system = index // dr.opaque(backend.UInt, shared)
+    return rays, lambda array: dr.gather(backend.Float, array, system)
+
+
+def _into_frame(backend: Backend, p: Any, d: Any, g: Mapping[str, Any]) -> tuple[Any, Any]:
+    import drjit as dr
+
+    position = backend.Vector3(
+        *(dr.fma(g[f"R{a}0"], p.x, dr.fma(g[f"R{a}1"], p.y, dr.fma(g[f"R{a}2"], p.z, g[f"T{a}"]))) for a in range(3))
+    )
+    direction = backend.Vector3(
+        *(dr.fma(g[f"R{a}0"], d.x, dr.fma(g[f"R{a}1"], d.y, g[f"R{a}2"] * d.z)) for a in range(3))
+    )
+    return position, direction
+
+
+def _distance(
+    backend: Backend, p: Any, d: Any, g: Mapping[str, Any], structure: Structure, grid: Any, differentiable: bool
+) -> tuple[Any, Any]:
+    """Path from p along d to the surface (may be negative) and whether it exists."""
+    import drjit as dr
+
+    bent = structure.even or structure.figure_order >= 0 or structure.grid
+    if structure.plane:
+        ok = dr.abs(d.z) > 1e-12
+        t = -p.z / dr.select(ok, d.z, 1.0)
+        if not bent:
+            return t, ok
+    else:
+        c, q = g["c"], 1.0 + g["k"]
+        a = c * dr.fma(d.x, d.x, dr.fma(d.y, d.y, q * d.z * d.z))
+        b = c * dr.fma(p.x, d.x, dr.fma(p.y, d.y, q * p.z * d.z)) - d.z
+        e = c * dr.fma(p.x, p.x, dr.fma(p.y, p.y, q * p.z * p.z)) - 2.0 * p.z
+        discriminant = b * b - a * e
+        ok = discriminant >= 0.0
+        root = dr.sqrt(dr.select(ok, discriminant, 1.0))
+        # of the two crossings the one on the vertex sheet: the denominator keeps d.z's sign and never cancels there
+        t = e / (dr.copysign(root, d.z) - b)
+        if not bent:
+            return t, ok & (q * c * dr.fma(t, d.z, p.z) < 1.0)
+    numbers = g
+    origin, direction = p, d
+    if differentiable:
+        # solve without derivatives; one attached step from the solution carries the exact derivative (implicit
+        # functions)
+        numbers = {name: dr.detach(value) for name, value in g.items()}
+        origin, direction, t = dr.detach(p), dr.detach(d), dr.detach(t)
+    for _ in range(NEWTON_STEPS):
+        t = _newton_step(origin, direction, t, numbers, structure, grid)
+    if differentiable:
+        t = _newton_step(p, d, t, g, structure, grid)
+    level, _, _, nz = _level(*_along(origin, direction, t), numbers, structure, grid)
+    # level / nz is the height above the surface to first order
+    return t, ok & (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
+
+
+def _solve(curve: GradedRay, tau: Any, g: Mapping[str, Any], structure: Structure, grid: Any, attached: bool) -> Any:
+    """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
+    import drjit as dr
+
+    def step(ray: GradedRay, tau: Any, numbers: Mapping[str, Any]) -> Any:
+        p, slope = ray.position(tau), ray.slope(tau)
+        level, nx, ny, nz = _level(p.x, p.y, p.z, numbers, structure, grid)
+        return tau - level / dr.fma(nx, slope.x, dr.fma(ny, slope.y, nz * slope.z))
+
+    numbers, ray = g, curve
+    if attached:
+        numbers = {name: dr.detach(value) for name, value in g.items()}
+        ray, tau = curve.detached(), dr.detach(tau)
+    for _ in range(NEWTON_STEPS):
+        tau = step(ray, tau, numbers)
+    return step(curve, tau, g) if attached else tau
+
+
+def _reached(p: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> Any:
+    """Whether p lies on the surface's sheet through the vertex."""
+    import drjit as dr
+
+    level, _, _, nz = _level(p.x, p.y, p.z, g, structure, grid)
+    return (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
+
+
+def _along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
+    import drjit as dr
+
+    return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
+
+
+def _newton_step(p: Any, d: Any, t: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> Any:
+    import drjit as dr
+
+    level, nx, ny, nz = _level(*_along(p, d, t), g, structure, grid)
+    return t - level / dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
+
+
+def _level(x: Any, y: Any, z: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any, Any]:
+    """Level function of the surface and its gradient.
+
+    With h the aspheric terms and the figure and w = z - h(x, y), the surface is where
+
+        G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
+
+    the conic's own equation in w: no square root and no division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
+    positive on the sheet of the vertex.
+    """
+    import drjit as dr
+
+    height: Any = None
+    sx: Any = None
+    sy: Any = None
+    r2 = dr.fma(x, x, y * y)
+    if structure.even:
+        # h and dh/d(r^2) of sum A_n r^(2n+4) by Horner, from the highest term down
+        last = structure.even - 1
+        polynomial: Any = g[f"A{last}"]
+        slope: Any = float(last + 2) * g[f"A{last}"]
+        for n in range(last - 1, -1, -1):
+            polynomial = dr.fma(polynomial, r2, g[f"A{n}"])
+            slope = dr.fma(slope, r2, float(n + 2) * g[f"A{n}"])
+        radial = 2.0 * slope * r2
+        height, sx, sy = polynomial * r2 * r2, radial * x, radial * y
+    if structure.figure_order >= 0:
+        coefficients = [g[f"F{m}"] for m in range(triangle_size(structure.figure_order))]
+        added = polynomial_figure(x - g["fx"], y - g["fy"], coefficients, structure.figure_order)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
+    if structure.grid:
+        added = grid_figure(x, y, g, grid)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
+    w = z if height is None else z - height
+    if structure.plane:
+        return w, (0.0 * x if sx is None else -sx), (0.0 * x if sy is None else -sy), 1.0 + 0.0 * x
+    c = g["c"]
+    qw = (1.0 + g["k"]) * w
+    level = dr.fma(-0.5 * c, dr.fma(qw, w, r2), w)
+    nz = dr.fma(-c, qw, 1.0)
+    nx, ny = -c * x, -c * y
+    if sx is not None:
+        nx, ny = dr.fma(-nz, sx, nx), dr.fma(-nz, sy, ny)
+    return level, nx, ny, nz
+
+
+def _inside(p: Any, g: Mapping[str, Any], structure: Structure) -> Any:
+    import drjit as dr
+
+    if structure.aperture in ("circle", "ring"):
+        x, y = p.x - g["ax"], p.y - g["ay"]
+        r2 = x * x + y * y
+        inside = r2 <= g["ar2"]
+        return inside & (r2 >= g["ai2"]) if structure.aperture == "ring" else inside
+    if structure.aperture == "ellipse":
+        u, v = (p.x - g["ax"]) / g["ahx"], (p.y - g["ay"]) / g["ahy"]
+        return u * u + v * v <= 1.0
+    if structure.aperture == "rectangle":
+        return (dr.abs(p.x - g["ax"]) <= g["ahx"]) & (dr.abs(p.y - g["ay"]) <= g["ahy"])
+    return True
+
+
+def _redirect(
+    backend: Backend, p: Any, d: Any, g: Mapping[str, Any], structure: Structure, grid: Any
+) -> tuple[Any, Any]:
+    """Direction after reflection or refraction (Snell), and whether it exists."""
+    import drjit as dr
+
+    _, nx, ny, nz = _level(p.x, p.y, p.z, g, structure, grid)
+    square = dr.fma(nx, nx, dr.fma(ny, ny, nz * nz))
+    along = dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
+    before, after = (
+        _index_at(p, g, name, graded) for name, graded in zip(("n", "n_after"), structure.graded, strict=True)
+    )
+    if structure.interaction in (Interaction.REFLECT, Interaction.TOTAL):
+        beyond: Any = True
+        if structure.interaction is Interaction.TOTAL:
+            beyond = before * before * (1.0 - along * along / square) > 1.0
+        f = -2.0 * along / square
+        return backend.Vector3(dr.fma(f, nx, d.x), dr.fma(f, ny, d.y), dr.fma(f, nz, d.z)), beyond
+    norm = dr.rsqrt(square)
+    cosine = along * norm
+    ratio = before / after
+    sine2 = ratio * ratio * (1.0 - cosine * cosine)
+    ok = sine2 <= 1.0
+    cosine_after = dr.copysign(dr.sqrt(dr.select(ok, 1.0 - sine2, 0.0)), cosine)
+    f = (cosine_after - ratio * cosine) * norm
+    return backend.Vector3(dr.fma(f, nx, ratio * d.x), dr.fma(f, ny, ratio * d.y), dr.fma(f, nz, ratio * d.z)), ok
+
+
+def _index_at(p: Any, g: Mapping[str, Any], name: str, graded: bool) -> Any:
+    """Refractive index at a point of the surface, before (``n``) or after it (``n_after``)."""
+    import drjit as dr
+
+    if not graded:
+        return g[name]
+    return dr.fma(g[f"{name}x"], p.x, dr.fma(g[f"{name}y"], p.y, dr.fma(g[f"{name}z"], p.z, g[name])))

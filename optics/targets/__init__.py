@@ -1,0 +1,1 @@
+"""Test targets, their images, the collimator they are shown in."""

@@ -1,0 +1,124 @@
+"""Test targets of optical benches as vector shapes: knife edge, bar group, star, pinhole.
+
+A target lies in its own plane, metres, about the origin. ``Target.mapped`` takes it into an image plane, where columns
+count along x and rows along y. Levels are transmittances, 0 to 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from optics.geometry.vector_shape import BEND_TOLERANCE, Disk, HalfPlane, PointMap, Polygon, Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A plane of even transmittance with shapes on it.
+
+    Attributes:
+        background: transmittance where no shape is, 0 to 1.
+        parts: (what the shape adds to the background, shape); shapes must not overlap (not checked).
+
+    Raises:
+        ValueError: a transmittance outside 0 to 1.
+    """
+
+    background: float
+    parts: tuple[tuple[float, Shape], ...]
+
+    def __post_init__(self) -> None:
+        """Check the levels."""
+        object.__setattr__(self, "parts", tuple((float(level), shape) for level, shape in self.parts))
+        for level in (self.background, *(self.background + level for level, _ in self.parts)):
+            if not 0.0 <= level <= 1.0:
+                raise ValueError(f"transmittances of a target lie between 0 and 1, found {level}")
+
+    def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Target:
+        """The target seen through a smooth map of points (N, 2) -> (N, 2), metres, such as a camera's chief rays.
+
+        Args:
+            point_map: the map.
+            tolerance: largest distance of a new outline from the mapped one, metres; half planes keep straight edges,
+                the tangents at their points.
+
+        Raises:
+            ValueError: the map is not finite at a shape, or too rough for the tolerance.
+        """
+        shapes = (
+            shape.mapped(point_map) if isinstance(shape, HalfPlane) else shape.mapped(point_map, tolerance)
+            for _, shape in self.parts
+        )
+        return Target(self.background, tuple((part[0], shape) for part, shape in zip(self.parts, shapes, strict=True)))
+
+
+def slanted_edge(angle: float, direction: Literal["x", "y"] = "y") -> Target:
+    """A knife edge through the origin, bright on one side, for the slanted-edge method (ISO 12233).
+
+    Args:
+        angle: by which the edge is turned from its axis, from +x toward +y, radians, below 45 degrees either way.
+        direction: the axis that the edge follows at angle 0: "y" for a profile along x (bright toward +x), "x" for a
+            profile along y (bright toward +y).
+    """
+    if not abs(angle) < 0.25 * np.pi:
+        raise ValueError(f"a slanted edge needs an angle below 45 degrees, found {np.degrees(angle):g}")
+    turn = angle if _is_y(direction) else angle + 0.5 * np.pi
+    return Target(0.0, ((1.0, HalfPlane(np.zeros(2), np.array([np.cos(turn), np.sin(turn)]))),))
+
+
+def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) -> Target:
+    """Bright bars on dark, each half a period wide, about the origin.
+
+    Args:
+        frequency: along the bars' normal, cycles/m.
+        bars: number of bright bars.
+        length: of a bar, metres.
+        angle: of the bars' normal from +x toward +y, radians.
+    """
+    if not (np.isfinite(frequency) and frequency > 0.0):
+        raise ValueError(f"bars need a positive frequency in cycles/m, found {frequency}")
+    if bars < 1 or bars != int(bars):
+        raise ValueError(f"a bar group needs a whole number of bars, 1 or more, found {bars}")
+    if not (np.isfinite(length) and length > 0.0):
+        raise ValueError(f"bars need a positive length, found {length}")
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    along = np.array([-normal[1], normal[0]])
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    upright = corners[:, :1] * 0.25 / frequency * normal + corners[:, 1:] * 0.5 * length * along
+    middles = (np.arange(int(bars)) - 0.5 * (bars - 1)) / frequency
+    return Target(0.0, tuple((1.0, Polygon(middle * normal + upright)) for middle in middles))
+
+
+def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
+    """Bright spokes on dark about the origin, each as wide in angle as the gaps; the first one lies along +x.
+
+    At the distance r from the middle the star has the frequency spokes / (2 pi r). The ends of the spokes are chords.
+
+    Args:
+        spokes: number of bright spokes, 2 or more.
+        radius: of the corners, metres.
+        inner: radius at which the spokes begin, metres; 0: they meet in the middle.
+    """
+    if spokes < 2:
+        raise ValueError(f"a Siemens star needs two spokes or more, found {spokes}")
+    if not 0.0 <= inner < radius:
+        raise ValueError(f"a Siemens star needs 0 <= inner < radius, found {inner} and {radius}")
+    angle = 2.0 * np.pi / spokes * (np.arange(spokes)[:, None] + np.array([-0.25, 0.25]))
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    ends = np.zeros((spokes, 1, 2)) if inner == 0.0 else inner * rim[:, ::-1]
+    return Target(0.0, tuple((1.0, Polygon(corners)) for corners in np.concatenate([radius * rim, ends], axis=1)))
+
+
+def pinhole(diameter: float) -> Target:
+    """A bright disk on dark at the origin; diameter in metres."""
+    if not (np.isfinite(diameter) and diameter > 0.0):
+        raise ValueError(f"a pinhole needs a positive diameter, found {diameter}")
+    return Target(0.0, ((1.0, Disk(np.zeros(2), 0.5 * diameter)),))
+
+
+def _is_y(direction: str) -> bool:
+    if direction not in ("x", "y"):
+        raise ValueError(f'the direction is "x" or "y", found {direction!r}')
+    return direction == "y"

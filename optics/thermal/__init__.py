@@ -1,0 +1,1 @@
+"""Heat: temperature fields, thermo-elastic deformation of bodies."""

@@ -1,0 +1,328 @@
+"""Finite-element meshes of mirror substrates and of glass prisms."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from skfem import MeshHex1, MeshHex2, MeshTet1
+
+from optics.geometry.aperture import Aperture, Circle
+from optics.geometry.surface import Surface
+
+CLOSE = 1e-3
+"""Corners nearer to each other than this part of the spacing are one for a mesh: what so small a facet changes is far
+below what the elements can tell."""
+
+_FLAT = 1e-9  # relative size below which a body counts as flat
+_PLANE = 1e-11  # and that of the steps between two triangles below which they are one face
+_INNER_SQUARE = 0.55  # half-diagonal of the inner block of a disk's mesh, in radii; gives about equal cells
+
+
+def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: float, cells: int) -> MeshHex2:
+    """Hexahedra with 27 nodes between an optical face and a plane back; every node of the face lies on the surface.
+
+    A rectangle is a grid; a disk is a square block with four blocks around it, so that no cell has a straight angle;
+    a disk with a hole is a ring of blocks.
+
+    Args:
+        surface: the optical face, in its own frame (metres), with its figure.
+        aperture: the outline of the substrate (its edge is a cylinder or box along z).
+        thickness: least distance along z from the face to the back, metres.
+        behind: side of the face where the substrate lies: +1 toward +z, -1 toward -z.
+        cells: number of cells across the longer width; the layers through the thickness follow from it (at least 2).
+
+    Raises:
+        ValueError: an impossible size, or the aperture reaches beyond the surface's domain.
+    """
+    if behind not in (1.0, -1.0):
+        raise ValueError(f"a substrate lies on side +1 or -1 of its face, found behind = {behind}")
+    if not 0.0 < thickness < np.inf or cells < 2:
+        raise ValueError(f"a substrate needs a positive thickness and 2 cells or more, found {thickness} m and {cells}")
+    x0, x1, y0, y1 = aperture.bounds
+    layers = max(2, round(cells * thickness / max(x1 - x0, y1 - y0)))
+    plane, quads = _disk_blocks(cells, aperture.inner > 0.0) if isinstance(aperture, Circle) else _grid(aperture, cells)
+    mesh = MeshHex2.from_mesh(_extruded(plane, quads, layers))
+    u, v, depth = mesh.doflocs
+    if isinstance(aperture, Circle):
+        x, y = _on_disk(u, v, aperture.inner / aperture.radius)
+        x, y = aperture.centre[0] + aperture.radius * x, aperture.centre[1] + aperture.radius * y
+    else:
+        x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
+    sag = surface.sag(x, y)
+    if not np.all(np.isfinite(sag)):
+        raise ValueError("the aperture reaches beyond the domain of its surface")
+    back = behind * (np.max(behind * sag) + thickness)
+    # as a displacement from the sag, so that the nodes of the face carry it to the last bit
+    z = sag + depth * (back - sag)
+    return _right_handed(MeshHex2(np.stack([x, y, z]), mesh.t))
+
+
+def _grid(aperture: Aperture, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 2) and quadrilaterals (Q, 4) of a grid over [-1, 1]^2 with cells about square on the aperture."""
+    x0, x1, y0, y1 = aperture.bounds
+    wide = max(x1 - x0, y1 - y0)
+    nx, ny = (max(2, round(cells * w / wide)) for w in (x1 - x0, y1 - y0))
+    return _tensor(np.linspace(-1.0, 1.0, nx + 1), np.linspace(-1.0, 1.0, ny + 1))
+
+
+def _tensor(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and quadrilaterals of a tensor grid; vertex (i, j) has number i * len(b) + j."""
+    number = np.arange(len(a) * len(b)).reshape(len(a), len(b))
+    corners = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
+    return np.stack([np.repeat(a, len(b)), np.tile(b, len(a))], axis=-1), np.stack([c.ravel() for c in corners], axis=1)
+
+
+def _disk_blocks(cells: int, hole: bool) -> tuple[np.ndarray, np.ndarray]:
+    """A disk's blocks drawn as squares: the inner block is |u|, |v| <= 1/2, the rings around it are squares up to 1."""
+    side = max(2, cells // 2)
+    rings = max(2, cells // 4)
+    s = np.linspace(-1.0, 1.0, side + 1)[:-1]
+    one = np.ones_like(s)
+    outline = np.concatenate([np.stack(p, axis=-1) for p in ((s, -one), (one, s), (-s, one), (-one, -s))])
+    size = np.linspace(0.5, 1.0, rings + 1)
+    points = (size[:, None, None] * outline).reshape(-1, 2)
+    number = np.arange(len(points)).reshape(rings + 1, len(outline))
+    after = np.roll(number, -1, axis=1)
+    quads = np.stack([c.ravel() for c in (number[:-1], number[1:], after[1:], after[:-1])], axis=1)
+    if hole:
+        return points, quads
+    inner, block = _tensor(np.linspace(-0.5, 0.5, side + 1), np.linspace(-0.5, 0.5, side + 1))
+    # one number for the vertices that the inner block shares with the first ring
+    at = {tuple(p): i for i, p in enumerate(np.rint(inner * 2 * side).astype(int).tolist())}
+    renumbered = np.arange(len(points)) + len(inner)
+    for i, p in enumerate(np.rint(points[: len(outline)] * 2 * side).astype(int).tolist()):
+        renumbered[i] = at[tuple(p)]
+    renumbered[len(outline) :] -= len(outline)
+    return np.concatenate([inner, points[len(outline) :]]), np.concatenate([block, renumbered[quads]])
+
+
+def _on_disk(u: np.ndarray, v: np.ndarray, inner: float) -> tuple[np.ndarray, np.ndarray]:
+    """From the squares of ``_disk_blocks`` to the unit disk with a hole of radius ``inner``."""
+    size = np.maximum(np.abs(u), np.abs(v))
+    safe = np.where(size > 0.0, size, 1.0)
+    along = np.where(np.abs(u) >= np.abs(v), v * np.sign(u), u * np.sign(v)) / safe  # place on a side, -1..1
+    t = 0.25 * np.pi * along
+    cosine, sine = np.cos(t), np.sin(t)
+    flat = np.abs(u) >= np.abs(v)
+    on_circle = (
+        np.where(flat, np.sign(u) * cosine, np.sign(v) * sine),
+        np.where(flat, np.sign(u) * sine, np.sign(v) * cosine),
+    )
+    outer = np.clip(2.0 * size - 1.0, 0.0, 1.0)  # 0 on and in the inner block, 1 on the rim
+    if inner > 0.0:
+        radius = inner + (1.0 - inner) * outer
+        return on_circle[0] * radius, on_circle[1] * radius
+    half = _INNER_SQUARE / np.sqrt(2.0)
+    block = (1.0 - outer) * half / np.maximum(safe, 0.5)
+    return block * u + outer * on_circle[0], block * v + outer * on_circle[1]
+
+
+def _extruded(plane: np.ndarray, quads: np.ndarray, layers: int) -> MeshHex1:
+    """Hexahedra over quadrilaterals, in ``layers`` from depth 0 to 1."""
+    count = len(plane)
+    depth = np.linspace(0.0, 1.0, layers + 1)
+    points = np.concatenate([np.column_stack([plane, np.full(count, d)]) for d in depth])
+    near = np.concatenate([quads + k * count for k in range(layers)])
+    a, b, c, d = near.T
+    # scikit-fem's order of a hexahedron: the corners 000, 001, 010, 100, 011, 101, 110, 111 of the unit cube, here
+    # with x along a-b, y along a-d and z along the depth
+    corners = [a, a + count, d, b, d + count, b + count, c, c + count]
+    return MeshHex1(np.ascontiguousarray(points.T), np.array(corners, np.int32))
+
+
+def _right_handed(mesh: MeshHex2) -> MeshHex2:
+    """Return the mesh after a check that no cell is turned inside out (all have one sign of volume)."""
+    volume = mesh.mapping().detDF(np.array([[0.1, 0.9, 0.5], [0.1, 0.9, 0.5], [0.1, 0.9, 0.5]]))
+    if not (np.all(volume > 0.0) or np.all(volume < 0.0)):
+        raise ValueError("the face is too steep for its mesh: a cell is turned inside out")
+    return mesh
+
+
+def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
+    """Tetrahedra that fill a convex polyhedron exactly.
+
+    The body is cut into tetrahedra from its middle over the middles of its faces. Then every edge longer than
+    ``spacing`` is halved, the longest of each tetrahedron first (Rivara, Int. J. Numer. Meth. Eng. 20, 745 (1984)).
+    Halving keeps volumes positive and faces plane, needs no repair and drives long thin pieces to compact ones.
+
+    Args:
+        vertices: corners of the polyhedron in any order, metres, shape (V, 3).
+        spacing: length of the longest edge of the mesh, metres.
+
+    Raises:
+        ValueError: the points do not span a body, or one of them lies inside the hull of the others, so that the body
+            meant cannot be convex.
+    """
+    points = np.asarray(vertices, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.all(np.isfinite(points)):
+        raise ValueError(f"a polyhedron needs four or more finite vertices (V, 3), found shape {points.shape}")
+    if not 0.0 < spacing < np.inf:
+        raise ValueError(f"a mesh needs a positive spacing, found {spacing}")
+    size = float(np.max(np.ptp(points, axis=0)))
+    middle = np.mean(points, axis=0)
+    if np.linalg.svd(points - middle, compute_uv=False)[-1] <= _FLAT * size:
+        raise ValueError("the polyhedron is degenerate: its vertices lie in a plane")
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:
+        raise ValueError(f"the polyhedron is degenerate: {str(error).splitlines()[0]}") from error
+    depth = np.max(points @ hull.equations[:, :3].T + hull.equations[:, 3], axis=1)
+    if np.min(depth) < -_FLAT * size:
+        raise ValueError(f"the polyhedron is not convex: vertex {int(np.argmin(depth))} lies inside the others' hull")
+    hull = ConvexHull(_apart(points[hull.vertices], CLOSE * spacing))
+    fans = [_fan(corners, faces) for corners, faces in _slabs(*_faces(hull, _PLANE * size), spacing)]
+    first = np.cumsum([0, *(len(n) for n, _ in fans)])
+    nodes, number = np.unique(np.concatenate([n for n, _ in fans]), axis=0, return_inverse=True)
+    tetrahedra = number.ravel()[np.concatenate([t + k for (_, t), k in zip(fans, first[:-1], strict=True)])]
+    nodes, tetrahedra = _bisected(nodes, tetrahedra, spacing)
+    volumes = _volumes(nodes, tetrahedra)
+    skin = _skin_area(nodes, tetrahedra)
+    if np.min(volumes) <= 0.0 or abs(np.sum(volumes) / hull.volume - 1.0) + abs(skin / hull.area - 1.0) > 1e-9:
+        raise ValueError(
+            f"the polyhedron's mesh is not watertight: {np.sum(volumes)} m^3 in {skin} m^2 of skin instead of "
+            f"{hull.volume} m^3 in {hull.area} m^2"
+        )
+    return MeshTet1(np.ascontiguousarray(nodes.T), np.ascontiguousarray(tetrahedra.T, np.int32))
+
+
+def _volumes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Signed volumes, shape (T,)."""
+    a, b, c, d = (nodes[tetrahedra[:, k]] for k in range(4))
+    return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
+
+
+def _skin_area(nodes: np.ndarray, tetrahedra: np.ndarray) -> float:
+    """Area of the triangles that belong to one tetrahedron only: that of the body, unless neighbours do not fit."""
+    triangles = np.sort(tetrahedra[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
+    unique, times = np.unique(triangles, axis=0, return_counts=True)
+    a, b, c = (nodes[unique[times == 1, k]] for k in range(3))
+    return float(np.sum(np.linalg.norm(np.cross(b - a, c - a), axis=1)) / 2.0)
+
+
+_Edges = list[tuple[int, int]]
+"""Of one face, numbers of corners, each with the face on its left when seen from outside."""
+
+
+def _apart(points: np.ndarray, least: float) -> np.ndarray:
+    """Those of some points (P, 3) that are farther than ``least`` from all that were kept before, (K, 3)."""
+    kept: list[np.ndarray] = []
+    for point in points:
+        if all(np.linalg.norm(point - other) > least for other in kept):
+            kept.append(point)
+    return np.array(kept)
+
+
+def _faces(hull: ConvexHull, tolerance: float) -> tuple[np.ndarray, list[_Edges]]:
+    """Corners (V, 3) and faces of a hull; neighbouring triangles in one plane are one face.
+
+    A face is known by its edges and not by what lies in its plane: whatever the tolerance, neighbours fit.
+    """
+    points, triangles = hull.points, hull.simplices.copy()
+    corners = points[triangles]
+    inward = np.einsum("ti,ti->t", np.cross(*np.moveaxis(np.diff(corners, axis=1), 1, 0)), hull.equations[:, :3]) < 0.0
+    triangles[inward] = triangles[inward, ::-1]
+    face = np.arange(len(triangles))
+    for i, neighbours in enumerate(hull.neighbors):
+        for j in neighbours:
+            heights = points[triangles[j]] @ hull.equations[i, :3] + hull.equations[i, 3]
+            if np.max(np.abs(heights)) <= tolerance:
+                face[face == face[j]] = face[i]
+    out = []
+    for number in np.unique(face):
+        edges = {(int(t[k]), int(t[k - 2])) for t in triangles[face == number] for k in range(3)}
+        out.append([(u, v) for u, v in sorted(edges) if (v, u) not in edges])
+    return points, out
+
+
+def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tuple[np.ndarray, list[_Edges]]]:
+    """Cut a body across its length into pieces about as long as it is wide: corners and faces of each.
+
+    Cuts stay away from the corners, so that no piece is a splinter. Neighbours have the very same corners in common.
+    """
+    middle = np.mean(corners, axis=0)
+    axes = np.linalg.svd(corners - middle)[2]
+    target = max(spacing, float(np.ptp((corners - middle) @ axes[1])))
+    nodes, along = list(corners), ((corners - middle) @ axes[0]).tolist()
+    cuts: list[float] = []
+    for low, high in pairwise(sorted(along)):
+        count = round((high - low) / target)
+        cuts += [low + (high - low) * (k + 0.5) / count for k in range(count)]
+    pieces = []
+    for cut in cuts:
+        new: dict[tuple[int, int], int] = {}
+        parts: tuple[list[_Edges], list[_Edges]] = ([], [])  # below, above
+        section: _Edges = []
+        for edges in faces:
+            own: tuple[_Edges, _Edges] = ([], [])
+            ends = {}
+            for u, v in edges:
+                side = along[u] > cut
+                if side == (along[v] > cut):
+                    own[side].append((u, v))
+                    continue
+                key = (min(u, v), max(u, v))
+                if key not in new:
+                    a, b = key
+                    share = (cut - along[a]) / (along[b] - along[a])
+                    new[key] = len(nodes)
+                    nodes.append(nodes[a] + share * (nodes[b] - nodes[a]))
+                    along.append(cut)
+                own[side].append((u, new[key]))
+                own[not side].append((new[key], v))
+                ends[side] = new[key]
+            if ends:  # where the face's outline goes up, and where it comes down again
+                own[False].append((ends[False], ends[True]))
+                own[True].append((ends[True], ends[False]))
+                section.append((ends[True], ends[False]))
+            for part, piece in zip(parts, own, strict=True):
+                if piece:
+                    part.append(piece)
+        pieces.append([*parts[0], section])
+        faces = [*parts[1], [(v, u) for u, v in section]]
+    return [(np.array(nodes), piece) for piece in [*pieces, faces]]
+
+
+def _fan(corners: np.ndarray, faces: list[_Edges]) -> tuple[np.ndarray, np.ndarray]:
+    """Tetrahedra from a convex body's middle over the triangles from each face's middle to its edges."""
+    used = sorted({corner for edges in faces for edge in edges for corner in edge})
+    number = {corner: k for k, corner in enumerate(used)}
+    nodes = [*corners[used], np.mean(corners[used], axis=0)]
+    tetrahedra = []
+    for edges in faces:
+        # in an order that does not depend on the piece: the neighbour's face gets the same middle to the last bit
+        nodes.append(np.mean(corners[sorted({corner for edge in edges for corner in edge})], axis=0))
+        tetrahedra += [(len(used), number[u], number[v], len(nodes) - 1) for u, v in edges]
+    chosen = np.array(tetrahedra)
+    # all are turned alike
+    return np.array(nodes), chosen if np.sum(_volumes(np.array(nodes), chosen)) > 0.0 else chosen[:, [0, 2, 1, 3]]
+
+
+def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Halve edges until none is longer than ``spacing``.
+
+    Each round halves the edges that are the longest in *every* tetrahedron around them. No tetrahedron has two of
+    them, so all its pieces fit their neighbours; and the longest edge of the mesh is always among them, so it ends.
+    """
+    pairs = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+    while True:
+        ends = np.sort(tetrahedra[:, pairs], axis=-1)  # (T, 6, 2)
+        edges, which = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+        which = which.reshape(-1, 6)
+        length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
+        # equal lengths must not compare by rounding errors: 9 digits, then by number
+        rank = np.empty(len(edges), int)
+        rank[np.lexsort((np.arange(len(edges)), np.round(length / spacing, 9)))] = np.arange(len(edges))
+        longest = which[np.arange(len(which)), np.argmax(rank[which], axis=1)]
+        around = np.bincount(which.ravel(), minlength=len(edges))
+        cut = (np.bincount(longest, minlength=len(edges)) == around) & (length > spacing * (1.0 + 1e-9))
+        if not np.any(cut):
+            return nodes, tetrahedra
+        new = np.cumsum(cut) - 1 + len(nodes)
+        nodes = np.concatenate([nodes, 0.5 * (nodes[edges[cut, 0]] + nodes[edges[cut, 1]])])
+        split = cut[longest]
+        old, edge = tetrahedra[split], longest[split]
+        halves = [np.where(old == edges[edge, k][:, None], new[edge][:, None], old) for k in (0, 1)]
+        tetrahedra = np.concatenate([tetrahedra[~split], *halves])

@@ -1,0 +1,1 @@
+"""From rays to images: wavefronts, pupils with their shadows, diffraction, transfer functions."""

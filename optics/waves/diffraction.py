@@ -1,0 +1,225 @@
+"""Diffraction images: the matrix Fourier transform of a traced pupil onto a detector's own grid, and Huygens' sum.
+
+Convention: time factor exp(-i w t), a wave of phase exp(+i k L) with L its optical path.
+
+Near the image point P0 every traced ray is a local plane wave of direction cosines (u, v) along the detector's x and y
+and of eikonal L (the optical path to the wave's plane through P0). The field on the detector is the sum of these waves,
+
+    U(x, y) = 1/lambda * sum_j w_j a_j exp(i k (L_j + u_j x + v_j y)),
+
+with w_j the pupil element. Because exp(ik(ux + vy)) factors, U on a grid of R x C pixels is the product of an (R x N)
+and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express
+15, 15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image
+integrates to P.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import j1
+
+from optics.numerics.threads import cores, one_blas_thread
+
+
+@dataclass(frozen=True, eq=False)
+class PupilField:
+    """Plane waves that make B images, N nodes each.
+
+    Attributes:
+        u, v: direction cosines along the detector's x and y, (B, N).
+        eikonal: optical path to the plane wave through the image's origin, metres, (B, N), common piston removed.
+        amplitude: a_j * w_j * du dv, such that the formula above holds with unit total power, (B, N); 0 = blocked.
+        wavelength: metres.
+    """
+
+    u: np.ndarray
+    v: np.ndarray
+    eikonal: np.ndarray
+    amplitude: np.ndarray
+    wavelength: float
+
+    def __getitem__(self, piece: slice) -> PupilField:
+        """Some of the images."""
+        return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
+
+    def in_lengths_of(self, size: np.ndarray) -> PupilField:
+        """The same images in coordinates x / size, y / size: those of pixels that have grown by ``size``, (B,).
+
+        Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
+        """
+        size = np.asarray(size)[:, None]
+        return PupilField(self.u * size, self.v * size, self.eikonal, self.amplitude * size, self.wavelength)
+
+    def repeated(self, count: int) -> PupilField:
+        """Every image ``count`` times in a row."""
+        u, v, eikonal, amplitude = (np.repeat(a, count, axis=0) for a in (self.u, self.v, self.eikonal, self.amplitude))
+        return PupilField(u, v, eikonal, amplitude, self.wavelength)
+
+
+@dataclass(frozen=True, eq=False)
+class PupilTangent:
+    """Derivatives of the arrays of a ``PupilField`` by one parameter, (B, N) each."""
+
+    u: np.ndarray
+    v: np.ndarray
+    eikonal: np.ndarray
+    amplitude: np.ndarray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Evenly spaced samples along one detector axis: start, start + step, ... (metres from the image's origin)."""
+
+    start: float
+    step: float
+    count: int
+
+    def points(self) -> np.ndarray:
+        """All samples, (count,)."""
+        return self.start + self.step * np.arange(self.count)
+
+
+def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarray:
+    """Irradiance on the grid of columns x and rows y by the matrix Fourier transform.
+
+    Args:
+        field: B pupils.
+        x: detector x of the C columns.
+        y: detector y of the R rows.
+        single: keep the waves in single precision (their phases are always worked out in double): an error of some 1e-7
+            of the peak for half of the time.
+
+    Returns:
+        Shape (B, R, C), 1/m^2 for unit power through the pupil.
+    """
+    k = 2.0 * np.pi / field.wavelength
+    count = len(field.u)
+    out = np.empty((count, y.count, x.count))
+
+    def piece(start: int) -> None:
+        some = slice(start, start + _AT_ONCE)
+        _irradiance(field[some], k, x, y, np.complex64 if single else np.complex128, out[some])
+
+    with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(piece, range(0, count, _AT_ONCE)))
+    return out
+
+
+def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: np.ndarray) -> None:
+    """Fill ``out`` (B, R, C).
+
+    Rows at equal distances d on both sides of the grid's middle share their waves: sum_j f_j exp(+-i q_j d) is
+    P +- i Q with P the sum of f_j cos(q_j d) and Q that of f_j sin(q_j d). So real tables of half of the rows do, and
+    a real matrix product of half of the work.
+    """
+    count, nodes = field.u.shape
+    half = (y.count + 1) // 2
+    first = 0.0 if y.count % 2 else 0.5 * y.step
+    middle = y.start + 0.5 * (y.count - 1) * y.step
+    factor = field.amplitude * np.exp(1j * k * (field.eikonal + middle * field.v))
+    rows = _waves(k * field.v, Grid(first, y.step, half), 1.0, kind)
+    columns = _waves(k * field.u, x, factor, kind)
+    real = np.float32 if kind is np.complex64 else np.float64
+    # a complex number is two real ones: (B, N, 2 half), its cosines and sines by turns, and (B, N, 2 C)
+    left, right = np.swapaxes(rows.view(real), 1, 2), columns.view(real)
+    product = left[..., :_SUMMED] @ right[:, :_SUMMED]
+    for start in range(_SUMMED, nodes, _SUMMED):
+        product += left[..., start : start + _SUMMED] @ right[:, start : start + _SUMMED]
+    even, odd = np.moveaxis(product.view(kind).reshape(count, half, 2, x.count), 2, 0)
+    scale = 1.0 / field.wavelength**2
+    for sign, part in ((1.0, out[:, y.count - half :]), (-1.0, out[:, half - 1 :: -1])):
+        one, two = even.real - sign * odd.imag, even.imag + sign * odd.real
+        np.multiply(one * one + two * two, scale, out=part)
+
+
+def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid) -> np.ndarray:
+    """Derivative of ``image`` by the parameter of ``tangent``, exact, (B, R, C)."""
+    k = 2.0 * np.pi / field.wavelength
+    out = np.empty((len(field.u), y.count, x.count))
+    for i in range(len(field.u)):
+        rows = _waves(k * field.v[i], y, 1.0, np.complex128).T
+        phasor = np.exp(1j * k * field.eikonal[i])
+        amplitude = field.amplitude[i] * phasor
+        columns = _waves(k * field.u[i], x, 1.0, np.complex128)
+        here = rows @ (amplitude[:, None] * columns)
+        own = (tangent.amplitude[i] + 1j * k * field.amplitude[i] * tangent.eikonal[i]) * phasor
+        step = rows @ (own[:, None] * columns)
+        step += 1j * k * x.points() * (rows @ ((amplitude * tangent.u[i])[:, None] * columns))
+        step += 1j * k * y.points()[:, None] * (rows @ ((amplitude * tangent.v[i])[:, None] * columns))
+        out[i] = 2.0 * np.real(np.conj(here) * step)
+    return out / field.wavelength**2
+
+
+_AT_ONCE = 2
+"""Images whose wave tables are worked on together: they should stay in the processor's cache."""
+
+_SUMMED = 160
+"""Nodes summed in one go: sums of sums lose less by rounding than one long sum, which matters in single precision."""
+
+
+def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: type) -> np.ndarray:
+    """Factor * exp(i frequency * point) for frequencies (..., N) on a grid, (..., N, count).
+
+    Built by doubling: exp(i q (p + m step)) = exp(i q p) exp(i q m step), with m = 1, 2, 4, ... from one phasor that is
+    squared in double precision. Each sample is a product of at most log2(count) + 1 phasors.
+    """
+    out = np.empty((*frequency.shape, grid.count), kind)
+    out[..., 0] = factor * np.exp(1j * frequency * grid.start)
+    turn = np.exp(1j * frequency * grid.step)
+    done = 1
+    while done < grid.count:
+        more = min(done, grid.count - done)
+        np.multiply(out[..., :more], turn.astype(kind)[..., None], out=out[..., done : done + more])
+        turn = turn * turn
+        done += more
+    return out
+
+
+def huygens(
+    points: np.ndarray,
+    path: np.ndarray,
+    direction: np.ndarray,
+    amplitude: np.ndarray,
+    wavelength: float,
+    pixels: np.ndarray,
+    normal: np.ndarray | None = None,
+    chunk: int = 256,
+) -> np.ndarray:
+    """Irradiance by Huygens' sum of spherical wavelets from points on the exit wavefront; slow, the check of ``image``.
+
+    Args:
+        points: (N, 3) points on the exit reference sphere, metres.
+        path: (N,) optical path at these points.
+        direction: (N, 3) unit ray directions there.
+        amplitude: (N,) area element times field amplitude at the points (m^2 * field).
+        wavelength: metres.
+        pixels: (M, 3) points where the irradiance is wanted.
+        normal: (3,) unit normal of the detector: each wavelet counts with the root of the cosine of its incidence, so
+            that the result is power per detector area, as in ``image``; None: square to the light.
+        chunk: pixels done at once, to bound memory.
+
+    Returns:
+        (M,) irradiance, 1/m^2 for unit power (sum amplitude * field = 1).
+    """
+    k = 2.0 * np.pi / wavelength
+    out = np.empty(len(pixels))
+    for start in range(0, len(pixels), chunk):
+        arm = pixels[start : start + chunk, None, :] - points[None]
+        distance = np.linalg.norm(arm, axis=-1)
+        obliquity = np.einsum("mnx,nx->mn", arm, direction) / distance
+        if normal is not None:
+            obliquity = obliquity * np.sqrt(np.abs(arm @ normal) / distance)
+        phase = k * ((path - path[0]) + (distance - distance[:, :1]))
+        field = np.sum(amplitude * obliquity / distance * np.exp(1j * phase), axis=1) / wavelength
+        out[start : start + chunk] = np.abs(field) ** 2
+    return out
+
+
+def airy(radius: np.ndarray, wavelength: float, f_number: float) -> np.ndarray:
+    """Airy pattern of a clear circular pupil, 1 at the centre; ``radius`` in metres."""
+    z = np.pi * np.asarray(radius) / (wavelength * f_number)
+    safe = np.where(z == 0.0, 1.0, z)
+    return np.where(z == 0.0, 1.0, (2.0 * j1(safe) / safe) ** 2)

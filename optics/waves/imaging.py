@@ -1,0 +1,181 @@
+"""The pupil field of a camera that looks at a far point: what ``optics.waves.diffraction.image`` turns into its image.
+
+The beam is collimated and evenly lit. Rays are aimed at quadrature nodes of the stop, so that its edge is exact in
+every state. With p the launch point on the incoming plane wavefront, s the point of the stop and (u, v) the direction
+cosines at the detector, power conservation |a|^2 du dv = dp / A makes the amplitude of a node
+
+    a du dv = sqrt(|d(u, v)/dp| / A) * |dp/ds| * ds,    A = sum |dp/ds| ds,
+
+with both Jacobians by forward-mode AD through the trace. Paths count from the incoming wavefront.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.aperture import Circle
+from optics.numerics.backend import Backend
+from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.aim import RayFan, aim, transverse_axes
+from optics.raytrace.derivatives import push_forward
+from optics.raytrace.system import SystemBatch
+from optics.raytrace.trace import require_some
+from optics.waves.diffraction import PupilField
+from optics.waves.wavefront import eikonal
+
+AIM_TOLERANCE = 1e-12
+"""Distance of a ray from its node on the stop, metres."""
+
+
+def aim_collimated(
+    backend: Backend,
+    to_stop: SystemBatch,
+    direction: np.ndarray,
+    launch: np.ndarray,
+    target: np.ndarray,
+    first: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of collimated beams that meet given points of the stop.
+
+    Args:
+        backend: where to trace.
+        to_stop: B systems from the scene to the stop, their last element.
+        direction: of the light, world, unit, (3,) or (B, 3).
+        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane
+            wavefront through it.
+        target: stop coordinates, (N, 2), metres of its nominal size.
+        first: world vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the
+            coordinate axis least along it, which is not the same for all directions.
+
+    Returns:
+        Launch points (B, N, 3) and the two axes of the wavefront (B, 2, 3).
+
+    Raises:
+        AimError: the beam does not reach the stop.
+    """
+    count = to_stop.count
+    along = np.broadcast_to(direction, (count, 3))[:, None]
+    origin = np.broadcast_to(launch, (count, 3))[:, None]
+    # for aiming any transverse axis will do; the coordinate axis least along the beam is well conditioned
+    least = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
+    across = least if first is None else np.broadcast_to(first, along.shape)
+    axes = transverse_axes(along, across)
+    fan = RayFan(origin, along, axes, moves_position=True)
+    middle, slope = aim(backend, to_stop, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
+    near = middle + np.einsum("bnij,pj->bpi", np.linalg.inv(slope), target)
+    q, _ = aim(backend, to_stop, fan, target, near, slope, AIM_TOLERANCE)
+    return fan.at(q)[0], axes[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class ImagingRays:
+    """Rays of collimated beams at the detector of B systems, N nodes of the stop each.
+
+    Attributes:
+        position, direction: in the detector's frame, (B, N, 3), metres and unit.
+        path: optical path from the incoming wavefront, (B, N), metres.
+        amplitude: a du dv of the module's formula, (B, N); 0 where another aperture stops the ray.
+        launched: points of the incoming wavefront, world, (B, N, 3), metres.
+        launch_area: |dp/ds| ds, area of the wavefront that belongs to each node, (B, N), m^2.
+        axes: of the wavefront, world, (B, 2, 3).
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    amplitude: np.ndarray
+    launched: np.ndarray
+    launch_area: np.ndarray
+    axes: np.ndarray
+
+
+def imaging_rays(
+    backend: Backend,
+    systems: SystemBatch,
+    to_stop: SystemBatch,
+    direction: np.ndarray,
+    launch: np.ndarray,
+    stop: Circle,
+    nodes: PupilNodes,
+    first: np.ndarray | None = None,
+) -> ImagingRays:
+    """Trace the beams of ``imaging_field``; arguments and exceptions as there."""
+    target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
+    launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
+    count = len(launched)
+    heading = np.broadcast_to(np.broadcast_to(direction, (count, 3))[:, None], launched.shape)
+    stop_index = len(to_stop.structure) - 1
+    # every ray twice, once for each axis of the wavefront along which its launch point is moved
+    twice, heading = (np.repeat(array, 2, axis=1) for array in (launched, heading))
+    moves = np.broadcast_to(axes[:, None], (*launched.shape[:2], 2, 3)).reshape(twice.shape)
+    out = push_forward(backend, systems, twice, heading, moves, keep=(stop_index,))
+    hit, turn = (
+        np.swapaxes(step[..., :2].reshape(*launched.shape[:2], 2, 2), -1, -2)
+        for step in (out.hits[stop_index], out.direction)
+    )
+    place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
+    require_some(valid, "the imaging path")
+    launch_area = (to_stop.size[:, None] * stop.radius) ** 2 * nodes.weight / np.abs(np.linalg.det(hit))
+    amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
+    return ImagingRays(place, leaving, path, amplitude, launched, launch_area, axes)
+
+
+def imaging_field(
+    backend: Backend,
+    systems: SystemBatch,
+    to_stop: SystemBatch,
+    direction: np.ndarray,
+    launch: np.ndarray,
+    stop: Circle,
+    nodes: PupilNodes,
+    wavelength: float,
+    origin: np.ndarray | None = None,
+    incoming: Callable[[np.ndarray], np.ndarray] | None = None,
+    first: np.ndarray | None = None,
+) -> PupilField:
+    """Plane waves at the detector for B systems that image a far point.
+
+    Args:
+        backend: where to trace.
+        systems: B systems from the scene to the detector, whose x, y are the image's.
+        to_stop: the same systems, only as far as the stop.
+        direction: of the light, world, unit, (3,) or (B, 3).
+        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres.
+        stop: clear aperture of the stop.
+        nodes: quadrature over the unit disk.
+        wavelength: metres.
+        origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
+        incoming: optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse
+            coordinates (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
+        first: as for ``aim_collimated``.
+
+    Returns:
+        Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
+
+    Raises:
+        AimError: the beam does not reach the stop.
+        BeamMissedError: no ray reaches the detector.
+    """
+    return pupil_field(
+        imaging_rays(backend, systems, to_stop, direction, launch, stop, nodes, first), wavelength, origin, incoming
+    )
+
+
+def pupil_field(
+    rays: ImagingRays,
+    wavelength: float,
+    origin: np.ndarray | None = None,
+    incoming: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> PupilField:
+    """Plane waves of traced beams; arguments as ``imaging_field``."""
+    centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]
+    leaving = rays.direction
+    phase = eikonal(rays.position, leaving, rays.path, centre)
+    if incoming is not None:
+        area, launched = rays.launch_area, rays.launched
+        middle = np.einsum("bn,bnx->bx", area, launched) / np.sum(area, axis=-1, keepdims=True)
+        phase = phase + incoming(np.einsum("bnx,bkx->bnk", launched - middle[:, None], rays.axes))
+    return PupilField(leaving[..., 0], leaving[..., 1], phase - phase[:, :1], rays.amplitude, wavelength)

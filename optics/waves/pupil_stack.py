@@ -1,0 +1,326 @@
+"""Transfer functions at a few frequencies for many pupils at once: for studies with thousands of perturbed states.
+
+The same pupils and integrals as ``optics.waves.pupil_function`` and ``optics.waves.transfer``, worked out together: a
+study asks of every image for two frequencies and one focus, where the general code spends its time on calls and not on
+numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from optics.numerics.quadrature import PupilNodes, gauss
+from optics.waves.pupil_edge import PupilEdge
+from optics.waves.pupil_function import DEGREE
+from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, in_rows
+from optics.waves.transfer import nodes_for
+
+LEAST_ALONG = 6
+LEAST_ACROSS = 10
+LEAST_SHADOW = 2
+"""Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
+function is then right to 2e-6, and to 5e-5 with shadows."""
+
+_EDGE_SAMPLES = 32
+_AT_ONCE = 2**14
+"""Points of overlaps worked on together: some arrays of 1 MB that stay in the cache."""
+_SHADOWS_AT_ONCE = 2**16
+"""The same for shadows, where the way to the points is longer than what is done there."""
+
+
+@dataclass(frozen=True, eq=False)
+class PupilStack:
+    """B exit pupils; for each what ``optics.waves.pupil_function.PupilFunction`` says of one.
+
+    Attributes:
+        axes: d(u, v)/dp, (B, 2, 2).
+        harmonics: of the edges in p, complex (2H + 1, B).
+        eikonal_terms, amplitude_terms: coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and unit power.
+        span: how far the eikonal runs over each pupil, a plane taken out, (B,), metres.
+        residual: rms eikonal that the fit leaves, (B,), metres.
+        shadow: what bodies in the beams take, None if nothing stands there.
+    """
+
+    axes: np.ndarray
+    harmonics: np.ndarray
+    eikonal_terms: np.ndarray
+    amplitude_terms: np.ndarray
+    span: np.ndarray
+    residual: np.ndarray
+    shadow: PupilShadow | None = None
+
+    @classmethod
+    def fit(
+        cls,
+        u: np.ndarray,
+        v: np.ndarray,
+        eikonal: np.ndarray,
+        amplitude: np.ndarray,
+        nodes: PupilNodes,
+        degree: int = DEGREE,
+        shadows: np.ndarray | None = None,
+    ) -> PupilStack:
+        """Fit pupils traced at nodes of the stop, all of which carry light.
+
+        Args:
+            u: direction cosines along the detector's first axis, (B, N).
+            v: likewise along the second.
+            eikonal: (B, N), metres.
+            amplitude: of the nodes as in ``optics.waves.diffraction.PupilField``, (B, N), positive.
+            nodes: N nodes of a quadrature over the stop's unit disk.
+            degree: of the polynomials.
+            shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
+
+        Raises:
+            ValueError: too few nodes for the degree.
+        """
+        root = np.sqrt(nodes.weight)
+        i, j = _orders(degree)
+        solve = to_terms(nodes, degree)
+        terms = np.stack([u, v], axis=1) @ solve.T
+        centre, axes, harmonics = _edges(terms, degree)
+        (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in _slopes(nodes, degree))
+        density = amplitude / (nodes.weight * np.abs(ux * vy - uy * vx))
+        place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
+        design = products(place[:, 0], place[:, 1], degree) * root[:, None]
+        both = np.stack([eikonal, density], axis=-1) * root[:, None]
+        turned = np.swapaxes(design, 1, 2)
+        solution = np.linalg.solve(turned @ design, turned @ both)
+        rest = both[..., 0] - (design @ solution[..., :1])[..., 0]
+        level = i + j < 2
+        plane = (design[..., level] @ solution[:, level, :1])[..., 0]
+        bent = (both[..., 0] - plane) / root
+        table = np.zeros((2, len(u), degree + 1, degree + 1))
+        table[:, :, i, j] = np.moveaxis(solution, -1, 0)
+        residual = np.sqrt(np.sum(rest**2, axis=-1) / np.sum(nodes.weight))
+        shadow = None
+        if shadows is not None and shadows.shape[1]:
+            corner = products(shadows[..., 0], shadows[..., 1], degree).reshape(len(u), -1, len(i))
+            place = np.linalg.solve(axes, terms @ corner.swapaxes(1, 2) - centre[..., None])
+            shadow = PupilShadow.within(place.swapaxes(1, 2).reshape(shadows.shape), harmonics, FEW_SIDES)
+        return cls(axes, harmonics, table[0], table[1], np.ptp(bent, axis=-1), residual, shadow)
+
+    @property
+    def bend(self) -> np.ndarray:
+        """How far each edge is from an ellipse, (B,); ``transfer`` needs at most
+        ``optics.waves.pupil_edge.WORST_BEND``.
+        """
+        last = len(self.harmonics) // 2
+        return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
+
+    def take(self, which: np.ndarray | slice) -> PupilStack:
+        """The pupils of the given indices."""
+        return PupilStack(
+            self.axes[which],
+            self.harmonics[:, which],
+            self.eikonal_terms[which],
+            self.amplitude_terms[which],
+            self.span[which],
+            self.residual[which],
+            None if self.shadow is None else self.shadow.take(which),
+        )
+
+    def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Polychromatic transfer functions in the plane of the traced detector.
+
+        Args:
+            frequency: (M, 2) along the detector's two axes, cycles/m.
+            wavelengths: (K,), metres.
+            weights: (K,) share of the signal at each; they need not sum to 1.
+
+        Returns:
+            Complex (B, M), 0 beyond the cut-off.
+
+        Raises:
+            ValueError: an edge that is far from an ellipse.
+        """
+        total = self._clear(frequency, wavelengths, weights / np.sum(weights))
+        if self.shadow is not None:
+            total = total + self._shadowed(self.shadow, frequency, wavelengths, weights / np.sum(weights))
+        return np.asarray(total / self.power[:, None])
+
+    def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normalised shifts, complex (B, K * M), and the wave numbers of each, (K * M,)."""
+        steps = (wavelengths[:, None, None] * frequency).reshape(-1, 2)
+        moved = np.linalg.solve(self.axes, np.broadcast_to(steps.T, (len(self.axes), 2, len(steps))))
+        return moved[:, 0] + 1j * moved[:, 1], np.repeat(2.0 * np.pi / wavelengths, len(frequency))
+
+    def _clear(self, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """The integral over the overlaps of the clear pupils, mean over the band, (B, M)."""
+        shift, wave = self._shifts(frequency, wavelengths)
+        steps = shift.shape[1]
+        edges = PupilEdge(np.repeat(self.harmonics, steps, axis=1))
+        right, left, inside = edges.corners(shift.ravel())
+        values = np.zeros(shift.shape, complex)
+        for which, across, along in self._pieces(float(np.max(wave)), steps, _AT_ONCE):
+            flat = (which[:, None] * steps + np.arange(steps)).ravel()
+            part = PupilEdge(edges.harmonics[:, flat])
+            rules = (gauss(count) for count in (across, along))
+            points, weight = part.overlap(shift.ravel()[flat], right[:, flat], left[:, flat], *rules)
+            shape = (len(which), steps, -1)
+            values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
+        values *= inside.reshape(shift.shape)
+        return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
+
+    def _shadowed(
+        self, shadow: PupilShadow, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray
+    ) -> np.ndarray:
+        """What the shadows add to ``_clear``."""
+        shift, wave = self._shifts(frequency, wavelengths)
+        values = np.zeros(shift.shape, complex)
+        for which, _, along in self._pieces(float(np.max(wave)), 1, _SHADOWS_AT_ONCE):
+            some, moved = self.take(which), shift[which]
+            parts = shadow.take(which).parts(moved, LEAST_SHADOW + along - LEAST_ALONG)
+            # light of whole pieces once for all shifts, of others and in the other pupil for every region by itself
+            pieces, count = parts.whole.shape[1], len(parts.piece)
+            other = parts.points - (parts.sign * moved[parts.pupil, parts.step])[:, None]
+            owner = np.concatenate([np.repeat(np.arange(len(which)), pieces), parts.pupil, parts.pupil[count:]])
+            every = np.concatenate([parts.whole.reshape(-1, other.shape[1]), other, parts.points[count:]])
+            path, light = some._values_at(owner, every)
+            first, last = len(which) * pieces, len(which) * pieces + len(other)
+            own = np.concatenate([parts.pupil[:count] * pieces + parts.piece, np.arange(last, len(owner))])
+            phase = (parts.sign * wave[parts.step])[:, None] * (path[own] - path[first:last])
+            light = light[own] * light[first:last] * parts.weights
+            at = parts.pupil * shift.shape[1] + parts.step
+            real, imaginary = (
+                np.bincount(at, np.einsum("fq,fq->f", part(phase), light), moved.size) for part in (np.cos, np.sin)
+            )
+            values[which] = (real + 1j * imaginary).reshape(moved.shape)
+        return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
+
+    def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
+        """Pupils that take the same numbers of nodes, in pieces of bounded size."""
+        along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
+        for count in np.unique(along):
+            rows = int(count) + LEAST_ACROSS - LEAST_ALONG
+            some = np.flatnonzero(along == count)
+            room = max(1, points // (shifts * rows * int(count)))
+            for start in range(0, len(some), room):
+                yield some[start : start + room], rows, int(count)
+
+    def _sums(self, points: np.ndarray, weight: np.ndarray, shift: np.ndarray, wave: np.ndarray) -> np.ndarray:
+        """Integrals over overlaps with points c and weights (B, S, Q), of shifts (B, S) at wave numbers (S,)."""
+        half = 0.5 * shift[..., None]
+        (path, light), (path_behind, light_behind) = (self._values(c) for c in (points + half, points - half))
+        phase = wave[:, None] * (path - path_behind)
+        light = light * light_behind * weight
+        real, imaginary = (np.einsum("bsq,bsq->bs", part(phase), light) for part in (np.cos, np.sin))
+        return np.asarray(real + 1j * imaginary)
+
+    def _values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Eikonal and amplitude at p (B, S, Q), of its shape."""
+        count, degree = len(p), self.eikonal_terms.shape[-1] - 1
+        x, y = (_series(part.reshape(count, -1), degree) for part in (p.real, p.imag))
+        eikonal, amplitude = (
+            np.einsum("bip,bip->bp", terms @ y, x).reshape(p.shape)
+            for terms in (self.eikonal_terms, self.amplitude_terms)
+        )
+        return eikonal, amplitude
+
+    def _values_at(self, owner: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same at p (F, Q) in pupils (F,)."""
+        order, place, most = in_rows(owner, len(self.axes))
+        points = np.zeros((len(self.axes), most, p.shape[1]), complex)
+        points[owner[order], place] = p[order]
+        back = np.empty_like(order)
+        back[order] = place
+        step = max(1, _AT_ONCE // (most * p.shape[1]))
+        parts = [slice(k, k + step) for k in range(0, len(points), step)]
+        path, light = (np.concatenate(a) for a in zip(*(self.take(s)._values(points[s]) for s in parts), strict=True))
+        return path[owner, back], light[owner, back]
+
+    @property
+    def light(self) -> np.ndarray:
+        """Share of the clear pupils' light that the shadows leave, (B,)."""
+        return np.asarray(self.power / self._clear_power)
+
+    @cached_property
+    def power(self) -> np.ndarray:
+        """Integral of the amplitude's square over each pupil in p, (B,)."""
+        if self.shadow is None:
+            return self._clear_power
+        points, weight = (a.reshape(len(self.axes), -1) for a in self.shadow.whole(LEAST_SHADOW + 2))
+        return np.asarray(self._clear_power - np.sum(self._values(points[:, None])[1][:, 0] ** 2 * weight, axis=-1))
+
+    @cached_property
+    def _clear_power(self) -> np.ndarray:
+        edges = PupilEdge(self.harmonics)
+        nothing = np.zeros(len(self.axes), complex)
+        right, left, _ = edges.corners(nothing)
+        rules = (gauss(count) for count in (24, 12))
+        points, weight = edges.overlap(nothing, right, left, *rules)
+        return np.asarray(np.sum(self._values(points[:, None])[1][:, 0] ** 2 * weight, axis=-1))
+
+
+def _orders(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Orders (i, j) with i + j <= degree, (K,) each."""
+    i, j = np.indices((degree + 1, degree + 1))
+    keep = i + j <= degree
+    return i[keep], j[keep]
+
+
+def _series(x: np.ndarray, degree: int) -> np.ndarray:
+    """T_0 .. T_degree of x (B, P), shape (B, degree + 1, P)."""
+    out = np.empty((len(x), degree + 1, x.shape[1]))
+    out[:, 0], twice = 1.0, 2.0 * x
+    if degree:
+        out[:, 1] = x
+    for n in range(2, degree + 1):
+        np.multiply(twice, out[:, n - 1], out=out[:, n])
+        out[:, n] -= out[:, n - 2]
+    return out
+
+
+def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
+    """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K)."""
+    tx, ty = chebyshev.chebvander(x, degree), chebyshev.chebvander(y, degree)
+    out = np.empty((*np.shape(x), (degree + 1) * (degree + 2) // 2))
+    first = 0
+    for i in range(degree + 1):  # in the order of ``_orders``
+        count = degree + 1 - i
+        np.multiply(tx[..., i : i + 1], ty[..., :count], out=out[..., first : first + count])
+        first += count
+    return out
+
+
+@lru_cache(maxsize=8)
+def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
+    """From values at nodes of the stop to coefficients of ``products``, by least squares, (K, N).
+
+    Raises:
+        ValueError: too few nodes for the degree.
+    """
+    root = np.sqrt(nodes.weight)
+    stop = products(nodes.x, nodes.y, degree) * root[:, None]
+    if nodes.count < stop.shape[1] or np.linalg.matrix_rank(stop) < stop.shape[1]:
+        raise ValueError(f"{nodes.count} nodes do not determine polynomials of degree {degree}; trace more")
+    return np.asarray(np.linalg.pinv(stop) * root)
+
+
+def _slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of ``products`` along x and along y at the nodes, (N, K) each."""
+    i, j = _orders(degree)
+    derive = chebyshev.chebder(np.eye(degree + 1), axis=0)
+    tx, ty = (chebyshev.chebvander(c, degree) for c in (nodes.x, nodes.y))
+    dx, dy = tx[:, :-1] @ derive, ty[:, :-1] @ derive
+    return dx[:, i] * ty[:, j], tx[:, i] * dy[:, j]
+
+
+def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the images of the unit circle by maps (B, 2, K)."""
+    angle = 2.0 * np.pi * np.arange(_EDGE_SAMPLES) / _EDGE_SAMPLES
+    rim = terms @ products(np.cos(angle), np.sin(angle), degree).T
+    harmonic = np.fft.fft(rim, axis=-1) / _EDGE_SAMPLES
+    centre = harmonic[..., 0].real
+    # u = centre + 2 Re(h e^{ia}): the ellipse of the first harmonic
+    axes = 2.0 * np.stack([harmonic[..., 1].real, -harmonic[..., 1].imag], axis=-1)
+    place = np.linalg.solve(axes, rim - centre[..., None])
+    order = np.arange(-degree, degree + 1)
+    harmonics = (np.fft.fft(place[:, 0] + 1j * place[:, 1], axis=-1) / _EDGE_SAMPLES)[:, order].T
+    harmonics[np.abs(order) <= 1] = np.array([0.0, 0.0, 1.0])[:, None]
+    return centre, axes, harmonics

@@ -1,0 +1,103 @@
+"""Wavefront of a traced bundle: eikonal at the image point, optical path difference on the exit pupil, Zernike fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry import zernike
+
+
+def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Optical path of each ray's plane wave through ``origin``: path - d . (position - origin).
+
+    Args:
+        position: where the path was measured, (..., N, 3), metres (image space, index 1).
+        direction: unit directions, (..., N, 3).
+        path: optical paths, (..., N).
+        origin: the image point, broadcastable to (..., 1, 3).
+
+    Returns:
+        (..., N), metres.
+    """
+    return np.asarray(path - np.sum(direction * (position - origin), axis=-1))
+
+
+def path_difference(
+    position: np.ndarray, direction: np.ndarray, path: np.ndarray, chief: int, radius: float = np.inf
+) -> np.ndarray:
+    """Optical path difference on the reference sphere centred where the chief ray meets the image.
+
+    Positive: the actual wavefront is ahead of the reference sphere, i.e. the ray needs less optical path than the
+    chief ray to reach it.
+
+    Args:
+        position: rays at the image, (..., N, 3), metres.
+        direction: unit directions there.
+        path: optical paths to ``position``, (..., N).
+        chief: index of the chief ray.
+        radius: distance from the exit pupil to the image along the chief ray, metres, positive when the pupil lies
+            upstream (may be infinite).
+
+    Returns:
+        (..., N) metres.
+    """
+    to_sphere = path_to_sphere(position, direction, path, position[..., chief : chief + 1, :], radius)
+    return np.asarray(to_sphere[..., chief : chief + 1] - to_sphere)
+
+
+def path_to_sphere(
+    position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray, radius: float = np.inf
+) -> np.ndarray:
+    """Optical path of each ray to the sphere of a radius about ``origin``, plus that radius.
+
+    Args:
+        position: rays near the image, (..., N, 3), metres.
+        direction: unit directions there.
+        path: optical paths to ``position``, (..., N).
+        origin: the image point, broadcastable to (..., 1, 3).
+        radius: as for ``path_difference``; for an infinite one this is the ``eikonal``.
+
+    Returns:
+        (..., N) metres.
+    """
+    offset = position - origin
+    along = np.sum(direction * offset, axis=-1)
+    # path back to the sphere minus the radius, written so that nothing cancels and an infinite radius is allowed
+    bend = along**2 - np.sum(offset**2, axis=-1)
+    back = along if np.isinf(radius) else along + bend / (radius + np.sign(radius) * np.sqrt(radius**2 + bend))
+    return np.asarray(path - back)
+
+
+@dataclass(frozen=True, eq=False)
+class WavefrontFit:
+    """Zernike coefficients of a wavefront (Noll order, index 0 = Z1), metres rms each, and the rms that remains.
+
+    Attributes:
+        coefficients: (..., last).
+        rms: (...,) rms wavefront error after piston and tilt are taken out, metres.
+        residual_rms: (...,) rms left by the fit.
+    """
+
+    coefficients: np.ndarray
+    rms: np.ndarray
+    residual_rms: np.ndarray
+
+
+def fit_wavefront(
+    x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int = 28
+) -> WavefrontFit:
+    """Fit Z1..Z_last to path differences at pupil coordinates x, y (unit disk) with quadrature weights.
+
+    Piston and tilt are removed from ``rms`` (they move the image, they do not blur it); defocus is kept.
+    """
+    coefficients = zernike.fit(last, x, y, difference, weight)
+    share = weight / np.sum(weight)
+    fitted = coefficients @ zernike.basis(last, x, y).T
+    plane = coefficients[..., :3] @ zernike.basis(3, x, y).T
+    rest = difference - plane
+    rest = rest - np.sum(rest * share, axis=-1, keepdims=True)
+    rms = np.sqrt(np.sum(rest**2 * share, axis=-1))
+    residual = np.sqrt(np.sum((difference - fitted) ** 2 * share, axis=-1))
+    return WavefrontFit(coefficients, rms, residual)

@@ -1,0 +1,1 @@
+"""From specifications to bodies, elements and solids."""

@@ -1,0 +1,110 @@
+"""From a camera's file and what is to be optimised to an optical prescription, and back to a camera's file."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from optics.design.design_rays import Beams
+from optics.design.design_variables import Prescription, Stand, Variable
+from optics.design.merit_function import Goals
+from optics.geometry.surface import Surface, plane
+from optics.numerics import quadrature
+from scenes.models.camera_model import IMAGE, _even_terms
+from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec, MirrorSpec
+from scenes.specs.load import find_camera, load_camera
+from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.yaml.errors import names_text, nearest
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
+
+_RINGS = 5
+_ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
+"""Fields, shares of the half angles; the others follow by symmetry."""
+
+
+class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
+    """An optimisation with the camera that it starts from."""
+
+    camera: CameraSpec
+
+
+def resolve_design(path: str | Path) -> CameraDesignSetup:
+    """Read a design's file and its camera; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or ``vary`` names what the camera does not have.
+    """
+    setup = read_setup(CameraDesignSetup, path)
+    if setup is None:
+        test = validate(CameraDesignSpec, read_yaml(path))
+        setup = CameraDesignSetup(test=test, camera=load_camera(find_camera(test)))
+    known = (*setup.camera.mirrors, IMAGE)
+    for name in setup.test.vary:
+        if name not in known:
+            allowed, meant = names_text(known), nearest(name, known)
+            raise setup.test.error("no such mirror", ("vary", name), found=name, allowed=allowed, suggestion=meant)
+    return setup
+
+
+def prescription_of(camera: CameraSpec) -> Prescription:
+    """The prescription of a camera's file."""
+    surfaces = {n: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for n, m in camera.mirrors.items()}
+    stands = {n: Stand(m.z) for n, m in camera.mirrors.items()}
+    return Prescription(
+        {**surfaces, IMAGE: plane()}, {**stands, IMAGE: Stand(camera.image.z)}, camera.stop, camera.field_bias
+    )
+
+
+def beams_of(camera: CameraSpec) -> Beams:
+    """Nine fields of one half of the camera's field."""
+    fields = [(x * camera.field.x, y * camera.field.y) for x in _ACROSS for y in _ALONG]
+    return Beams(np.array(fields), camera.entrance_pupil, quadrature.disk(_RINGS))
+
+
+def goals_of(setup: CameraDesignSetup, principal_distance: float, envelope: float) -> Goals:
+    """What is asked for, given the start's principal distance and envelope, metres."""
+    largest = None if setup.test.envelope is None else setup.test.envelope * envelope
+    camera = setup.camera
+    return Goals(camera.wavelength, principal_distance, largest, setup.test.clearance, camera.edge_margin)
+
+
+def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
+    """What varies; radii as curvatures."""
+    return tuple(
+        Variable(name, "curvature" if quantity == "radius" else quantity)
+        for name, quantities in spec.vary.items()
+        for quantity in quantities
+    )
+
+
+def camera_of(start: CameraSpec, prescription: Prescription, name: str, description: str) -> CameraSpec:
+    """The camera of an optimised prescription: all that is not optics as in the start.
+
+    Raises:
+        ValueError: surfaces are tilted or decentred, which a camera's file cannot say.
+    """
+    if any(stand.y or stand.tilt for stand in prescription.stands.values()):
+        raise ValueError("a camera's file has no place for tilted or decentred surfaces")
+    mirrors = {}
+    for mirror in start.mirrors:
+        surface = prescription.surfaces[mirror]
+        terms = {f"A{2 * n + 4}": a for n, a in enumerate(surface.even)}
+        mirrors[mirror] = MirrorSpec.model_construct(
+            z=prescription.stands[mirror].z, radius=1.0 / surface.curvature, conic=surface.conic, aspheric=terms
+        )
+    update = {
+        "name": name,
+        "description": description or start.description,
+        "mirrors": mirrors,
+        "image": ImageSpec.model_construct(z=prescription.stands[IMAGE].z),
+        "field_bias": prescription.field_bias,
+    }
+    return start.model_copy(update=update)
+
+
+def camera_file(camera: CameraSpec, remark: str) -> str:
+    """Text of the camera's YAML file, with remarks at its top."""
+    plain: Mapping[str, object] = camera.plain()
+    head = "".join(f"# {line}\n" for line in remark.splitlines())
+    return head + dump_yaml({k: v for k, v in plain.items() if v not in ("", {})})

@@ -1,0 +1,215 @@
+"""From a camera's prescription to its frame, apertures, stop and pivots, all found by tracing.
+
+Frames. Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
+line. Camera frame: Z = line of sight toward the scene, Y = along the line CCD (= prescription x), X = Y x Z, the flight
+direction; its origin is the point where the centre's chief ray meets the first mirror. Focal-plane frame: origin at the
+line's centre, Y as the camera's, Z square to the image plane and toward the scene, X = Y x Z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.geometry.aperture import Aperture, Circle, Rectangle
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface, plane
+from optics.geometry.tree import Body, RigidTree
+from optics.numerics.array_math import determinant, norm, turned
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError, transverse_axes
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.first_order import FirstOrder, first_order, ray_matrix
+from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
+from optics.waves.imaging import aim_collimated
+
+if TYPE_CHECKING:
+    from scenes.specs.camera import CameraSpec
+
+IMAGE = "image"
+REFERENCE = "reference"
+LINE_AXIS = np.array([1.0, 0.0, 0.0])
+LAUNCH_DISTANCE = 3.0
+"""How far before the prescription's origin beams from the scene are launched, metres."""
+
+_RIM_POINTS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A camera's derived numbers; poses and points are in the prescription frame, metres and radians.
+
+    Attributes:
+        spec: the prescription.
+        surfaces: mirror name -> shape.
+        apertures: mirror name -> clear aperture (the stop's is the stop itself).
+        camera_frame: the camera frame in the prescription frame.
+        focal_plane: the focal-plane frame in the prescription frame.
+        first_order: parabasal quantities about the centre's chief ray.
+        image_direction: direction of the centre's chief ray at the image.
+        rear_node: point one focal length (along the line) upstream of the line's centre along that ray.
+    """
+
+    spec: CameraSpec
+    surfaces: Mapping[str, Surface]
+    apertures: Mapping[str, Aperture]
+    camera_frame: Pose
+    focal_plane: Pose
+    first_order: FirstOrder
+    image_direction: np.ndarray
+    rear_node: np.ndarray
+
+    @property
+    def mirrors(self) -> tuple[str, ...]:
+        """Mirror names in the order of the light from the scene."""
+        return tuple(self.spec.mirrors)
+
+    @property
+    def line_focal_length(self) -> float:
+        """Focal length along the line about the centre's chief ray, metres (the papers' f)."""
+        return float(abs(self.first_order.scale[0, 0, 0]))
+
+    def vertex(self, mirror: str) -> np.ndarray:
+        """Vertex of a mirror's parent surface in the prescription frame, metres."""
+        return np.array([0.0, 0.0, self.spec.mirrors[mirror].z])
+
+    def toward_optics(self, focal_plane: np.ndarray) -> np.ndarray:
+        """Direction from the line's centre along its chief ray, upstream, for rotations (..., 3, 3) of the focal plane
+        in the world.
+        """
+        return turned(focal_plane, turned(self.focal_plane.rotation.T, -self.image_direction))
+
+    def bare_assembly(self, apertures: bool = True) -> Assembly:
+        """The camera alone, in the prescription frame: mirrors and image plane."""
+        return _bare(self.spec, self.surfaces, self.apertures if apertures else {})
+
+
+def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
+    """Direction in which light of field (x, y) travels, prescription frame; y counts from the biased centre,
+    radians.
+    """
+    vector = np.array([np.tan(x), np.tan(spec.field_bias + y), 1.0])
+    return np.asarray(vector / norm(vector))
+
+
+def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Launch points of collimated beams that meet the stop at given points.
+
+    Args:
+        backend: where to trace.
+        to_stop: one system, from the scene to the stop.
+        directions: (F, 3) beam directions.
+        targets: (N, 2) stop coordinates, metres, the same for every beam.
+
+    Returns:
+        (F, N, 3) points on a plane before the first mirror, prescription frame.
+    """
+    every = to_stop.take(np.zeros(len(directions), dtype=int))
+    return aim_collimated(backend, every, directions, -LAUNCH_DISTANCE * directions, targets)[0]
+
+
+def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
+    """Trace a prescription and work out frames, stop, apertures and first-order numbers.
+
+    Raises:
+        InputError: the prescription does not bring the light of its field through the stop to the image.
+    """
+    try:
+        return _derived(spec, backend)
+    except (AimError, BeamMissedError) as error:
+        reason = str(error).partition(";")[0]
+        problem = f"no light of the whole field comes through the stop to the image: {reason}"
+        allowed = "mirrors, image, field and stop that belong together"
+        raise spec.error(problem, ("mirrors",), allowed=allowed) from error
+
+
+def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
+    """What `derive_camera` says. Raises AimError, BeamMissedError."""
+    surfaces = {name: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for name, m in spec.mirrors.items()}
+    names = tuple(spec.mirrors)
+    stop = names.index(spec.stop)
+    bare = _bare(spec, surfaces, {})
+    to_stop = assemble(bare, [names[: stop + 1]])
+    imaging = assemble(bare, [(*names, IMAGE)])
+
+    centre = field_direction(spec, 0.0, 0.0)
+    launch = collimated(backend, to_stop, centre[None], np.zeros((1, 2)))[0]
+    traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
+    assert traced.world is not None
+    position, direction, _, valid = traced.numpy(traced.world)
+    require_some(valid, f"camera {spec.name}")
+    image_centre, image_direction = position[0, 0], direction[0, 0]
+
+    sight = -centre
+    across = np.cross(LINE_AXIS, sight)
+    origin = traced.hit(0)[0, 0] + np.array([0.0, 0.0, spec.mirrors[names[0]].z])
+    camera_frame = Pose(np.stack([across, LINE_AXIS, sight], axis=-1), origin)
+    normal = np.array([0.0, 0.0, np.sign(sight[2])])
+    focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
+
+    axes = transverse_axes(centre[None], LINE_AXIS[None])
+    chief = first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
+    stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
+    apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
+    focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
+    return CameraModel(
+        spec,
+        surfaces,
+        apertures,
+        camera_frame,
+        focal_plane,
+        chief,
+        image_direction,
+        image_centre - focal_length * image_direction,
+    )
+
+
+def _even_terms(aspheric: Mapping[str, float] | None) -> tuple[float, ...]:
+    """(A4, A6, ...) from a mapping with those names, gaps filled by zero."""
+    if not aspheric:
+        return ()
+    last = max(int(name[1:]) for name in aspheric)
+    return tuple(float(aspheric.get(f"A{n}", 0.0)) for n in range(4, last + 1, 2))
+
+
+def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:
+    bodies = [Body(name, Pose(np.eye(3), np.array([0.0, 0.0, m.z]))) for name, m in spec.mirrors.items()]
+    bodies.append(Body(IMAGE, Pose(np.eye(3), np.array([0.0, 0.0, spec.image.z]))))
+    elements = {
+        name: Element(name, name, surface, Interaction.REFLECT, apertures.get(name))
+        for name, surface in surfaces.items()
+    }
+    elements[IMAGE] = Element(IMAGE, IMAGE, plane(), Interaction.PASS)
+    return Assembly(RigidTree(tuple(bodies)), elements, {"imaging": (*spec.mirrors, IMAGE)})
+
+
+def _apertures(
+    spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, stop_radius: float
+) -> dict[str, Aperture]:
+    """Clear apertures: the stop, and for the other mirrors the box around the beams of the whole field plus the
+    margin.
+    """
+    angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
+    rim = stop_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    fields = [
+        (x, y) for x in np.linspace(-spec.field.x, spec.field.x, 5) for y in np.linspace(-spec.field.y, spec.field.y, 3)
+    ]
+    directions = np.array([field_direction(spec, x, y) for x, y in fields])
+    launch = collimated(backend, to_stop, directions, rim)
+    rays = make_rays(backend, launch.reshape(-1, 3), np.repeat(directions, _RIM_POINTS, axis=0))
+    traced = trace(backend, imaging, rays, keep=range(len(spec.mirrors)))
+    require_some(traced.numpy()[3], f"camera {spec.name} at its field edges")
+    out: dict[str, Aperture] = {}
+    for i, name in enumerate(spec.mirrors):
+        if name == spec.stop:
+            out[name] = Circle(stop_radius)
+            continue
+        points = traced.hit(i)[0, :, :2]
+        low, high = points.min(axis=0) - spec.edge_margin, points.max(axis=0) + spec.edge_margin
+        half, middle = 0.5 * (high - low), 0.5 * (high + low)
+        out[name] = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
+    return out

@@ -1,0 +1,188 @@
+"""Whether the bodies of an instrument leave each other room: prisms, mirrors and focal-plane boards, as convex bodies.
+
+Two convex bodies meet where their Minkowski difference contains the origin; how deep tells how far one of them has to
+move. Parts of one camera are not compared with each other: the prescription gives them no substrates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+
+from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mesh
+from optics.geometry.tree import PlacedBodies
+from optics.raytrace.assembly import Assembly, Element
+from scenes.models.instrument_model import Instrument, MisplacedError, key_of
+from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
+from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.yaml.errors import InputError, Issue, KeyPath
+
+LEAST_GAP = 20e-6
+"""Bodies nearer than this count as touching, metres: what the path tracer needs between two of them."""
+
+PARALLEL = 1e-9
+"""Sine of the angle between planes below which they have no common edge."""
+
+_CELLS = 12  # across a mirror: the hull lies within a few tenths of a millimetre of the surface
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Two bodies that stand in each other, or touch.
+
+    Attributes:
+        first, second: their paths.
+        depth: how far one of them has to move for them to touch only; negative for a gap below ``LEAST_GAP``; metres.
+    """
+
+    first: str
+    second: str
+    depth: float
+
+
+def separation(first: np.ndarray, second: np.ndarray) -> float:
+    """Distance of the convex hulls of two sets of points, (P, 3) and (Q, 3), metres.
+
+    Negative when they overlap: the shortest displacement that takes them apart, with a minus sign.
+    """
+    difference = ConvexHull((first[:, None] - second[None]).reshape(-1, 3))
+    deepest = float(np.max(difference.equations[:, 3]))  # of the origin, relative to every face
+    if deepest <= 0.0:
+        return deepest
+    faces = difference.points[difference.simplices]
+    nearest = trimesh.triangles.closest_point(faces, np.zeros((len(faces), 3)))
+    return float(np.min(np.linalg.norm(nearest, axis=-1)))
+
+
+def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) -> Mapping[str, np.ndarray]:
+    """Path -> corners of the body in the base frame, (P, 3), metres.
+
+    Args:
+        instrument: the instrument.
+        placed: where its bodies stand; by default as designed.
+    """
+    placed = instrument.assembly.place() if placed is None else placed
+    out = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).mesh.vertices) for s in instrument.solids}
+    for camera, model in instrument.cameras.items():
+        for mirror in model.mirrors:
+            path = f"{BASE}/{camera}/{mirror}"
+            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror), _CELLS)
+            corners = mesh.vertices[ConvexHull(mesh.vertices).vertices]
+            out[path] = placed.pose(path).apply(corners)
+        path = f"{BASE}/{camera}/focal_plane"
+        spots = [p for c in instrument.channels if c.camera == camera for p in (c.pinhole, c.ccd)]
+        x, y = (0.5 * size for size in board_size(model, spots))
+        corners = np.array([[a, b, z] for a in (-x, x) for b in (-y, y) for z in (0.0, 2.0 * CHIP + BOARD)])
+        out[path] = placed.pose(path).apply(corners)
+    return out
+
+
+def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
+    """All pairs of bodies that stand in each other or nearer than ``LEAST_GAP``, as designed; deepest first."""
+    bodies = convex_bodies(instrument)
+    bounds = {path: (corners.min(axis=0), corners.max(axis=0)) for path, corners in bodies.items()}
+    prisms = {solid.path for solid in instrument.solids}
+    found = []
+    for first, second in combinations(bodies, 2):
+        if not prisms & {first, second} and _camera(first) == _camera(second):
+            continue
+        low = np.maximum(bounds[first][0], bounds[second][0])
+        high = np.minimum(bounds[first][1], bounds[second][1])
+        if np.any(low > high + LEAST_GAP):
+            continue
+        gap = separation(bodies[first], bodies[second])
+        if gap < LEAST_GAP:
+            found.append(Overlap(first, second, -gap))
+    return tuple(sorted(found, key=lambda overlap: -overlap.depth))
+
+
+def check_clearance(instrument: Instrument) -> None:
+    """Check that no two bodies stand in each other.
+
+    Raises:
+        InputError: some do; one issue for each pair, at the key that moves the more movable of the two.
+    """
+    issues = [_issue(instrument, overlap) for overlap in find_overlaps(instrument)]
+    if issues:
+        raise InputError(*issues)
+
+
+def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
+    ranks = [_remedy(path) for path in (overlap.second, overlap.first)]  # of equals the later one: first cameras lead
+    _, key, remedy = min(ranks, key=lambda rank: rank[0])
+    mm = 1e3 * overlap.depth
+    how = f"reaches {mm:.3g} mm into" if mm > 0.0 else f"is only {-1e3 * mm:.2g} um from"
+    problem = f"{overlap.first} {how} {overlap.second}"
+    allowed = f"{remedy} that leaves at least {1e6 * LEAST_GAP:.3g} um of room"
+    return instrument.spec.issue(problem, key, allowed=allowed)
+
+
+def _remedy(path: str) -> tuple[int, KeyPath, str]:
+    """How willingly a body is moved (the first first), which key moves it, and what to choose there."""
+    kind = path.rpartition("/")[2]
+    if path == CENTRAL_PRISM:
+        return 2, ("central_prism", "position"), "a position"
+    if kind == "prism_0":
+        return 0, ("monitor", "prism_0", "distance"), "a distance (or width, or shift)"
+    if kind == "prism_180":
+        return 1, ("monitor", "prism_180", "distance"), "a distance (or width, or a monitor field)"
+    return 3, ("cameras", _camera(path), "position"), "a position"
+
+
+def _camera(path: str) -> str:
+    """Name of the camera that a body belongs to; "" for the central prism."""
+    return "" if path == CENTRAL_PRISM else path.split("/")[1]
+
+
+def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
+    """Check that every solid is closed and that clear apertures lie on their faces.
+
+    Raises:
+        MisplacedError: names the body and the face.
+    """
+    placed = assembly.place()
+    for solid in solids:
+        try:
+            solid_mesh(solid, placed)
+        except SolidError as error:
+            raise MisplacedError(str(error), key_of(solid.path)) from error
+        for face in solid.faces:
+            for element in assembly.elements.values():
+                if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
+                    _check_inside(element, face, solid, placed)
+
+
+def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodies) -> None:
+    """Check that an element's clear aperture lies on its face: behind the planes of all others, whatever the length of
+    the edges that they have in common.
+    """
+    assert element.aperture is not None
+    rim = element.aperture.outline()
+    points = placed.pose(element.body).apply(np.column_stack([rim, np.zeros(len(rim))]))
+    _, own = face_plane(face, placed)
+    over, across = 0.0, ""
+    for other in solid.faces:
+        point, normal = face_plane(other, placed)
+        slope = float(np.linalg.norm(normal - (normal @ own) * own))
+        if other is face or slope < PARALLEL:
+            continue
+        beyond = float(np.max((points - point) @ normal)) / slope
+        if beyond > over:
+            over, across = beyond, other.name
+    if over > 0.0:
+        what = f"the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face"
+        raise MisplacedError(f"{solid.path}: {what}, beyond {across}", _key_of_edge(solid.path, across))
+
+
+def _key_of_edge(path: str, across: str) -> KeyPath:
+    """What to change when a clear aperture reaches over a face's edge to the face named ``across``."""
+    if path != CENTRAL_PRISM:
+        return key_of(path)
+    if across == "bottom":
+        return ("central_prism", "height")
+    return ("monitor", "return_face", "aperture")

@@ -1,0 +1,193 @@
+"""From an instrument's YAML to the optical assembly: cameras in the base, monitor channels, the central prism's
+faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.solid import Solid
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, RigidTree
+from optics.materials.glass import glass
+from optics.numerics.backend import Backend
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.system import assemble
+from scenes.models.camera_assembly import camera_bodies, camera_elements, camera_sequences, focal_plane_body
+from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.clearance import check_clearance, check_solids
+from scenes.models.instrument_model import Instrument, MisplacedError
+from scenes.models.monitor_chain import MonitorChain, check_prisms, leaving_beams, monitor_chain, square_facets
+from scenes.models.prism_model import facet_block
+from scenes.specs.baffle import Plate
+from scenes.specs.channel import BASE, CENTRAL_PRISM, SIDES, Channel
+from scenes.specs.job import NodeInfo
+from scenes.yaml.errors import names_text, nearest
+
+if TYPE_CHECKING:
+    from scenes.specs.instrument import InstrumentSpec
+
+_FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along -X, rows along +Y, facing the light
+
+
+def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend) -> Instrument:
+    """Build an instrument.
+
+    Args:
+        spec: the instrument.
+        camera_specs: camera file stem -> CameraSpec, for every stem the instrument names.
+        backend: where to trace while the geometry is worked out.
+
+    Raises:
+        InputError: prisms or central prism cannot stand as the file says, or the cameras are too different.
+    """
+    try:
+        return _build(spec, camera_specs, backend)
+    except MisplacedError as error:
+        raise spec.error(str(error), error.key) from error
+
+
+def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend) -> Instrument:
+    check_prisms(spec)
+    derived: dict[str, CameraModel] = {}
+    for site in spec.cameras.values():
+        if site.camera not in derived:
+            derived[site.camera] = derive_camera(camera_specs[site.camera], backend)  # type: ignore[arg-type]
+    bodies = [Body(BASE), Body(CENTRAL_PRISM, Pose(np.eye(3), np.array(spec.central_prism.position)))]
+    elements: dict[str, Element] = {}
+    sequences: dict[str, tuple[str, ...]] = {}
+    channels: list[Channel] = []
+    chains: dict[str, MonitorChain] = {}
+    for name, site in spec.cameras.items():
+        model = derived[site.camera]
+        root = f"{BASE}/{name}"
+        to_base = Pose(about_axis(1, site.look), np.array(site.position))
+        own = _channels(spec, name, model)
+        bodies += [*camera_bodies(root, to_base, model), *_monitor_bodies(focal_plane_body(root), own)]
+        elements.update({**camera_elements(name, root, model), **_ccd_elements(own)})
+        sequences.update(camera_sequences(name, model))
+        bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.side}") for channel in own)]
+        beams = leaving_beams(spec.monitor, model, own, np.array(site.pupil_offset), to_base, backend)
+        for channel, beam in zip(own, beams, strict=True):
+            chain = monitor_chain(spec, channel, beam, to_base)
+            bodies += chain.bodies
+            elements.update({e.name: e for e in chain.elements})
+            way = tuple(e.name for e in chain.elements)
+            forward = tuple(f"{name}/{m}" for m in model.mirrors)
+            sequences[f"{channel.key}/outgoing"] = (*forward[::-1], *way)
+            sequences[f"{channel.key}/monitor"] = (
+                *forward[::-1],
+                *way,
+                *way[-2::-1],
+                *forward,
+                f"{channel.key}/area_ccd",
+            )
+            chains[channel.key] = chain
+        channels += own
+    solids = tuple(solid for chain in chains.values() for solid in chain.solids)
+    facets = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
+    block = spec.central_prism
+    solids = (*solids, facet_block(CENTRAL_PRISM, block.material, facets, block.spread, block.height))
+    index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
+    cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
+    assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
+    _check_alike(spec, assembly)
+    assembly = square_facets(assembly, channels, cameras, backend)
+    nodes = _nodes(assembly, cameras, solids)
+    lengths = {key: chain.glass for key, chain in chains.items()}
+    instrument = Instrument(
+        spec,
+        assembly,
+        cameras,
+        tuple(channels),
+        MappingProxyType(nodes),
+        solids,
+        MappingProxyType(lengths),
+        _baffles(spec, assembly.tree),
+    )
+    check_solids(instrument.assembly, solids)
+    check_clearance(instrument)
+    return instrument
+
+
+def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
+    """Refuse cameras that cannot be traced together: one batch holds them all."""
+    try:
+        for way in ("image_to_stop", "image_to_object"):
+            assemble(assembly, [f"{name}/{way}" for name in spec.cameras], [{}])
+    except ValueError as error:
+        text = f"these cameras are too different to stand in one instrument ({error})"
+        alike = "cameras with as many mirrors, planes and apertures of the same kinds in the same places"
+        raise spec.error(text, ("cameras",), allowed=alike) from error
+
+
+def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
+    """Where the reticles and area CCDs stand: at +-f tan(field) along the line."""
+    half = model.line_focal_length * float(np.tan(spec.monitor.field))
+    dx, dy = spec.monitor.area_ccd.offset
+    return [
+        Channel(camera, side, pinhole=(-dx, sign * half - dy), ccd=(0.0, sign * half))
+        for side, sign in zip(SIDES, (1.0, -1.0), strict=True)
+    ]
+
+
+def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
+    """Boards at the ends of the line CCD, with their reticles and area CCDs."""
+    bodies = []
+    for channel in channels:
+        bodies.append(Body(f"{plane_root}/{channel.side}", Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
+        offset = np.array([channel.pinhole[0] - channel.ccd[0], channel.pinhole[1] - channel.ccd[1], 0.0])
+        bodies.append(Body(channel.reticle_body, Pose(np.eye(3), offset)))
+        bodies.append(Body(channel.ccd_body, Pose(_FLIP, np.zeros(3))))
+    return bodies
+
+
+def _ccd_elements(channels: list[Channel]) -> dict[str, Element]:
+    keys = {channel: f"{channel.key}/area_ccd" for channel in channels}
+    return {key: Element(key, channel.ccd_body, plane(), Interaction.PASS) for channel, key in keys.items()}
+
+
+def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
+    """Plates of all baffles.
+
+    Raises:
+        InputError: a baffle stands on a body that does not exist.
+    """
+    out: list[Plate] = []
+    for name, baffle in spec.baffles.items():
+        if baffle.body not in tree.paths:
+            raise spec.error(
+                "no such body",
+                ("baffles", name, "body"),
+                found=baffle.body,
+                allowed=names_text(tree.paths),
+                suggestion=nearest(baffle.body, tree.paths),
+            )
+        out += baffle.plates(name)
+    return tuple(out)
+
+
+def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
+    """What may be done to each body; the base itself is the frame of everything and is not moved."""
+    # a figure belongs to the element's own body: a face that the beam meets twice has one for each passage
+    shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}
+    roots = {f"{BASE}/{name}" for name in cameras}
+    out = {}
+    for body in assembly.tree.bodies:
+        if body.path == BASE:
+            out[BASE] = NodeInfo(allows=frozenset({"temperature"}))
+            continue
+        allows = {"rotate", "shift"}
+        if not any(body.path.startswith(f"{solid.path}/") for solid in solids):
+            allows.add("temperature")
+        if body.path in shaped:
+            allows.add("figure")
+        if body.path in roots:
+            allows.add("scale")
+        out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows))
+    return out

@@ -1,0 +1,84 @@
+"""An instrument ready to be perturbed and traced: its assembly, cameras, monitor channels and solids."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.solid import Solid
+from optics.geometry.tree import PlacedBodies
+from optics.raytrace.assembly import Assembly
+from scenes.models.camera_model import CameraModel
+from scenes.specs.baffle import Plate
+from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.job import NodeInfo
+from scenes.yaml.errors import KeyPath
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """An instrument ready to be perturbed and traced.
+
+    Attributes:
+        spec: what the YAML says.
+        assembly: bodies, elements, sequences.
+        cameras: name -> model.
+        channels: all monitor channels, camera by camera, left before right.
+        nodes: body path -> what may be done to it.
+        solids: the prisms of all channels, camera by camera, and the central prism.
+        glass_path: channel key -> prism -> length of the beam inside its glass, one way, metres.
+        baffles: black plates that only the path tracer and pictures know.
+    """
+
+    spec: InstrumentSpec
+    assembly: Assembly
+    cameras: Mapping[str, CameraModel]
+    channels: tuple[Channel, ...]
+    nodes: Mapping[str, NodeInfo]
+    solids: tuple[Solid, ...]
+    glass_path: Mapping[str, Mapping[str, float]]
+    baffles: tuple[Plate, ...] = ()
+
+    def camera_axes(self, camera: str) -> np.ndarray:
+        """Nominal camera X, Y, Z in the base frame as columns, (3, 3)."""
+        return self.assembly.nominal_pose(f"{BASE}/{camera}").rotation
+
+    def toward_optics(self, placed: PlacedBodies, camera: str) -> np.ndarray:
+        """Direction from the line's centre along its chief ray, upstream, in each state, world, (S, 3).
+
+        Where rays that start at the focal plane are first sent; it rides on the focal plane.
+        """
+        model = self.cameras[camera]
+        return model.toward_optics(placed.rotation[:, placed.index[f"{BASE}/{camera}/focal_plane"]].real)
+
+    @property
+    def separation(self) -> Mapping[str, float]:
+        """Camera -> distance of its two area CCDs (the papers' L), metres."""
+        out = {}
+        for name in self.cameras:
+            left, right = (c for c in self.channels if c.camera == name)
+            out[name] = abs(left.ccd[1] - right.ccd[1])
+        return out
+
+
+class MisplacedError(ValueError):
+    """A part of the monitor cannot stand as the instrument's file says.
+
+    Attributes:
+        key: of the file, what to change.
+    """
+
+    def __init__(self, problem: str, key: KeyPath) -> None:
+        super().__init__(problem)
+        self.key = key
+
+
+def key_of(path: str) -> KeyPath:
+    """Key of the instrument's file that a body comes from."""
+    if path.startswith(CENTRAL_PRISM):
+        return ("central_prism",)
+    kinds = [part for part in path.split("/") if part in ("prism_180", "prism_0")]
+    return ("monitor", kinds[0]) if kinds else ("cameras", path.split("/")[1], "pupil_offset")

@@ -1,0 +1,134 @@
+"""Triangles: mirrors and boards as solid bodies, and surfaces that paths hit.
+
+Prescriptions say nothing about substrates; these have a thickness that is usual for light mirrors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from optics.geometry.aperture import Aperture, Circle
+from optics.geometry.surface import Surface
+from scenes.models.camera_model import CameraModel
+
+GRID = 24
+"""Cells across a mirror: the mesh departs from the surface by less than a millimetre."""
+
+THICKNESS = 0.08
+"""Least thickness of a mirror behind its surface, share of its longer side."""
+
+BOARD = 0.010
+"""Thickness of the focal plane's board, metres; it stands behind the detectors."""
+
+BOARD_EDGE = 0.020
+"""How far the board reaches beyond the outermost of what it carries, metres."""
+
+CHIP = 0.0005
+"""Thickness of chips, metres."""
+
+
+def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = GRID) -> trimesh.Trimesh:
+    """Watertight mesh of a mirror: its optical surface over the clear aperture, a flat back and an edge.
+
+    Args:
+        surface: shape, metres.
+        aperture: clear aperture.
+        back: +1 when the substrate is on the surface's +z side, -1 when on its -z side.
+        cells: across the mirror.
+    """
+    x0, x1, y0, y1 = aperture.bounds
+    s = np.linspace(-1.0, 1.0, cells + 1)
+    u, v = np.meshgrid(s, s)
+    if isinstance(aperture, Circle):  # square onto disk, ring by ring
+        ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
+        u, v = ring * np.cos(angle), ring * np.sin(angle)
+    x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
+    z = surface.sag(x, y)
+    thickness = THICKNESS * max(x1 - x0, y1 - y0)
+    flat = (z.max() + thickness) if back > 0 else (z.min() - thickness)
+    n = cells + 1
+    front = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    rear = front.copy()
+    rear[:, 2] = flat
+    i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
+    face = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
+    up, down = np.arange(cells), np.arange(cells, 0, -1)
+    rim = np.concatenate([up, up * n + cells, cells * n + down, down * n])
+    after = np.roll(rim, -1)
+    offset = n * n
+    edge = np.concatenate([np.stack([rim, rim + offset, after], 1), np.stack([after, rim + offset, after + offset], 1)])
+    faces = np.concatenate([face, face[:, ::-1] + offset, edge])
+    return trimesh.Trimesh(np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces, process=False)
+
+
+def behind(model: CameraModel, mirror: str) -> float:
+    """Side of a mirror's surface on which its substrate lies: +1 toward +z, -1 toward -z.
+
+    That is where the light would go on to.
+    """
+    places = [*(model.spec.mirrors[m].z for m in model.mirrors), model.spec.image.z]
+    k = model.mirrors.index(mirror)
+    return 1.0 if places[k] > places[k + 1] else -1.0
+
+
+def board_size(model: CameraModel, pinholes: list[tuple[float, float]]) -> tuple[float, float]:
+    """Size of a focal plane's board along its X and Y, metres, centred on the line.
+
+    Args:
+        model: the camera.
+        pinholes: X, Y of its channels' pinholes and area CCDs in the focal plane, metres.
+    """
+    line = 0.5 * model.spec.line.pixels * model.spec.line.pitch
+    x = max((abs(p[0]) for p in pinholes), default=0.0)
+    y = max([line, *(abs(p[1]) for p in pinholes)])
+    return 2.0 * (x + BOARD_EDGE), 2.0 * (y + BOARD_EDGE)
+
+
+CELLS = 10
+"""Cells across a curved surface: few, because Mitsuba's search costs most. The triangles of a metre-sized mirror are
+then up to a millimetre off; the refinement does not mind."""
+
+MARGIN = 0.01
+LEAST_MARGIN = 2e-4
+"""How far the triangles reach beyond the clear aperture: share of its half-size, and at least so much, metres. The
+chords of the outline and of the surface must not cut a ray off that meets the surface inside its edge."""
+
+
+def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.ndarray, float]:
+    """Triangles over a clear aperture and a little more.
+
+    Args:
+        surface: shape, metres.
+        aperture: clear aperture; a hole in it is covered, too.
+
+    Returns:
+        Vertices (V, 3) in the surface's frame, metres; triangles (T, 3); largest distance between the triangles and the
+        surface, metres.
+    """
+    cells = 2 if surface.is_plane and not isinstance(aperture, Circle) else CELLS
+    x0, x1, y0, y1 = aperture.bounds
+    half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
+    half_x, half_y = (max((1.0 + MARGIN) * h, h + LEAST_MARGIN) for h in (half_x, half_y))
+    s = np.linspace(-1.0, 1.0, cells + 1)
+    u, v = np.meshgrid(s, s)
+    if isinstance(aperture, Circle):  # square onto disk, ring by ring
+        ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
+        u, v = ring * np.cos(angle), ring * np.sin(angle)
+    x, y = 0.5 * (x0 + x1) + half_x * u, 0.5 * (y0 + y1) + half_y * v
+    z = surface.sag(x, y)
+    if not np.all(np.isfinite(z)):
+        raise ValueError("a surface ends before its clear aperture does")
+    n = cells + 1
+    i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
+    triangles = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    middles = 0.5 * (vertices[triangles] + vertices[np.roll(triangles, 1, axis=1)])
+    apart = np.abs(surface.sag(middles[..., 0], middles[..., 1]) - middles[..., 2])
+    return vertices, triangles, 2.0 * float(np.max(apart))
+
+
+def polygon_mesh(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A convex polygon (K, 3) as a fan: vertices and triangles."""
+    k = np.arange(1, len(corners) - 1)
+    return np.asarray(corners), np.stack([np.zeros_like(k), k, k + 1], axis=1)

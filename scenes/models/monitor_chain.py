@@ -1,0 +1,328 @@
+"""Where the monitor's prisms stand: from the beam that leaves a camera, over both prisms, to a facet of the central
+prism.
+
+The beam leaves the camera through a part of the pupil. The 180-deg prism takes it at a given distance, turns it back
+and over to the central prism's side; the rhomboid displaces it by a given amount in the same direction; how far the
+180-deg prism has to transfer it follows from where the facet is. The facet stands square to the beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import sqrt
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.geometry.aperture import Circle
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Solid
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body, RigidTree
+from optics.materials.glass import glass
+from optics.numerics.array_math import inner, norm, turned
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
+from scenes.models.instrument_model import MisplacedError, key_of
+from scenes.models.prism_model import null_point, prism_0, prism_180, roof_offset
+from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.yaml.errors import KeyPath
+
+if TYPE_CHECKING:
+    from scenes.specs.instrument import InstrumentSpec, MonitorSpec
+
+
+_OUTLINE = 2000  # points of a clear aperture's edge: a few millimetres apart at most
+
+
+@dataclass(frozen=True, eq=False)
+class LeavingBeam:
+    """A channel's beam in front of its camera, base frame.
+
+    Attributes:
+        middle: where it meets the 180-deg prism's window, metres.
+        direction: of its middle ray, halfway between the beam from the pinhole and the one that would come from the
+            middle of the area CCD; unit vector.
+    """
+
+    middle: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorChain:
+    """What a channel's beam meets outside the camera.
+
+    Attributes:
+        bodies: of the prisms and their faces, and of the facet.
+        elements: in the order in which the leaving beam meets them; the last one is the return face.
+        solids: the two prisms.
+        glass: prism -> length of the beam inside it, one way, metres.
+    """
+
+    bodies: tuple[Body, ...]
+    elements: tuple[Element, ...]
+    solids: tuple[Solid, ...]
+    glass: Mapping[str, float]
+
+
+def leaving_beams(
+    spec: MonitorSpec,
+    model: CameraModel,
+    channels: Sequence[Channel],
+    pupil_offset: np.ndarray,
+    to_base: Pose,
+    backend: Backend,
+) -> list[LeavingBeam]:
+    """Trace the channels' beams out of a camera.
+
+    The beam's middle is where the pinhole's chief ray passes, displaced by the sub-aperture's offset in the pupil.
+
+    Raises:
+        MisplacedError: light from the pinholes or the area CCDs misses a mirror's surface.
+    """
+    frame = model.camera_frame
+    reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, spec.prism_180.distance])))
+    bare = model.bare_assembly(apertures=False)
+    tree = RigidTree((*bare.tree.bodies, Body(REFERENCE, reference)))
+    element = Element(REFERENCE, REFERENCE, plane(), Interaction.PASS)
+    bare = Assembly(tree, {**bare.elements, REFERENCE: element}, {})
+    backward = tuple(reversed(model.mirrors))
+    stop = backward.index(model.spec.stop)
+    to_stop = assemble(bare, [backward[: stop + 1]])
+    outgoing = assemble(bare, [(*backward, REFERENCE)])
+
+    spots = np.array([[*p, 0.0] for c in channels for p in (c.pinhole, c.ccd)])
+    points = model.focal_plane.apply(spots)[None]
+    guess = np.broadcast_to(-model.image_direction, points.shape)
+    fan = RayFan(points, guess, transverse_axes(guess, np.broadcast_to(LINE_AXIS, guess.shape)))
+    where = " and ".join(c.key for c in channels)
+    q = _aimed(backend, to_stop, fan, np.zeros(2), where, ("monitor", "field"))
+    position, direction = fan.at(q)
+    chief = trace(backend, outgoing, make_rays(backend, position, direction)).numpy()
+    if not chief[3].all():
+        raise MisplacedError(f"light of the monitor channels {where} misses a mirror", ("monitor", "field"))
+    centres = chief[0][0, 0::2, :2] + pupil_offset
+    q = _aimed(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], where, ("monitor", "field"), start=q)
+    position, direction = fan.at(q)
+    traced = trace(backend, outgoing, make_rays(backend, position, direction), world=True)
+    assert traced.world is not None
+    leaving = traced.numpy(traced.world)[1][0]
+    in_base = to_base @ frame.inverse()
+    beams = []
+    for i, centre in enumerate(centres):
+        along = leaving[2 * i] + leaving[2 * i + 1]
+        along = turned(in_base.rotation, along / norm(along))
+        beams.append(LeavingBeam(in_base.apply(reference.apply(np.array([*centre, 0.0]))), along))
+    return beams
+
+
+def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_base: Pose) -> MonitorChain:
+    """Place both prisms and the facet of a channel.
+
+    Args:
+        spec: the instrument.
+        channel: which.
+        beam: as it leaves the camera.
+        to_base: the camera's pose in the base.
+
+    Raises:
+        InputError: the central prism is too near the camera's beam for the rhomboid's displacement, or that is too
+            small for the rhomboid's width.
+    """
+    monitor, up = spec.monitor, beam.direction
+    apex = np.array(spec.central_prism.position)
+    spread = np.array(spec.central_prism.spread)
+    # facets lean to where their beams come from, so that each is the lowest of all planes through the apex there
+    side = np.sign(up[:2])
+    offset = side * spread
+    centre = apex + np.array([*offset, -inner(offset, up[:2]) / up[2]])
+    across = centre - beam.middle
+    across = across - inner(across, up) * up
+    whole = float(norm(across))
+    toward = across / whole
+    transfer = whole - monitor.prism_0.shift
+    off = roof_offset(monitor.prism_180.width)
+    shortest = 2.0 * off + monitor.prism_180.width
+    if transfer < shortest:
+        raise spec.error(
+            f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism; less the "
+            f"rhomboid's displacement this leaves {1e3 * transfer:.4g} mm for the 180-deg prism",
+            ("central_prism", "position"),
+            allowed=f"places that leave it at least {1e3 * shortest:.4g} mm",
+        )
+    into_camera = to_base.inverse()
+    length = sqrt(transfer**2 - (2.0 * off) ** 2)
+    turned = np.cross(up, toward)
+    # of the two mirror-image prisms the one that lies more nearly across the line
+    x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
+    hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
+    made = monitor.prism_180
+    pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
+    pose = pose @ _turn(made.tilt, null_point(length, made.width))
+    first = prism_180(
+        channel.prism_body("prism_180"),
+        into_camera @ pose,
+        f"{channel.key}/prism_180",
+        made.material,
+        length,
+        made.width,
+        hand,
+        made.angle_errors,
+    )
+    small = monitor.prism_0
+    pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
+    pose = pose @ _turn(small.tilt, (0.0, 0.0, 0.0))
+    try:
+        second = prism_0(
+            channel.prism_body("prism_0"),
+            into_camera @ pose,
+            f"{channel.key}/prism_0",
+            small.material,
+            small.shift,
+            small.width,
+            small.angle_errors,
+        )
+    except ValueError as error:
+        raise spec.error(str(error), ("monitor", "prism_0", "shift")) from error
+    face = Element(
+        f"{channel.key}/return_face",
+        channel.face_body,
+        plane(),
+        Interaction.REFLECT,
+        Circle(0.5 * monitor.return_face.aperture),
+    )
+    facet = Body(channel.face_body, Pose(_facet_axes(up), centre - apex))
+    return MonitorChain(
+        (*first.bodies, *second.bodies, facet),
+        (*first.elements, *second.elements, face),
+        (first.solid, second.solid),
+        MappingProxyType({"prism_180": first.path_length, "prism_0": second.path_length}),
+    )
+
+
+def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
+    """A turn about x and y that leaves a point in place."""
+    turn = rotation_matrix(np.array([*tilt, 0.0]))
+    return Pose(turn, np.array(about) - turned(turn, np.array(about)))
+
+
+def check_prisms(spec: InstrumentSpec) -> None:
+    """Check that the prisms' glasses have an index at the monitor's wavelength and that they let the beam pass.
+
+    Raises:
+        InputError: one of them does not.
+    """
+    monitor, face = spec.monitor, spec.monitor.return_face.aperture
+    for name, prism in (("prism_180", monitor.prism_180), ("prism_0", monitor.prism_0)):
+        known = glass(prism.material)
+        if not known.shortest <= monitor.wavelength <= known.longest:
+            raise spec.error(
+                f"the index of {prism.material} is not known at the monitor's wavelength of "
+                f"{1e9 * monitor.wavelength:.6g} nm",
+                ("monitor", name, "material"),
+                found=prism.material,
+                allowed=f"a glass for that wavelength, or a wavelength from {1e9 * known.shortest:.6g} to "
+                f"{1e9 * known.longest:.6g} nm",
+            )
+        if prism.width < face:
+            raise spec.error(
+                f"the prism is narrower than the beam: {1e3 * prism.width:.4g} mm for a return face of "
+                f"{1e3 * face:.4g} mm",
+                ("monitor", name, "width"),
+                allowed=f"at least {1e3 * face:.4g} mm",
+            )
+
+
+def square_facets(
+    assembly: Assembly, channels: Sequence[Channel], cameras: Mapping[str, CameraModel], backend: Backend
+) -> Assembly:
+    """Turn every facet so that it sends the pinhole's beam to the middle of its area CCD, as found by tracing.
+
+    The normal halves the angle between the beam that arrives and the one that would come from the CCD's middle, both
+    through the facet's centre, after all prisms with their angle errors.
+
+    Raises:
+        MisplacedError: a beam misses a mirror or a prism; the message names the element.
+    """
+    poses = {}
+    placed = assembly.place()
+    for channel in channels:
+        names = assembly.sequences[f"{channel.key}/outgoing"]
+        start = np.array([placed.translation[0, placed.index[b]] for b in (channel.reticle_body, channel.ccd_body)])[
+            None
+        ]
+        guess = cameras[channel.camera].toward_optics(placed.pose(f"{BASE}/{channel.camera}/focal_plane").rotation)
+        guess = np.broadcast_to(guess, start.shape)
+        fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
+        arriving = assembly.with_element(Element("arriving", channel.face_body, plane(), Interaction.PASS))
+        systems = assemble(arriving, [(*names[:-1], "arriving")])
+        q = _aimed(backend, systems, fan, np.zeros(2), channel.key, ("central_prism", "position"))
+        position, direction = fan.at(q)
+        traced = trace(backend, systems, make_rays(backend, position, direction), world=True)
+        assert traced.world is not None
+        _, leaving, _, valid = traced.numpy(traced.world)
+        if not valid.all():
+            raise _missed(assembly, channel, backend, position, direction)
+        normal = -leaving[0].sum(axis=0)
+        block = placed.pose(CENTRAL_PRISM)
+        local = turned(block.rotation.T, normal / norm(normal))
+        poses[channel.face_body] = Pose(_facet_axes(local), assembly.tree[channel.face_body].pose.translation)
+    bodies = tuple(Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies)
+    return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media)
+
+
+def _aimed(
+    backend: Backend,
+    systems: SystemBatch,
+    fan: RayFan,
+    target: np.ndarray,
+    channels: str,
+    key: KeyPath,
+    start: np.ndarray | None = None,
+) -> np.ndarray:
+    """Parameters of ``aim``; MisplacedError at ``key`` when it finds no ray."""
+    try:
+        return aim(backend, systems, fan, target, start)[0]
+    except (AimError, np.linalg.LinAlgError) as error:
+        why = f": {error}" if isinstance(error, AimError) else ""
+        raise MisplacedError(f"no light of {channels} gets to where it has to go{why}", key) from error
+
+
+def _missed(
+    assembly: Assembly, channel: Channel, backend: Backend, position: np.ndarray, direction: np.ndarray
+) -> MisplacedError:
+    """Which element of a channel's way out rays (1, N, 3) from the pinhole and from the CCD miss first."""
+    names = assembly.sequences[f"{channel.key}/outgoing"]
+    for count, (element, alive) in enumerate(alive_along(backend, assembly, names, position, direction), 1):
+        if alive.all():
+            continue
+        what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
+        bare = assembly.with_element(replace(element, aperture=None))
+        traced = trace(backend, assemble(bare, [names[:count]]), make_rays(backend, position, direction))
+        if element.aperture is not None and traced.numpy()[3].all():
+            gap = element.aperture.outline(_OUTLINE)[:, None] - traced.place()[0][~alive]
+            off = float(np.max(np.min(np.linalg.norm(gap, axis=-1), axis=0)))
+            what += f": it passes {1e3 * off:.3g} mm beside the clear aperture"
+        elif element.interaction is Interaction.TOTAL:
+            what += ", or is not totally reflected there"
+        what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
+        return MisplacedError(what, key_of(element.body))
+    return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
+
+
+def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Rotation with these x and z axes."""
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _facet_axes(normal: np.ndarray) -> np.ndarray:
+    """Frame of a facet: z along its normal, x along the line (against the camera's Y)."""
+    x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
+    return _columns(x_axis, normal)

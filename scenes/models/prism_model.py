@@ -1,0 +1,287 @@
+"""Shapes of the monitor's prisms: faces on bodies, elements on faces, clear apertures.
+
+The 180-deg prism is a slice of a corner cube. Its frame has z along the beam that enters, x along the transfer, the
+origin in the middle of its window:
+
+    z ^        mirror ________________________ roof_a, roof_b
+      |              /                        |    (seen along y, the two roof faces
+      |             /                         |     stand at +-45 deg about the ridge)
+      +---> x       |__entry____________exit__|
+                             window
+
+A ray that enters at (x, y) leaves at (-x, -y), antiparallel: the point reflection at the apex (0, 0, z_apex), whatever
+the prism's attitude. The beam passes at a distance ``roof_offset`` from the ridge: all of it meets roof_a first.
+
+The 0-deg prism is a rhomboid, its frame's z along the beam, x along the displacement, the origin in its middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from math import sqrt
+
+import numpy as np
+
+from optics.geometry.aperture import Ellipse
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.solid import Coating, Face, Solid
+from optics.geometry.surface import plane
+from optics.geometry.tree import Body
+from optics.numerics.array_math import inner, norm
+from optics.raytrace.assembly import Element, Interaction
+
+EDGE = 0.003
+"""How far the glass reaches beyond its clear apertures, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """What the beam does at one optical face.
+
+    Attributes:
+        name: of the element within the prism, e.g. ``entry``.
+        face: which face (its body is ``<solid>/<face>``, with a child for each passage if there are several).
+        interaction: refract, reflect or total.
+        place: of the beam's middle on the face, in the solid's frame, metres.
+        direction: of the beam when it arrives, in the solid's frame.
+    """
+
+    name: str
+    face: str
+    interaction: Interaction
+    place: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PrismParts:
+    """A prism ready for the assembly.
+
+    Attributes:
+        bodies: its own and its faces'.
+        elements: in the order in which the beam that leaves the camera meets them.
+        solid: its glass.
+        path_length: of the beam's middle inside the glass, metres.
+        apex: null point of the 180-deg prism in its frame, metres; the middle for the rhomboid.
+    """
+
+    bodies: tuple[Body, ...]
+    elements: tuple[Element, ...]
+    solid: Solid
+    path_length: float
+    apex: tuple[float, float, float]
+
+
+Plane = tuple[str, tuple[float, float, float], tuple[float, float, float], Coating]
+"""A face as name, outward normal (any length), a point on it, coating; in the solid's frame."""
+
+_S = 1.0 / sqrt(2.0)
+
+
+def prism_180(
+    path: str,
+    pose: Pose,
+    key: str,
+    material: str,
+    length: float,
+    width: float,
+    hand: float,
+    errors: Mapping[str, tuple[float, float]],
+) -> PrismParts:
+    """The lateral-transfer prism.
+
+    Args:
+        path: of its body.
+        pose: in the body that carries it, as the module says.
+        key: prefix of its elements' names.
+        material: its glass.
+        length: from the middle of the entering to that of the leaving beam along x, metres.
+        width: of the clear apertures, metres.
+        hand: +1: the beam enters at +y of the ridge; -1: the mirror image of that prism.
+        errors: face -> tilt about its x and y, radians.
+    """
+    off = roof_offset(width)
+    half = 0.5 * width
+    height = _beam_height(width)
+    apex = null_point(length, width)
+    reach, side = 0.5 * length + half + EDGE, off + half + EDGE
+    planes: list[Plane] = [
+        ("window", (0, 0, -1), (0, 0, 0), Coating.TRANSMITTING),
+        ("mirror", (-1, 0, 1), apex, Coating.MIRROR),
+        ("roof_a", (_S, hand, _S), apex, Coating.TOTAL),
+        ("roof_b", (_S, -hand, _S), apex, Coating.TOTAL),
+        ("top", (0, 0, 1), (0, 0, height + half + EDGE), Coating.GROUND),
+        ("side_a", (0, 1, 0), (0, side, 0), Coating.GROUND),
+        ("side_b", (0, -1, 0), (0, -side, 0), Coating.GROUND),
+        ("end_a", (-1, 0, 0), (-reach, 0, 0), Coating.GROUND),
+        ("end_b", (1, 0, 0), (reach, 0, 0), Coating.GROUND),
+    ]
+    x = 0.5 * length
+    up, along, turned = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
+    at, y = np.array, hand * off
+    passages = [
+        Passage("entry", "window", Interaction.REFRACT, at([-x, y, 0.0]), up),
+        Passage("mirror", "mirror", Interaction.REFLECT, at([-x, y, height]), up),
+        Passage("roof_a", "roof_a", Interaction.TOTAL, at([x - sqrt(2.0) * off, y, height]), along),
+        Passage("roof_b", "roof_b", Interaction.TOTAL, at([x, -y, height - sqrt(2.0) * off]), turned),
+        Passage("exit", "window", Interaction.REFRACT, at([x, -y, 0.0]), -up),
+    ]
+    return _parts(path, pose, key, material, planes, passages, width, errors, apex, {"window": (0.0, 0.0, 0.0)})
+
+
+def _beam_height(width: float) -> float:
+    """Height of the transferred beam above the window, metres: its way down from the roof clears the window's edge."""
+    return sqrt(2.0) * roof_offset(width) + sqrt(3.0) * 0.5 * width + EDGE
+
+
+def null_point(length: float, width: float) -> tuple[float, float, float]:
+    """Apex of the 180-deg prism's three reflecting faces in its frame, metres: turns about it leave the beam alone."""
+    return (0.0, 0.0, _beam_height(width) + 0.5 * length)
+
+
+def roof_offset(width: float) -> float:
+    """How far from the ridge the beam passes the 180-deg prism, metres: no clear aperture reaches over the ridge."""
+    return 0.5 * width + EDGE
+
+
+def prism_0(
+    path: str,
+    pose: Pose,
+    key: str,
+    material: str,
+    shift: float,
+    width: float,
+    errors: Mapping[str, tuple[float, float]],
+) -> PrismParts:
+    """The rhomboid; arguments as ``prism_180``, shift is the beam's displacement along x, metres.
+
+    Raises:
+        ValueError: the displacement is too small for the width, so that the rhomboid would cut the beam.
+    """
+    half = 0.5 * width + EDGE
+    if shift < half + 0.5 * width:
+        raise ValueError(
+            f"{path}: a rhomboid of width {1e3 * width:.4g} mm cannot displace the beam by only {1e3 * shift:.4g} mm; "
+            f"at least {1e3 * (half + 0.5 * width):.4g} mm"
+        )
+    x = 0.5 * shift
+    planes: list[Plane] = [
+        ("entry", (0, 0, -1), (-x, 0, -half), Coating.TRANSMITTING),
+        ("mirror_a", (-1, 0, 1), (-x, 0, 0), Coating.TOTAL),
+        ("mirror_b", (1, 0, -1), (x, 0, 0), Coating.TOTAL),
+        ("exit", (0, 0, 1), (x, 0, half), Coating.TRANSMITTING),
+        ("side_a", (0, 1, 0), (0, half, 0), Coating.GROUND),
+        ("side_b", (0, -1, 0), (0, -half, 0), Coating.GROUND),
+    ]
+    along_z, along_x = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
+    passages = [
+        Passage("entry", "entry", Interaction.REFRACT, np.array([-x, 0, -half]), along_z),
+        Passage("mirror_a", "mirror_a", Interaction.TOTAL, np.array([-x, 0, 0.0]), along_z),
+        Passage("mirror_b", "mirror_b", Interaction.TOTAL, np.array([x, 0, 0.0]), along_x),
+        Passage("exit", "exit", Interaction.REFRACT, np.array([x, 0, half]), along_z),
+    ]
+    return _parts(path, pose, key, material, planes, passages, width, errors, (0.0, 0.0, 0.0), {})
+
+
+def _parts(
+    path: str,
+    pose: Pose,
+    key: str,
+    material: str,
+    planes: list[Plane],
+    passages: list[Passage],
+    width: float,
+    errors: Mapping[str, tuple[float, float]],
+    apex: tuple[float, float, float],
+    origins: Mapping[str, tuple[float, float, float]],
+) -> PrismParts:
+    """Bodies, elements and solid from planes and passages; ``origins`` places the frame of a face that two passages
+    share.
+    """
+    used = {p.face: p for p in reversed(passages)}
+    shared = {face for face in used if sum(p.face == face for p in passages) > 1}
+    unknown = set(errors) - set(used)
+    if unknown:
+        raise ValueError(f"{path}: no such face: {', '.join(sorted(unknown))}; faces are {', '.join(used)}")
+    bodies = [Body(path, pose, pivots={"apex": apex, "centre": _centre(passages)})]
+    faces, frames = [], {}
+    for name, normal, point, coating in planes:
+        if name not in used:
+            faces.append(Face(name, path, coating, Pose(_axes(np.array(normal, float), None), np.array(point, float))))
+            continue
+        passage = used[name]
+        origin = np.array(origins[name]) if name in origins else passage.place
+        frame = Pose(_axes(np.array(normal, float), passage.direction), origin)
+        tilted = frame @ Pose(rotation_matrix(np.array([*errors.get(name, (0.0, 0.0)), 0.0])))
+        bodies.append(Body(f"{path}/{name}", tilted))
+        faces.append(Face(name, f"{path}/{name}", coating))
+        frames[name] = frame
+        # two footprints far apart on one face tilt differently when it bends: each has a body of its own
+        bodies += [
+            Body(_footprint(path, p, shared), Pose(np.eye(3), frame.inverse().apply(p.place)))
+            for p in passages
+            if p.face == name and name in shared
+        ]
+    elements = []
+    for passage in passages:
+        frame = frames[passage.face]
+        centre = np.zeros(3) if passage.face in shared else frame.inverse().apply(passage.place)
+        cosine = abs(float(inner(frame.rotation[:, 2], passage.direction)))
+        aperture = Ellipse(0.5 * width / cosine, 0.5 * width, (float(centre[0]), float(centre[1])))
+        elements.append(
+            Element(
+                f"{key}/{passage.name}",
+                _footprint(path, passage, shared),
+                plane(),
+                passage.interaction,
+                aperture,
+                solid=path,
+            )
+        )
+    inside = sum(float(norm(b.place - a.place)) for a, b in pairwise(passages))
+    return PrismParts(tuple(bodies), tuple(elements), Solid(path, material, tuple(faces)), inside, apex)
+
+
+def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
+    """Body on which a passage's element stands: the face's, or a child of it when the beam meets the face twice."""
+    own = f"{path}/{passage.face}"
+    return f"{own}/{passage.name}" if passage.face in shared else own
+
+
+def _centre(passages: list[Passage]) -> tuple[float, float, float]:
+    middle = np.mean([p.place for p in passages], axis=0)
+    return (float(middle[0]), float(middle[1]), float(middle[2]))
+
+
+def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
+    """Columns x, y, z of a face's frame: z along the normal, x where the arriving beam leans."""
+    z = normal / norm(normal)
+    lean = np.zeros(3) if direction is None else direction - inner(direction, z) * z
+    if norm(lean) < 1e-6:
+        lean = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
+        lean = lean - inner(lean, z) * z
+    x = lean / norm(lean)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def facet_block(
+    path: str, material: str, facets: Mapping[str, str], spread: tuple[float, float], height: float
+) -> Solid:
+    """The central prism: mirror facets on bodies of their own (name -> path), closed by side walls and a bottom.
+
+    The walls stand as far behind the middles of the facets as those are from the apex.
+    """
+    x, y = 2.0 * spread[0], 2.0 * spread[1]
+    walls: list[Plane] = [
+        ("wall_front", (1, 0, 0), (x, 0, 0), Coating.GROUND),
+        ("wall_back", (-1, 0, 0), (-x, 0, 0), Coating.GROUND),
+        ("wall_left", (0, 1, 0), (0, y, 0), Coating.GROUND),
+        ("wall_right", (0, -1, 0), (0, -y, 0), Coating.GROUND),
+        ("bottom", (0, 0, -1), (0, 0, -height), Coating.GROUND),
+    ]
+    faces = [Face(name, body, Coating.MIRROR) for name, body in facets.items()]
+    for name, normal, point, coating in walls:
+        faces.append(Face(name, path, coating, Pose(_axes(np.array(normal, float), None), np.array(point, float))))
+    return Solid(path, material, tuple(faces), transparent=False)

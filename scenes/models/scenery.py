@@ -1,0 +1,188 @@
+"""What stands where for the path tracer: every surface of an instrument in one perturbed state.
+
+Figure errors of mirrors and gradients of the refractive index are left out: they turn a ray by less than a microradian
+and decide nothing about stray light. So are motions of single footprints on a glass face. Bodies must stay 20 um apart
+from each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optics.geometry.aperture import Rectangle
+from optics.geometry.pose import Pose
+from optics.geometry.tree import PlacedBodies, State
+from optics.materials.finish import BLACK, Finish
+from optics.raytrace.assembly import Element, Interaction
+from scenes.models.camera_assembly import line_body
+from scenes.models.instrument_model import Instrument
+from scenes.models.scene_surface import (
+    Detector,
+    Finishes,
+    SceneSurface,
+    detector_surface,
+    mirror_surface,
+    plate_surfaces,
+    solid_surfaces,
+)
+from scenes.specs.baffle import Plate, box
+from scenes.specs.channel import BASE
+
+BOARD = 0.002
+BOARD_EDGE = 0.02
+"""How far the board stands behind the detectors, and how far it reaches beyond them, metres."""
+
+FACING_THE_LIGHT = Pose(np.diag([-1.0, 1.0, -1.0]))
+"""From a focal plane's frame, along whose +Z light arrives, to that of a detector that faces it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenery:
+    """All surfaces of a scene and its detectors; the position in ``surfaces`` is a surface's number."""
+
+    surfaces: tuple[SceneSurface, ...]
+    detectors: tuple[Detector, ...] = ()
+    _by_element: Mapping[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check the names."""
+        names = [s.name for s in self.surfaces]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"surfaces of the same name: {', '.join(twice)}")
+        known = {d.name for d in self.detectors}
+        unknown = sorted({s.detector for s in self.surfaces if s.detector is not None} - known)
+        if unknown:
+            raise ValueError(f"surfaces name unknown detectors: {', '.join(unknown)}")
+        index = {e: i for i, s in enumerate(self.surfaces) for e in s.elements}
+        object.__setattr__(self, "_by_element", index)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts, in the order of their first surfaces."""
+        return tuple(dict.fromkeys(s.part for s in self.surfaces))
+
+    def of_element(self, element: str) -> int:
+        """Number of the surface on which an element lies; KeyError when there is none."""
+        return self._by_element[element]
+
+
+def build_scenery(
+    instrument: Instrument,
+    state: State,
+    finishes: Finishes | None = None,
+    baffles: Iterable[Plate] = (),
+    whole_focal_planes: bool = False,
+) -> Scenery:
+    """Surfaces of an instrument in one state.
+
+    Args:
+        instrument: the instrument.
+        state: what is perturbed.
+        finishes: what surfaces do with light; by default those of ``Finishes``.
+        baffles: more parts than the instrument's own.
+        whole_focal_planes: make each focal plane one large detector, named ``CAMERA/focal_plane``, in the place
+            of its CCDs and its board: for light from the scene.
+    """
+    finishes = finishes or Finishes()
+    assembly = instrument.assembly
+    placed = assembly.place([state])
+    glass = [
+        surface for solid in instrument.solids for surface in solid_surfaces(solid, assembly, placed, state, finishes)
+    ]
+    on_glass = {name for surface in glass for name in surface.elements}
+    surfaces = [
+        mirror_surface(element, placed, finishes, _lit_side(instrument, element))
+        for element in assembly.elements.values()
+        if element.interaction is Interaction.REFLECT and element.name not in on_glass
+    ]
+    surfaces += glass
+    detectors: list[Detector] = []
+    for camera in instrument.cameras:
+        more, grids = _focal_plane(instrument, camera, placed, finishes, whole_focal_planes)
+        surfaces += more
+        detectors += grids
+    surfaces += plate_surfaces((*instrument.baffles, *baffles), placed)
+    return Scenery(tuple(surfaces), tuple(detectors))
+
+
+def _lit_side(instrument: Instrument, element: Element) -> float:
+    """+1 when light meets a mirror from its +z side, -1 from its -z side: where the neighbours in a sequence stand."""
+    nominal = instrument.assembly.place()
+    own = nominal.pose(element.body).inverse()
+    for names in instrument.assembly.sequences.values():
+        if element.name in names[1:]:
+            before = instrument.assembly.elements[names[names.index(element.name, 1) - 1]]
+            return float(np.sign(own.apply(_middle(before, nominal))[2] - _depth(element)))
+    return 1.0
+
+
+def _middle(element: Element, placed: PlacedBodies) -> np.ndarray:
+    x, y = (0.0, 0.0) if element.aperture is None else element.aperture.centre
+    return np.asarray(placed.pose(element.body).apply(np.array([x, y, float(element.surface.sag(x, y))])))
+
+
+def _depth(element: Element) -> float:
+    x, y = (0.0, 0.0) if element.aperture is None else element.aperture.centre
+    return float(element.surface.sag(x, y))
+
+
+def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
+    """Half the size of a focal plane's board, metres."""
+    line = instrument.cameras[camera].spec.line
+    channels = [c for c in instrument.channels if c.camera == camera]
+    half_line = 0.5 * line.pixels * line.pitch
+    x = max((abs(c.pinhole[0]) for c in channels), default=0.0)
+    return x + BOARD_EDGE, max(half_line, *(abs(c.ccd[1]) for c in channels)) + BOARD_EDGE
+
+
+def _focal_plane(
+    instrument: Instrument, camera: str, placed: PlacedBodies, finishes: Finishes, whole: bool
+) -> tuple[list[SceneSurface], list[Detector]]:
+    """Detectors of one focal plane and the board behind them."""
+    model = instrument.cameras[camera]
+    body = f"{BASE}/{camera}/focal_plane"
+    line, element = model.spec.line, f"{camera}/line"
+    channels = [c for c in instrument.channels if c.camera == camera]
+    reach_x, reach_y = _reach(instrument, camera)
+    facing = placed.pose(body) @ FACING_THE_LIGHT
+    if whole:
+        pitch = 1e-3
+        name = f"{camera}/focal_plane"
+        grid = Detector(name, round(2.0 * reach_x / pitch), round(2.0 * reach_y / pitch), (pitch, pitch))
+        return [detector_surface(grid, facing, finishes, (element,))], [grid]
+    chip = line_body(f"{BASE}/{camera}")
+    pitch = line.pitch * float(placed.size(chip)[0])
+    grids = [Detector(element, 1, line.pixels, (pitch, pitch))]
+    surfaces = [detector_surface(grids[0], placed.pose(chip) @ FACING_THE_LIGHT, finishes, (element,))]
+    ccd = instrument.spec.monitor.area_ccd
+    for channel in channels:
+        name = f"{channel.key}/area_ccd"
+        pitch = ccd.pitch * float(placed.size(channel.ccd_body)[0])
+        grid = Detector(name, ccd.columns, ccd.rows, (pitch, pitch))
+        grids.append(grid)
+        surfaces.append(detector_surface(grid, placed.pose(channel.ccd_body), finishes, (name,)))
+    board = Pose(np.eye(3), np.array([0.0, 0.0, BOARD]))
+    plate = Plate(f"{camera}/board", body, board, Rectangle(reach_x, reach_y), finishes.board)
+    return surfaces + plate_surfaces([plate], placed), grids
+
+
+def focal_plane_housing(
+    instrument: Instrument, camera: str, depth: float = 0.03, finish: Finish = BLACK
+) -> tuple[Plate, ...]:
+    """A black box around the detectors of a camera, open to the light.
+
+    Args:
+        instrument: the instrument.
+        camera: which camera.
+        depth: how far its walls stand out before the detectors, metres.
+        finish: of all sides.
+    """
+    reach_x, reach_y = _reach(instrument, camera)
+    bottom = 2.0 * BOARD
+    pose = FACING_THE_LIGHT @ Pose(np.eye(3), np.array([0.0, 0.0, -bottom]))
+    size = (2.0 * reach_x, 2.0 * reach_y, bottom + depth)
+    return box(f"{camera}/housing", f"{BASE}/{camera}/focal_plane", pose, size, finish)

@@ -1,0 +1,303 @@
+"""Heat: from temperatures of bodies to motions, deformed faces and refractive indices.
+
+A body without a temperature of its own has the field of the body that carries it. Every body is held at its mount
+(the pivot ``centre`` if there is one, else the origin) and expands freely about it; structures carry the mounts of
+what stands on them. Mirrors and prisms deform by a finite-element solution for a unit gradient along each axis, held
+at three points; the solution is linear, so that one factorisation serves all temperatures. Glass changes its index by
+dn/dT.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+
+import numpy as np
+
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose, triple
+from optics.geometry.solid import Solid, solid_mesh
+from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
+from optics.materials.glass import glass
+from optics.materials.material import Material, material
+from optics.thermal.deformation import FaceChange, face_change
+from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
+from optics.thermal.heat import Temperature, carried_motion
+from optics.thermal.thermo_elastic import ElasticBody, Kinematic
+from scenes.models.instrument_model import Instrument
+from scenes.models.meshes import THICKNESS, behind
+from scenes.specs.channel import BASE
+
+SPACING = 0.06
+"""Longest edge of the finite elements in a prism, metres. A linear field is met exactly by any mesh."""
+CELLS = 8
+"""Finite elements across a mirror."""
+TERMS = 15
+"""Zernike terms that hold a deformed face, to fourth order."""
+
+Response = Mapping[str, tuple[FaceChange, FaceChange, FaceChange]]
+"""Body of a face -> what a gradient of 1 K/m along each axis of the solid's frame does to it."""
+
+
+class TemperatureError(ValueError):
+    """A temperature that cannot be.
+
+    Attributes:
+        origin: path of the body that was given it (bodies that it carries inherit it).
+        allowed: in words.
+    """
+
+    def __init__(self, problem: str, origin: str, allowed: str) -> None:
+        super().__init__(problem)
+        self.origin, self.allowed = origin, allowed
+
+
+class ThermalModel:
+    """Temperatures of an instrument's bodies turned into a perturbed state.
+
+    Args:
+        instrument: the instrument.
+    """
+
+    def __init__(self, instrument: Instrument) -> None:
+        self.instrument = instrument
+        self.reference: float = instrument.spec.temperature
+        self._placed = instrument.assembly.place()
+        self._bodies = {body.path: body for body in instrument.assembly.tree.bodies}
+        self._solids = {solid.path: solid for solid in instrument.solids}
+        self._mirrors = {
+            f"{BASE}/{name}/{mirror}": (name, mirror)
+            for name, model in instrument.cameras.items()
+            for mirror in model.mirrors
+        }
+        self._carried: dict[str, list[Body]] = {path: [] for path in self._bodies}
+        for body in instrument.assembly.tree.bodies:
+            if body.parent:
+                self._carried[body.parent].append(body)
+        self._responses: dict[str, Response] = {}
+        self._extents: dict[str, np.ndarray] = {}
+
+    @cached_property
+    def materials(self) -> Mapping[str, Material]:
+        """Body path -> what it is made of, for all bodies but the faces of solids."""
+        named = self.instrument.spec.materials
+        out: dict[str, Material] = {}
+        for path in self._bodies:
+            parts = path.split("/")
+            if self._owner(path) not in (None, path):
+                continue
+            if path in self._solids:
+                name = self._solids[path].material
+            elif path in self._mirrors:
+                name = named.mirror
+            elif "focal_plane" in parts:
+                name = named.board if len(parts) > 3 and parts[3] != "line" else named.focal_plane
+            else:
+                name = named.base if path == BASE else named.camera
+            out[path] = material(name)
+        return out
+
+    def _owner(self, path: str) -> str | None:
+        """The solid that a body belongs to, itself or a parent."""
+        while path:
+            if path in self._solids:
+                return path
+            path = path.rpartition("/")[0]
+        return None
+
+    def fields(self, temperatures: Mapping[str, Temperature]) -> dict[str, Temperature]:
+        """Every warmed body's field in its own frame, its own or inherited."""
+        out: dict[str, Temperature] = {}
+        for path, body in self._bodies.items():
+            if path in temperatures:
+                out[path] = temperatures[path]
+            elif body.parent in out:
+                out[path] = out[body.parent].seen_from(body.pose)
+        return out
+
+    def check(self, temperatures: Mapping[str, Temperature]) -> None:
+        """Check that no body gets to 0 K, and that the indices of all glasses are known at their temperatures.
+
+        Raises:
+            TemperatureError: names the body.
+        """
+        for path, field in self.fields(temperatures).items():
+            origin = next(p for p in _upward(path) if p in temperatures)
+            if self._owner(path) not in (None, path):
+                continue
+            if not self.coldest(path, field) > 0.0:
+                raise TemperatureError(
+                    f"{path} would be at {self.coldest(path, field):.4g} K, which is not above absolute zero",
+                    origin,
+                    f"changes from the instrument's {self.reference:.6g} K that stay above 0 K everywhere on the body",
+                )
+            if path in self._solids and self._solids[path].transparent:
+                try:
+                    self._index(path, field)
+                except ValueError as error:
+                    raise TemperatureError(f"{path}: {error}", origin, "a glass with known dn/dT") from error
+
+    def coldest(self, path: str, field: Temperature) -> float:
+        """Lowest absolute temperature that a field makes on a body, kelvin: at its corners for optics, else at its
+        origin.
+        """
+        return float(self.reference + field.change + np.min(self._extent(path) @ np.array(field.gradient)))
+
+    def _extent(self, path: str) -> np.ndarray:
+        """Points of a body between which its temperature lies, (P, 3), metres; kept, since a series asks often."""
+        if path not in self._extents:
+            if path in self._solids:
+                points = solid_mesh(self._solids[path], self._placed).mesh.vertices
+            elif path in self._mirrors:
+                points = self._mirror_outline(path)
+            else:
+                points = np.zeros((1, 3))
+            self._extents[path] = np.asarray(points, np.float64)
+        return self._extents[path]
+
+    def state(
+        self,
+        temperatures: Mapping[str, Temperature],
+        motions: State | None = None,
+        progress: Callable[[str], None] = lambda path: None,
+    ) -> State:
+        """The perturbed state: thermal motions under the given other motions.
+
+        Args:
+            temperatures: body path -> field in its own frame.
+            motions: what else happens; it acts on top of the thermal motion of the same body.
+            progress: called with the path of each body whose finite-element solution begins.
+        """
+        fields = self.fields(temperatures)
+        thermal: State = {}
+        for path, field in fields.items():
+            if self._owner(path) in (None, path):
+                thermal = compose(thermal, self._warmed(path, field, progress), self._bodies)
+        return compose(thermal, motions or {}, self._bodies)
+
+    def _warmed(self, path: str, field: Temperature, progress: Callable[[str], None]) -> State:
+        """What a body's field does to the body itself, to its faces and to what it carries."""
+        body, stuff = self._bodies[path], self.materials[path]
+        pivot = _mount(body)
+        about = np.array(body.pivots[pivot])
+        gradient = np.array(field.gradient)
+        own = Motion(pivot=pivot, stretch=stuff.expansion * field.at(about))
+        bent = bool(np.any(gradient)) and stuff.expansion != 0.0
+        if path in self._solids and self._solids[path].transparent:
+            change, slope = self._index(path, field)
+            own = Motion(pivot=pivot, stretch=own.stretch, index=change, index_gradient=slope)
+        out: dict[str, Motion] = {path: own}
+        if path in self._solids or path in self._mirrors:
+            # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
+            out.update({face: Motion(stretch=own.stretch) for face in self._bodies if face.startswith(f"{path}/")})
+            if not bent:
+                return out
+            bending = {face: _superposed(units, gradient) for face, units in self._response(path, progress).items()}
+            return compose(bending, out, self._bodies)
+        for child in self._carried[path]:
+            mount = np.array(child.pivots[_mount(child)])
+            turn, move = carried_motion(stuff.expansion, gradient, child.pose.apply(mount) - about)
+            inward = child.pose.rotation.T
+            # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
+            shift = inward @ move + own.stretch * mount
+            if np.any(turn) or np.any(shift):
+                out[child.path] = Motion(rotate=triple(inward @ turn), shift=triple(shift), pivot=_mount(child))
+        return out
+
+    def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
+        """Change of index at a solid's origin, and its gradient, 1/m."""
+        kind, wavelength = glass(self._solids[path].material), self.instrument.spec.monitor.wavelength
+        if field.change == 0.0 and not any(field.gradient):
+            return 0.0, (0.0, 0.0, 0.0)
+        here = self.reference + field.change
+        change = kind.vacuum_index(wavelength, here) - kind.vacuum_index(wavelength, self.reference)
+        slope = kind.dn_dt(wavelength, here)
+        return change, triple(slope * np.array(field.gradient))
+
+    def _response(self, path: str, progress: Callable[[str], None]) -> Response:
+        if path not in self._responses:
+            progress(path)
+            solve = self._solid_response if path in self._solids else self._mirror_response
+            self._responses[path] = solve(path)
+        return self._responses[path]
+
+    def _solid_response(self, path: str) -> Response:
+        solid: Solid = self._solids[path]
+        corners = solid_mesh(solid, self._placed).mesh.vertices
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        middle, half = corners.mean(axis=0), 0.5 * (high - low)
+        # three points around the middle, 120 deg apart in the plane of the two longest sides
+        a, b = np.argsort(half)[:0:-1][:2]
+        support = middle + np.array(
+            [0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE]
+        )
+        faces = {
+            element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
+            for element in self.instrument.assembly.elements.values()
+            if self._owner(element.body) == path and element.aperture is not None
+        }
+        elastic = ElasticBody(polyhedron_mesh(corners, SPACING), self.materials[path])
+        return self._unit_gradients(path, elastic, support, faces)
+
+    def _mirror_response(self, path: str) -> Response:
+        camera, name = self._mirrors[path]
+        model = self.instrument.cameras[camera]
+        surface, aperture = model.surfaces[name], model.apertures[name]
+        side = behind(model, name)
+        outline = self._mirror_outline(path)
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        thickness = THICKNESS * float(max(high[:2] - low[:2]))
+        back = high[2] + 0.5 * thickness if side > 0 else low[2] - 0.5 * thickness
+        x, y = aperture.centre
+        radius = 0.25 * float(min(high[:2] - low[:2]))
+        support = np.array([[x + radius * c, y + radius * s, back] for c, s in _THREE])
+        elastic = ElasticBody(mirror_mesh(surface, aperture, thickness, side, CELLS), self.materials[path])
+        return self._unit_gradients(path, elastic, support, {path: (aperture, Pose())})
+
+    def _unit_gradients(
+        self, path: str, elastic: ElasticBody, support: np.ndarray, faces: Mapping[str, tuple[Aperture, Pose]]
+    ) -> Response:
+        about = self._bodies[path].pivots.get("centre", (0.0, 0.0, 0.0))
+        loads = [_unit_load(a, np.array(about)) for a in range(3)]
+        solved = elastic.solve_many(loads, Kinematic(support))
+        surfaces = {e.body: e.surface for e in self.instrument.assembly.elements.values()}
+        out = {}
+        for body, (aperture, pose) in faces.items():
+            x, y, z = (face_change(d, surfaces[body], aperture, pose, TERMS) for d in solved)
+            out[body] = (x, y, z)
+        return out
+
+    def _mirror_outline(self, path: str) -> np.ndarray:
+        camera, name = self._mirrors[path]
+        model = self.instrument.cameras[camera]
+        xy = model.apertures[name].outline()
+        return np.column_stack([xy, model.surfaces[name].sag(xy[:, 0], xy[:, 1])])
+
+
+_THREE = tuple((float(np.cos(t)), float(np.sin(t))) for t in np.radians([90.0, 210.0, 330.0]))
+
+
+def _mount(body: Body) -> str:
+    """Name of the pivot at which a body is held."""
+    return "centre" if "centre" in body.pivots else ORIGIN
+
+
+def _upward(path: str) -> Iterator[str]:
+    """The path itself, its parent, and so on."""
+    while path:
+        yield path
+        path = path.rpartition("/")[0]
+
+
+def _unit_load(axis: int, about: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    # zero at the point about which the uniform part, the body's stretch, is taken
+    return lambda points: points[:, axis] - about[axis]
+
+
+def _superposed(units: tuple[FaceChange, FaceChange, FaceChange], gradient: np.ndarray) -> Motion:
+    rotate = sum(g * np.array(u.rotate) for g, u in zip(gradient, units, strict=True))
+    shift = sum(g * np.array(u.shift) for g, u in zip(gradient, units, strict=True))
+    terms = sorted({j for u in units for j in u.figure})
+    figure = {j: float(sum(g * u.figure.get(j, 0.0) for g, u in zip(gradient, units, strict=True))) for j in terms}
+    figure = {j: a for j, a in figure.items() if a}
+    return Motion(rotate=triple(np.asarray(rotate)), shift=triple(np.asarray(shift)), figure=figure)

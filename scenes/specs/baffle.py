@@ -1,0 +1,153 @@
+"""Baffles: plates, boxes, tubes and rings, and how an instrument's file gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.pose import Pose, about_axis, rotation_matrix
+from optics.materials.finish import BLACK, Finish
+from scenes.yaml.errors import Problem
+from scenes.yaml.quantity import Quantity, Vector, Vector3
+from scenes.yaml.spec import Spec
+from scenes.yaml.units import ANGLE, LENGTH
+
+TUBE_SIDES = 24
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A flat plate of no thickness.
+
+    Attributes:
+        name: of the part it belongs to; plates of one name are one part in the results.
+        body: path of the body that carries it.
+        pose: of the plate in that body's frame.
+        outline: its edge in the plate's x, y; a ring has a hole.
+        finish: of both sides.
+    """
+
+    name: str
+    body: str
+    pose: Pose
+    outline: Circle | Rectangle
+    finish: Finish = BLACK
+
+
+def box(
+    name: str,
+    body: str,
+    pose: Pose,
+    size: tuple[float, float, float],
+    finish: Finish = BLACK,
+    open_top: bool = True,
+) -> tuple[Plate, ...]:
+    """A box whose bottom's middle is the pose's origin and whose walls rise along +z.
+
+    Args:
+        name: of the part.
+        body: path of the body that carries it.
+        pose: in that body's frame.
+        size: along x, y, z, metres.
+        finish: of all sides.
+        open_top: whether the side at +z is left open.
+    """
+    x, y, z = (0.5 * s for s in size)
+
+    def wall(axis: int, angle: float, place: tuple[float, float, float], half: tuple[float, float]) -> Plate:
+        inner = Pose(about_axis(axis, angle), np.array(place))
+        return Plate(name, body, pose @ inner, Rectangle(*half), finish)
+
+    quarter = 0.5 * np.pi
+    plates = [
+        wall(0, 0.0, (0.0, 0.0, 0.0), (x, y)),
+        wall(1, quarter, (-x, 0.0, z), (z, y)),
+        wall(1, -quarter, (x, 0.0, z), (z, y)),
+        wall(0, -quarter, (0.0, -y, z), (x, z)),
+        wall(0, quarter, (0.0, y, z), (x, z)),
+    ]
+    if not open_top:
+        plates.append(wall(0, 0.0, (0.0, 0.0, 2.0 * z), (x, y)))
+    return tuple(plates)
+
+
+def tube(
+    name: str, body: str, pose: Pose, radius: float, length: float, finish: Finish = BLACK, sides: int = TUBE_SIDES
+) -> tuple[Plate, ...]:
+    """A tube along +z from the pose's origin, open at both ends, of flat sides that touch the circle of ``radius``."""
+    half = radius * float(np.tan(np.pi / sides))
+    plates = []
+    for k in range(sides):
+        turn = about_axis(2, 2.0 * np.pi * k / sides)
+        # the plate's z points to the axis, its x along the tube
+        inner = Pose(turn @ about_axis(1, -0.5 * np.pi), turn @ np.array([radius, 0.0, 0.5 * length]))
+        plates.append(Plate(name, body, pose @ inner, Rectangle(0.5 * length, half), finish))
+    return tuple(plates)
+
+
+def ring(name: str, body: str, pose: Pose, inner: float, outer: float, finish: Finish = BLACK) -> tuple[Plate, ...]:
+    """A flat stop with a round hole; radii in metres."""
+    return (Plate(name, body, pose, Circle(outer, inner=inner), finish),)
+
+
+Size = Annotated[float, Quantity(LENGTH, above_zero=True, largest="10 m")]
+_NEEDS = {"plate": ("width", "height"), "box": ("width", "height", "length"), "tube": ("diameter", "length"),
+          "ring": ("hole", "diameter")}  # fmt: skip
+
+
+class BaffleSpec(Spec):
+    """A black mechanical part. The wave path does not see it; the path tracer, scene.glb and the picture do.
+
+    Attributes:
+        shape: plate (width x height), box (width x height x length, open at +z), tube (diameter, length, open at both
+            ends) or ring (diameter, with a round hole).
+        body: path of the body that carries it.
+        position: in that body's frame, metres: the middle of a plate, a ring, a box's bottom or a tube's lower end.
+        rotate: rotation vector in that frame, radians; plates stand square to z, boxes and tubes run along z.
+        width: along x, metres.
+        height: along y, metres.
+        length: along z, metres.
+        diameter: metres.
+        hole: diameter, metres.
+    """
+
+    shape: Literal["plate", "box", "tube", "ring"]
+    body: Annotated[str, Field(strict=True, min_length=1)]
+    position: Vector3
+    rotate: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="360 deg"))] = (0.0, 0.0, 0.0)
+    width: Size | None = None
+    height: Size | None = None
+    length: Size | None = None
+    diameter: Size | None = None
+    hole: Size | None = None
+
+    @model_validator(mode="after")
+    def _has_its_sizes(self) -> BaffleSpec:
+        for name in ("width", "height", "length", "diameter", "hole"):
+            given, needed = getattr(self, name) is not None, name in _NEEDS[self.shape]
+            if given != needed:
+                what = "needs" if needed else "has no"
+                allowed = f"for a {self.shape}: {', '.join(_NEEDS[self.shape])}"
+                raise Problem(f"a {self.shape} {what} {name}", "it" if given else "nothing", allowed, within=(name,))
+        if self.shape == "ring" and not self.hole < self.diameter:  # type: ignore[operator]
+            raise Problem(
+                "the hole is not smaller than the ring", f"{self.hole:g} m", "a smaller hole", within=("hole",)
+            )
+        return self
+
+    def plates(self, name: str) -> tuple[Plate, ...]:
+        """The part as flat plates of that name."""
+        pose = Pose(rotation_matrix(self.rotate), self.position)  # type: ignore[arg-type]
+        width, height, length = self.width or 0.0, self.height or 0.0, self.length or 0.0
+        radius = 0.5 * (self.diameter or 0.0)
+        if self.shape == "box":
+            return box(name, self.body, pose, (width, height, length))
+        if self.shape == "tube":
+            return tube(name, self.body, pose, radius, length)
+        if self.shape == "ring":
+            return ring(name, self.body, pose, 0.5 * (self.hole or 0.0), radius)
+        return (Plate(name, self.body, pose, Rectangle(0.5 * width, 0.5 * height)),)

@@ -1,0 +1,143 @@
+"""The optical prescription of a camera and its optimisation, as a file in scenes/library/cameras gives them."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.band import BandSpec
+from scenes.specs.detector import PixelPitch
+from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Wavelength
+from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text, Whole
+from scenes.yaml.units import ANGLE, LENGTH, SCALE
+
+IMAGE = "image"
+Vary = Literal["radius", "conic", "A4", "A6", "A8", "z"]
+
+
+class CameraDesignSpec(Spec):
+    """What is to be optimised.
+
+    The focal length along the line, the entrance pupil, the field and its bias stay as they are.
+
+    Attributes:
+        camera: prescription to start from, by name or path.
+        name: of the new camera.
+        description: of the new camera, for people.
+        vary: mirror, or ``image`` -> what of it varies.
+        envelope: extent along the parent axis over all mirrors and the image, relative to the start's; the largest.
+        clearance: least distance of every beam, in the plane of symmetry, from the edge of every mirror and of the
+            focal plane that it passes, metres.
+        steps: in which the envelope is brought from the start's to the goal's.
+        seed: nothing is drawn; there for the command's sake.
+    """
+
+    camera: Reference
+    name: Name
+    description: Text = ""
+    vary: Annotated[Named[tuple[Vary, ...]], Field(min_length=1)]
+    envelope: Annotated[float, Quantity(SCALE, above_zero=True, largest="200 percent")] | None = None
+    clearance: Length = 0.02
+    steps: Annotated[Whole, Field(ge=1, le=100)] = 8
+    seed: Annotated[Whole, Field(ge=0, le=0)] = 0
+
+    @model_validator(mode="after")
+    def _image_moves_only_along_z(self) -> "CameraDesignSpec":
+        for name, quantities in self.vary.items():
+            wrong = [q for q in quantities if name == IMAGE and q != "z"]
+            if wrong:
+                raise Problem("the image is a plane", wrong[0], "z", within=("vary", name))
+        return self
+
+
+FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]
+
+
+class MirrorSpec(Spec):
+    """A mirror of revolution about the parent axis.
+
+    Attributes:
+        z: vertex on the parent axis, metres; light enters toward +z.
+        radius: vertex radius of curvature, metres, positive if the centre of curvature lies toward +z.
+        conic: conic constant k.
+        aspheric: terms A4, A6, A8 of the sag beyond the conic's, 1/m^3, 1/m^5, 1/m^7; empty for a pure conic.
+    """
+
+    z: Length
+    radius: Length
+    conic: Number = 0.0
+    aspheric: AsphereTerms = Field(default_factory=FrozenMap)
+
+    @model_validator(mode="after")
+    def _is_curved(self) -> "MirrorSpec":
+        if self.radius == 0.0:
+            raise Problem("a radius of curvature cannot be zero", "0 m", "a length other than zero", within=("radius",))
+        return self
+
+
+class FieldSpec(Spec):
+    """Half angles of the field of view, radians: x along the line CCD, y across it, about the field bias."""
+
+    x: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+    y: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+
+
+class ImageSpec(Spec):
+    """The focal plane: z is where it crosses the parent axis, metres."""
+
+    z: Length
+
+
+class LineSpec(Spec):
+    """The line CCD, centred on the field bias: number of pixels and their pitch, metres."""
+
+    pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
+    pitch: PixelPitch
+
+
+class CameraSpec(Spec):
+    """An off-axis mirror camera.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        focal_length: nominal, metres; the trace tells the exact one.
+        entrance_pupil: diameter of the entrance pupil, metres.
+        field_bias: angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
+        field: half angles about the field bias.
+        wavelength: design wavelength, metres.
+        stop: name of the mirror that is the aperture stop.
+        mirrors: by name, in the order in which the light meets them.
+        image: focal plane.
+        line: line CCD.
+        bands: line CCDs by spectral band, for images of targets; empty when none is described.
+        edge_margin: by how much a mirror's clear aperture is wider than the beams that use it, metres.
+    """
+
+    name: Name
+    description: Text = ""
+    focal_length: PositiveLength
+    entrance_pupil: PositiveLength
+    field_bias: FieldAngle
+    field: FieldSpec
+    wavelength: Wavelength
+    stop: Name
+    mirrors: Annotated[Named[MirrorSpec], Field(min_length=1)]
+    image: ImageSpec
+    line: LineSpec
+    bands: Named[BandSpec] = Field(default_factory=FrozenMap)
+    edge_margin: Annotated[float, Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
+
+    @model_validator(mode="after")
+    def _stop_is_a_mirror(self) -> "CameraSpec":
+        if self.stop not in self.mirrors:
+            names = names_text(self.mirrors)
+            raise Problem(
+                "the stop is not one of the mirrors",
+                shown(self.stop),
+                names,
+                nearest(self.stop, self.mirrors),
+                ("stop",),
+            )
+        return self

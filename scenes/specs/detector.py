@@ -1,0 +1,93 @@
+"""A detector by the numbers of its EMVA 1288 data sheet, as a file in scenes/library/detectors gives it, and what
+limits its pixels.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from scenes.yaml.errors import KeyPath, Problem, names_text
+from scenes.yaml.quantity import Quantity
+from scenes.yaml.spec import Name, Number, Spec, Text, Whole
+from scenes.yaml.units import LENGTH, TIME, format_quantity
+
+AreaSide = Annotated[Whole, Field(ge=24, le=8192)]
+"""Rows or columns of an area CCD, from what a spot can be measured in on."""
+PixelPitch = Annotated[float, Quantity(LENGTH, smallest="0.5 um", largest="1 mm")]
+"""Metres; pixels smaller than the smallest that are made would be a mistaken unit."""
+LEAST_STEPS = 1.0
+"""Grey values between the dark and a full well at least."""
+
+
+class DetectorSpec(Spec):
+    """Plain numbers in the units of EMVA 1288; e stands for electrons and DN for digital numbers (grey values).
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        quantum_efficiency: electrons per photon at the wavelength it is used at.
+        system_gain_dn_per_e: DN per electron (K of EMVA 1288).
+        dark_noise_e: temporal noise in the dark without dark current, rms.
+        dark_current_e_per_s: mean dark current of a pixel.
+        full_well_e: saturation capacity.
+        prnu: photo response non-uniformity, relative rms.
+        dsnu_e: dark signal non-uniformity, rms.
+        bit_depth: of the analogue-to-digital converter; frames are stored as 16 bits.
+        offset_dn: grey value of no signal.
+    """
+
+    name: Name
+    description: Text = ""
+    quantum_efficiency: Annotated[Number, Field(gt=0.0, le=1.0)]
+    system_gain_dn_per_e: Annotated[Number, Field(gt=0.0, le=1e4)]
+    dark_noise_e: Annotated[Number, Field(ge=0.0, le=1e5)]
+    dark_current_e_per_s: Annotated[Number, Field(ge=0.0, le=1e9)]
+    full_well_e: Annotated[Number, Field(ge=1.0, le=1e9)]
+    # above 20% some responses would be negative; no image sensor is that uneven
+    prnu: Annotated[Number, Field(ge=0.0, le=0.2)]
+    dsnu_e: Annotated[Number, Field(ge=0.0, le=1e5)]
+    bit_depth: Annotated[Whole, Field(ge=1, le=16)]
+    offset_dn: Annotated[Number, Field(ge=0.0, le=65535.0)]
+
+    @model_validator(mode="after")
+    def _leaves_grey_values(self) -> "DetectorSpec":
+        most = 2**self.bit_depth - 1
+        if self.offset_dn >= most:
+            found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {most}"
+            raise Problem("no grey values are left above the offset", found, allowed, within=("offset_dn",))
+        steps = self.system_gain_dn_per_e * self.full_well_e
+        if steps < LEAST_STEPS:
+            raise Problem(
+                "a full well is not even one grey value",
+                f"{self.system_gain_dn_per_e:g}, with which a full well makes {steps:.3g} DN",
+                f"at least {LEAST_STEPS / self.full_well_e:.3g} DN per electron",
+                within=("system_gain_dn_per_e",),
+            )
+        return self
+
+    def check_exposure(self, exposure: float) -> None:
+        """See whether the dark signal leaves room for light.
+
+        Args:
+            exposure: of a frame, seconds.
+
+        Raises:
+            InputError: the dark current alone saturates the pixels.
+        """
+        limit = min(self.full_well_e, (2**self.bit_depth - 1 - self.offset_dn) / self.system_gain_dn_per_e)
+        if self.dark_current_e_per_s * exposure >= limit:
+            raise self.error(
+                "the dark current alone saturates the pixels",
+                ("dark_current_e_per_s",),
+                found=self.dark_current_e_per_s,
+                allowed=f"less than {limit / exposure:.3g} electrons per second with the exposure of"
+                f" {format_quantity(exposure, TIME)}, or a shorter exposure",
+            )
+
+
+def require_detector(setup: Spec, key: KeyPath, name: str, detectors: Mapping[str, DetectorSpec]) -> None:
+    """InputError at ``key`` unless a setup's data sheets hold that name: a config.yaml may have been changed."""
+    if name not in detectors:
+        allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
+        raise setup.error("no such detector in this file", key, found=name, allowed=allowed)

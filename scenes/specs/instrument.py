@@ -1,0 +1,229 @@
+"""An instrument: cameras on a common base with their autocollimation monitors and prisms, as its file gives it."""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from optics.materials.glass import GLASSES, glass
+from optics.materials.material import MATERIALS, material
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.baffle import BaffleSpec
+from scenes.specs.detector import AreaSide, PixelPitch
+from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
+from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, Whole, name_in
+from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE, TIME
+
+Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]
+
+
+GlassName = Annotated[str, Field(strict=True), name_in("glass", GLASSES, glass)]
+"""A glass of the catalogue in optics/materials/glass.py."""
+
+
+PRISM_180_FACES = ("window", "mirror", "roof_a", "roof_b")
+PRISM_0_FACES = ("entry", "mirror_a", "mirror_b", "exit")
+
+
+def _faces_of(known: tuple[str, ...]) -> AfterValidator:
+    """Refuse angle errors of faces that a prism does not have."""
+
+    def check(errors: dict[str, tuple[float, float]]) -> FrozenMap[str, tuple[float, float]]:
+        for name in errors:
+            if name not in known:
+                raise Problem("no such face", shown(name), names_text(known), nearest(name, known), (name,))
+        return FrozenMap(errors)
+
+    return AfterValidator(check)
+
+
+class Prism180Spec(Spec):
+    """The lateral-transfer prism: three mutually perpendicular faces send the beam back parallel to itself.
+
+    Attributes:
+        material: its glass.
+        distance: from the camera's origin to its window, along the line of sight, metres.
+        width: of the clear apertures across the beam, metres; somewhat more than the return face's.
+        tilt: turn about its own x and y from where its faces stand square to the beam, about its null point, radians.
+            It leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
+        angle_errors: face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a,
+            roof_b.
+    """
+
+    material: GlassName
+    distance: PositiveLength
+    width: PositiveLength
+    tilt: Tilt = (0.0, 0.0)
+    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, _faces_of(PRISM_180_FACES)] = Field(
+        default_factory=FrozenMap
+    )
+
+
+class Prism0Spec(Spec):
+    """The rhomboid: two parallel reflecting faces displace the beam and keep its direction.
+
+    Attributes:
+        material: its glass.
+        distance: from the return face to its centre, along the beam, metres.
+        shift: by how much it displaces the beam, toward the central prism, metres.
+        width: of the clear apertures across the beam, metres.
+        tilt: turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
+        angle_errors: face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit.
+    """
+
+    material: GlassName
+    distance: PositiveLength
+    shift: PositiveLength
+    width: PositiveLength
+    tilt: Tilt = (0.0, 0.0)
+    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, _faces_of(PRISM_0_FACES)] = Field(
+        default_factory=FrozenMap
+    )
+
+
+class CentralPrismSpec(Spec):
+    """The central prism, the common reference of all cameras: a block with one mirror facet per channel, which meet in
+    its apex.
+
+    Attributes:
+        position: of the apex in the base frame, metres.
+        material: of the block.
+        spread: how far from the apex the beams meet their facets, along the base's X and Y, metres.
+        height: of the block below the apex, metres.
+    """
+
+    position: Vector3
+    material: GlassName
+    spread: Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True, largest="10 m"), 2)]
+    height: PositiveLength
+
+
+MaterialName = Annotated[str, Field(strict=True), name_in("material", MATERIALS, material)]
+Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
+LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
+MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+MOST_FRAMES = 10_000
+Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
+
+
+class MountedCameraSpec(Spec):
+    """A camera in its place on the base.
+
+    Attributes:
+        camera: which camera, by name or path.
+        look: angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+        position: of the camera's origin in the base frame, metres.
+        pupil_offset: centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
+    """
+
+    camera: Reference
+    look: LookAngle
+    position: Vector3
+    pupil_offset: Vector2
+
+
+class ReticleSpec(Spec):
+    """The light source of a monitor channel: a lit pinhole in the focal plane.
+
+    Attributes:
+        pinhole: diameter, metres.
+        photons_per_frame: expected number of photons of one spot that reach the area CCD's plane during one exposure.
+    """
+
+    pinhole: PositiveLength
+    photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
+
+
+class AreaCcdSpec(Spec):
+    """The area CCD of a monitor channel.
+
+    Attributes:
+        detector: its data sheet, by name or path.
+        rows: number of pixel rows.
+        columns: number of pixel columns.
+        pitch: of the pixels, metres.
+        offset: (X, Y) from the pinhole to the centre of the pixel grid, in the focal plane, metres.
+        exposure: of a frame, seconds.
+    """
+
+    detector: Reference
+    rows: AreaSide
+    columns: AreaSide
+    pitch: PixelPitch
+    offset: Vector2
+    exposure: Exposure
+
+
+class ReturnFaceSpec(Spec):
+    """The mirror coating of a central prism's facet, which returns the monitor's beam and limits it: diameter,
+    metres.
+    """
+
+    aperture: PositiveLength
+
+
+class MaterialsSpec(Spec):
+    """What the parts are made of, by name in the catalogue of optics/materials/material.py; prisms name their own
+    glass.
+
+    Attributes:
+        base: the common structure.
+        camera: each camera's structure, with the monitor's brackets.
+        mirror: all mirrors.
+        focal_plane: what carries the line CCD.
+        board: what carries reticle and area CCD at each end of it.
+    """
+
+    base: MaterialName = "CFRP"
+    camera: MaterialName = "CFRP"
+    mirror: MaterialName = "Zerodur"
+    focal_plane: MaterialName = "SiC"
+    board: MaterialName = "AlN"
+
+
+class MonitorSpec(Spec):
+    """The autocollimation monitor, alike in all cameras and in both channels of each.
+
+    Attributes:
+        wavelength: of the source, metres.
+        field: angle from the visual axis at which the area CCDs stand, left at +Y and right at -Y, radians.
+        reticle: light source.
+        area_ccd: detector.
+        prism_180: the lateral-transfer prism of every channel.
+        prism_0: the rhomboid of every channel.
+        return_face: what sends the light back.
+        frames: number of frames in one measurement.
+    """
+
+    wavelength: Wavelength
+    field: MonitorField
+    reticle: ReticleSpec
+    area_ccd: AreaCcdSpec
+    prism_180: Prism180Spec
+    prism_0: Prism0Spec
+    return_face: ReturnFaceSpec
+    frames: Frames = 9
+
+
+class InstrumentSpec(Spec):
+    """Cameras on a common base, each with its monitor.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        cameras: by name; the first is the reference for the change of the intersection angle.
+        central_prism: common reference.
+        monitor: of every camera.
+        temperature: at which everything has its nominal shape, kelvin.
+        materials: what the parts are made of.
+        baffles: by name; none by default.
+    """
+
+    name: Name
+    description: Text = ""
+    cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
+    central_prism: CentralPrismSpec
+    monitor: MonitorSpec
+    temperature: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="1000 K")] = 293.15
+    materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec()
+    baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)

@@ -1,0 +1,310 @@
+"""A job: which instrument, what is perturbed, what changes with time, what is rendered and how."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
+
+from optics.geometry.zernike import MAX_NOLL
+from optics.numerics.frozen_map import FrozenMap
+from optics.thermal.heat import Temperature
+from scenes.specs.course import CourseSpec, TemperatureChange, TemperatureGradient
+from scenes.specs.instrument import Frames
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
+from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.spec import Name, NothingIsEmpty, Paths, Reference, Seed, Spec, Whole
+from scenes.yaml.units import ANGLE, LENGTH, SCALE
+
+TARGET_IMAGES = ("knife_edge", "bars", "star", "pinhole")
+"""What ``render.images`` may name beside the monitor's spots."""
+
+EdgeAngle = Annotated[float, Quantity(ANGLE, smallest="2 deg", largest="10 deg")]
+White = Annotated[float, Quantity(SCALE, smallest="0.1 percent", largest="100 percent")]
+
+
+class TargetsSpec(Spec):
+    """How the test targets are turned and exposed.
+
+    Attributes:
+        angle: of the knife edge against the pixel columns or rows, radians.
+        region: side of the recorded images, pixels.
+        white: signal of a wide bright area in each frame, as a share of the full well, through a free pupil; what
+            bodies in the beam take is missing.
+        frames: number of frames, None for as many as there are of the spots.
+    """
+
+    angle: EdgeAngle = float(np.radians(5.0))
+    region: Annotated[Whole, Field(ge=112, le=512)] = 112
+    white: White = 0.6
+    frames: Frames | None = None
+
+
+Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
+Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
+FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
+ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
+
+NO_MOTION = (0.0, 0.0, 0.0)
+DEFAULT_PIVOT = "origin"
+_TERM = re.compile(r"Z([1-9][0-9]{0,3})")
+
+
+def noll(term: str) -> int:
+    """The Noll index of a figure term: 5 for "Z5".
+
+    Raises:
+        Problem: not Z1 .. Z66.
+    """
+    match = _TERM.fullmatch(term)
+    if match is None or int(match[1]) > MAX_NOLL:
+        raise Problem("not a Zernike term", shown(term), f"Z1 .. Z{MAX_NOLL} (Noll's numbering)")
+    return int(match[1])
+
+
+def _is_term(term: str) -> str:
+    noll(term)
+    return term
+
+
+Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
+
+
+class TemperatureSpec(Spec):
+    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r.
+
+    Attributes:
+        change: at the body's origin, kelvin.
+        gradient: in the body's own frame, K/m.
+    """
+
+    change: TemperatureChange = 0.0
+    gradient: TemperatureGradient = NO_MOTION
+
+    @property
+    def field(self) -> Temperature:
+        """The field."""
+        return Temperature(self.change, self.gradient)
+
+
+def _uniform(value: Any) -> Any:
+    """`temperature: 2 K` means a uniform change."""
+    return {"change": value} if isinstance(value, str | int | float) else value
+
+
+class PerturbationSpec(Spec):
+    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and
+    for a mirror or a prism's face a figure error.
+
+    Attributes:
+        rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
+        shift: in the body's own frame, metres.
+        pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
+        figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
+        scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
+        temperature: uniform change as `2 K`, or with a gradient.
+    """
+
+    rotate: Rotation = NO_MOTION
+    shift: Shift = NO_MOTION
+    pivot: Name = DEFAULT_PIVOT
+    figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
+    scale: ScaleChange = 0.0
+    temperature: Annotated[TemperatureSpec, BeforeValidator(_uniform)] = TemperatureSpec()
+
+    def uses(self) -> tuple[str, ...]:
+        """Which of rotate, shift, figure, scale and temperature do something."""
+        done = {
+            "rotate": any(self.rotate),
+            "shift": any(self.shift),
+            "figure": any(self.figure.values()),
+            "scale": self.scale != 0.0,
+            "temperature": self.temperature != TemperatureSpec(),
+        }
+        return tuple(name for name, does in done.items() if does)
+
+
+def _some(images: tuple[str, ...]) -> tuple[str, ...]:
+    """Every image once, the spots first."""
+    if not images:
+        raise Problem("nothing to render", "an empty list", "[spots]")
+    return tuple(dict.fromkeys(("spots", *images)))
+
+
+class StraySpec(Spec):
+    """Path tracing of ghosts and stray light.
+
+    Attributes:
+        paths: from every source.
+    """
+
+    paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
+
+
+def _switch(value: Any) -> Any:
+    """`stray: true` takes the defaults, `stray: false` is none."""
+    return {True: {}, False: None}[value] if isinstance(value, bool) else value
+
+
+class RenderSpec(Spec):
+    """What is rendered.
+
+    Attributes:
+        images: which images: the monitor's spots, which are always among them, and test targets on the line CCDs.
+        targets: how the test targets are turned and exposed, None for the defaults.
+        stray: whether ghosts and stray light are path-traced and added: true, or the number of paths.
+        quality: whether wavefront errors, defocus and MTF on the line CCDs are worked out.
+        obstruction: `traced`: what prisms, baffles and other bodies take of the cameras' beams is missing in image
+            quality and targets; `ignore`: their pupils are free.
+        frames: number of frames, None for as many as the instrument's monitor takes.
+        seed: of every random number in the job.
+    """
+
+    images: Annotated[tuple[Literal["spots", "knife_edge", "bars", "star", "pinhole"], ...], AfterValidator(_some)] = (
+        "spots",
+    )
+    targets: TargetsSpec | None = None
+    stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
+    quality: Annotated[bool, Field(strict=True)] = False
+    obstruction: Literal["traced", "ignore"] = "traced"
+    frames: Frames | None = None
+    seed: Seed = 1
+
+    @model_validator(mode="after")
+    def _targets_are_rendered(self) -> "RenderSpec":
+        if self.targets is not None and not self.target_images:
+            known = ", ".join(TARGET_IMAGES)
+            raise Problem(
+                "targets are described, but none is rendered", "no target among images", known, within=("images",)
+            )
+        return self
+
+    @property
+    def obstructed(self) -> bool:
+        """Whether bodies in the cameras' beams count."""
+        return self.obstruction == "traced"
+
+    @property
+    def target_images(self) -> tuple[str, ...]:
+        """The test targets among the images, in the order of TARGET_IMAGES."""
+        return tuple(name for name in TARGET_IMAGES if name in self.images)
+
+
+class AnalysisSpec(Spec):
+    """How the images are analysed: by which method the centres of the spots are found."""
+
+    centroid: Literal["ml", "gaussian", "energy"] = "ml"
+
+
+class JobSpec(Spec):
+    """A job.
+
+    Attributes:
+        instrument: name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's
+            file.
+        perturb: node path -> perturbation; empty for the nominal state.
+        course: temperatures that change with time, None for a single state.
+        render: what is rendered.
+        analysis: how it is analysed.
+    """
+
+    instrument: Reference
+    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    course: CourseSpec | None = None
+    render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
+    analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
+
+    @model_validator(mode="after")
+    def _stray_of_one_state(self) -> "JobSpec":
+        if self.course is not None and self.render.stray is not None:
+            raise Problem(
+                "stray light is traced for one state, not for every time of a course",
+                "both course and render.stray",
+                "one of them; put the temperatures of one time under perturb",
+                within=("render", "stray"),
+            )
+        return self
+
+    def fields(self, time: int | None = None) -> dict[str, Temperature]:
+        """Node path -> change of its temperature, of the perturbation and of the course at time number ``time``."""
+        out = {path: what.temperature.field for path, what in self.perturb.items() if "temperature" in what.uses()}
+        if self.course is not None and time is not None:
+            for path, added in self.course.fields(time).items():
+                out[path] = out.get(path, Temperature()) + added
+        return out
+
+
+@dataclass(frozen=True)
+class NodeInfo:
+    """What may be done to a body of the instrument.
+
+    Attributes:
+        pivots: names of its pivots.
+        allows: which of "rotate", "shift", "figure", "scale" and "temperature".
+    """
+
+    pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
+    allows: frozenset[str] = frozenset({"rotate", "shift", "temperature"})
+
+
+def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
+    """Check that every perturbed node exists, has the named pivot and allows what is done to it.
+
+    Args:
+        job: as loaded.
+        nodes: node path -> what may be done to it, for all bodies of the instrument.
+
+    Raises:
+        InputError: one issue for each fault, with the nearest valid name.
+    """
+    issues = [
+        issue
+        for path, what in job.perturb.items()
+        for issue in perturbation_issues(job, nodes, path, what, ("perturb", path))
+    ]
+    for path in job.course.temperature if job.course is not None else ():
+        key = ("course", "temperature", path)
+        if path not in nodes:
+            issues.append(_no_such_node(job, nodes, path, key))
+        elif "temperature" not in nodes[path].allows:
+            issues.append(_not_allowed(job, nodes[path], "temperature", key))
+    if issues:
+        raise InputError(*issues)
+
+
+def perturbation_issues(
+    owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PerturbationSpec, key: KeyPath
+) -> list[Issue]:
+    """What is wrong with a perturbation of the node ``path`` that stands at ``key`` of a specification.
+
+    Args:
+        owner: the specification.
+        nodes: node path -> what may be done to it.
+        path: of the node.
+        what: is done to it.
+        key: where it is written.
+    """
+    if path not in nodes:
+        return [_no_such_node(owner, nodes, path, key)]
+    info, issues = nodes[path], []
+    for action in what.uses():
+        if action not in info.allows:
+            issues.append(_not_allowed(owner, info, action, (*key, action)))
+    if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
+        known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))
+        meant = nearest(what.pivot, known)
+        text = "this node has no such pivot"
+        issues.append(owner.issue(text, (*key, "pivot"), found=what.pivot, allowed=names_text(known), suggestion=meant))
+    return issues
+
+
+def _no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
+    meant = nearest(path, nodes)
+    return owner.issue("no such node", key, found=path, allowed=names_text(sorted(nodes)), suggestion=meant)
+
+
+def _not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
+    allowed = names_text(sorted(info.allows)) or "nothing"
+    return owner.issue(f"this node does not allow {action}", key, allowed=allowed)

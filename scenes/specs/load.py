@@ -1,0 +1,227 @@
+"""Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
+
+The library's folders are scenes/library/cameras, scenes/library/instruments, scenes/library/detectors,
+scenes/library/payloads, scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's name without
+.yaml is its name there.
+"""
+
+from pathlib import Path
+from typing import TypeVar
+
+from scenes.specs.camera import CameraDesignSpec, CameraSpec
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.distortion_test import DistortionTestSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.focus_test import CameraUnderTestSpec
+from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.job import JobSpec
+from scenes.specs.orbit_angle import OrbitAngleSpec
+from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+from scenes.specs.orbit_scene import LineImageSpec
+from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.principle_experiment import PrincipleExperimentSpec, PrincipleSetup
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.yaml.spec import Spec
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import read_yaml
+
+SpecType = TypeVar("SpecType", bound=Spec)
+
+SCENES = Path(__file__).resolve().parent.parent
+LIBRARY = SCENES / "library"
+EXAMPLES = SCENES / "examples"
+CAMERAS, INSTRUMENTS, DETECTORS = "cameras", "instruments", "detectors"
+LAB, BUDGETS, ORBIT, PAYLOADS = "lab", "budgets", "orbit", "payloads"
+
+
+def _folder(name: str) -> Path:
+    """Where the files of one kind stand."""
+    return (SCENES if name in (LAB, ORBIT) else LIBRARY) / name
+
+
+def library_names(folder: str) -> tuple[str, ...]:
+    """The names in one folder of the library ("cameras", "instruments" or "detectors"), sorted."""
+    return tuple(sorted(path.stem for path in _folder(folder).glob("*.yaml")))
+
+
+def load_job(path: str | Path) -> JobSpec:
+    """Read a job. The instrument it names is looked for, not read.
+
+    Raises:
+        InputError: the file cannot be read or is not a valid job, or there is no such instrument; one issue for each
+            fault.
+    """
+    job = validate(JobSpec, read_yaml(path))
+    instrument_path(job)
+    return job
+
+
+def instrument_path(job: JobSpec) -> Path:
+    """The file of the job's instrument.
+
+    Raises:
+        InputError: there is none, said with the line of the job's file.
+    """
+    return _find(INSTRUMENTS, job.instrument, job, ("instrument",))
+
+
+def load_error_budget(name_or_path: str | Path, relative_to: str | Path | None = None) -> ErrorBudgetSpec:
+    """Read an error budget; arguments and errors as `load_instrument`."""
+    return _load(ErrorBudgetSpec, BUDGETS, name_or_path, relative_to)
+
+
+def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = None) -> InstrumentSpec:
+    """Read an instrument. The cameras and the detector it names are looked for, not read.
+
+    Args:
+        name_or_path: a name in the library, or a path (anything with a slash or ending in .yaml or .yml).
+        relative_to: folder that a relative path starts from, the current one by default.
+
+    Raises:
+        InputError: as `load_job`.
+    """
+    instrument = _load(InstrumentSpec, INSTRUMENTS, name_or_path, relative_to)
+    paths_of_cameras(instrument)
+    path_of_detector(instrument)
+    return instrument
+
+
+def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
+    """Name in the instrument -> file of its camera. Raises InputError if there is none."""
+    return {
+        name: _find(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
+        for name, mounted in instrument.cameras.items()
+    }
+
+
+def path_of_detector(instrument: InstrumentSpec) -> Path:
+    """The file of the area CCD's data sheet. Raises InputError if there is none."""
+    return _find(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
+
+
+def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> CameraSpec:
+    """Read a camera; arguments and errors as `load_instrument`."""
+    return _load(CameraSpec, CAMERAS, name_or_path, relative_to)
+
+
+def load_detector(name_or_path: str | Path, relative_to: str | Path | None = None) -> DetectorSpec:
+    """Read a detector's data sheet; arguments and errors as `load_instrument`."""
+    return _load(DetectorSpec, DETECTORS, name_or_path, relative_to)
+
+
+def load_principle_experiment(
+    name_or_path: str | Path = "principle_experiment", relative_to: str | Path | None = None
+) -> PrincipleSetup:
+    """Read a principle experiment and the data sheet of its area CCDs; arguments and errors as `load_instrument`."""
+    spec = _load(PrincipleExperimentSpec, LAB, name_or_path, relative_to)
+    reference = spec.autocollimator.area_ccd.detector
+    detector = _find(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
+    return PrincipleSetup(spec, load_detector(detector))
+
+
+def load_turntable_test(
+    name_or_path: str | Path = "turntable", relative_to: str | Path | None = None
+) -> TurntableTestSpec:
+    """Read a turntable test; arguments and errors as `load_instrument`."""
+    return _load(TurntableTestSpec, LAB, name_or_path, relative_to)
+
+
+def load_lab_test(model: type[SpecType], name_or_path: str | Path, relative_to: str | Path | None = None) -> SpecType:
+    """Read a laboratory test of that sort; arguments and errors as `load_instrument`."""
+    return _load(model, LAB, name_or_path, relative_to)
+
+
+def load_orbit_test(model: type[SpecType], name_or_path: str | Path) -> SpecType:
+    """Read a test in orbit of that sort; arguments and errors as `load_instrument`."""
+    return _load(model, ORBIT, name_or_path, None)
+
+
+def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
+    """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
+    return _find(CAMERAS, test.camera, test, ("camera",))
+
+
+def find_turntable_test(test: DistortionTestSpec) -> Path:
+    """The file of the distortion test's turntable. Raises InputError if there is none."""
+    return _find(LAB, test.turntable, test, ("turntable",))
+
+
+def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> ThreeLineCameraSpec:
+    """Read a three-line payload; arguments and errors as `load_instrument`."""
+    return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
+
+
+def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec) -> Path:
+    """The file of the payload of a test in orbit. Raises InputError if there is none."""
+    return _find(PAYLOADS, test.camera, test, ("camera",))
+
+
+def find_orbit_camera(test: OrbitAngleSpec) -> Path:
+    """The file of the payload or instrument of a test in orbit. Raises InputError if there is none."""
+    reference, file = test.camera, test.source.file
+    for folder in (PAYLOADS, INSTRUMENTS):
+        if _candidate(folder, reference, Path(file).parent if file else Path()) is not None:
+            return _find(folder, reference, test, ("camera",))
+    payloads, instruments = library_names(PAYLOADS), library_names(INSTRUMENTS)
+    allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
+    meant = nearest(reference, (*payloads, *instruments))
+    problem = "no such name in payloads or instruments"
+    raise test.error(problem, ("camera",), found=reference, allowed=allowed, suggestion=meant)
+
+
+def load_line_detectors(camera: ThreeLineCameraSpec) -> dict[str, DetectorSpec]:
+    """Data sheets of a payload's line CCDs, by the name that the image sections give. Raises InputError as
+    `load_instrument`.
+    """
+    sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
+    sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
+    return {
+        image.detector: load_detector(_find(DETECTORS, image.detector, camera, (*key, "detector")))
+        for key, image in sections
+        if image is not None
+    }
+
+
+def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
+    """Data sheets of a camera's line CCDs, by the name that the bands give. Raises InputError as `load_instrument`."""
+    return {
+        band.detector: load_detector(_find(DETECTORS, band.detector, camera, ("bands", name, "detector")))
+        for name, band in camera.bands.items()
+    }
+
+
+def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None) -> SpecType:
+    path = _candidate(folder, name_or_path, Path(relative_to) if relative_to is not None else Path())
+    if path is None:
+        name, names = str(name_or_path), library_names(folder)
+        allowed = f"{names_text(names)}, or the path of a .yaml file"
+        raise InputError(
+            Issue(f"no such name in {folder}", found=shown(name), allowed=allowed, suggestion=nearest(name, names))
+        )
+    return validate(model, read_yaml(path))
+
+
+def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
+    """The file that a specification refers to, or an InputError at the line of the reference."""
+    file = owner.source.file
+    path = _candidate(folder, reference, Path(file).parent if file else Path())
+    if path is None:
+        names = library_names(folder)
+        allowed = f"{names_text(names)}, or the path of a .yaml file"
+        raise owner.error(
+            f"no such name in {folder}", key, found=reference, allowed=allowed, suggestion=nearest(reference, names)
+        )
+    if not path.is_file():
+        raise owner.error(f"no such file: {path}", key)
+    return path
+
+
+def _candidate(folder: str, name_or_path: str | Path, base: Path) -> Path | None:
+    """Where a reference leads: a library file that exists, a path that may not, or None for an unknown name."""
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
+        return base / text
+    path = _folder(folder) / f"{text}.yaml"
+    return path if text in library_names(folder) else None

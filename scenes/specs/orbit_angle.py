@@ -1,0 +1,183 @@
+"""The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from scenes.specs.job import PerturbationSpec
+from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, OrbitSpec
+from scenes.yaml.errors import Problem
+from scenes.yaml.quantity import Quantity, Vector, Wavelength
+from scenes.yaml.spec import Name, Named, Number, Paths, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.units import DISTANCE, LENGTH, MOMENT, format_quantity
+
+LINES = ("forward", "nadir", "aft")
+"""The three lines of paper 000."""
+PAPER_ANGLES = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
+"""Its angles: name -> the two lines that it lies between."""
+LEAST_POINTS = 3
+
+Moment = Annotated[float, Quantity(MOMENT, largest="240 h")]
+GroundSigma = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 km")]
+DatumShift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="1 km"))]
+TerrainHeight = Annotated[float, Quantity(LENGTH, smallest="-500 m", largest="9 km")]
+Relief = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="2 km")]
+ReliefLength = Annotated[float, Quantity(DISTANCE, smallest="10 m", largest="1000 km")]
+Points = Annotated[Whole, Field(le=2000)]
+Passes = Annotated[Whole, Field(ge=2, le=5000)]
+Flag = Annotated[bool, Field(strict=True)]
+
+
+def _turn(value: Any) -> Any:
+    """`[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
+    return {"rotate": value} if isinstance(value, list) else value
+
+
+Change = Annotated[PerturbationSpec, BeforeValidator(_turn)]
+
+
+def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:
+    if angles is not None and not angles:
+        raise Problem("no angles", "an empty mapping", "alpha: [forward, nadir], or nothing for the usual ones")
+    for name, (first, second) in (angles or {}).items():
+        if first == second:
+            problem = "a line makes no angle with itself"
+            raise Problem(problem, f"{first} twice", "two different lines", within=(name,))
+    return angles
+
+
+Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
+
+
+def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
+    """Angles of a camera whose test names none: the paper's, or that of a camera of two lines; None for others."""
+    if set(LINES) <= set(lines):
+        return PAPER_ANGLES
+    return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
+
+
+class StripsSpec(Spec):
+    """Ground points on what each line sees at the moment of exposure, evenly spaced along the line.
+
+    Places are pixels, counted from 0, of the camera's usual line: one with the payload's own number of pixels, or an
+    instrument's first line. On a line with more or fewer pixels they stand at the same share of its length.
+
+    Attributes:
+        points: on each strip, three or more.
+        first: place of the first point on the line.
+        last: place of the last point.
+    """
+
+    points: Points
+    first: Number
+    last: Number
+
+    @model_validator(mode="after")
+    def _is_a_strip(self) -> "StripsSpec":
+        if self.points < LEAST_POINTS:
+            found = f"{self.points} on each strip"
+            allowed = f"{LEAST_POINTS} or more; paper 000 asks for n >= {LEAST_POINTS}"
+            problem = "too few points to fit a plane"
+            raise Problem(problem, found, allowed, within=("points",))
+        if not self.first < self.last:
+            found = f"first {self.first:g}, last {self.last:g}"
+            raise Problem("the strip has no length", found, "a last pixel after the first", within=("last",))
+        return self
+
+
+class TerrainSpec(Spec):
+    """Heights of the ground points above the ellipsoid.
+
+    Attributes:
+        height: mean, metres.
+        relief: standard deviation about it, metres.
+        length: along the strip over which heights are alike (correlation exp(-(distance/length)^2/2)), metres.
+    """
+
+    height: TerrainHeight = 0.0
+    relief: Relief = 0.0
+    length: ReliefLength = 5e3
+
+
+class EffectsSpec(Spec):
+    """What happens to the light between ground and camera.
+
+    Attributes:
+        light_time: the Earth turns while the light is under way.
+        aberration: the satellite's velocity tilts what it sees.
+        refraction: the standard atmosphere bends the light.
+        wavelength: in vacuum, for the refraction, metres.
+        corrected: the analysis takes the effects that are on out of the ground points, by its models of them.
+    """
+
+    light_time: Flag = True
+    aberration: Flag = True
+    refraction: Flag = True
+    wavelength: Wavelength = 650e-9
+    corrected: Flag = True
+
+
+class AngleErrorsSpec(Spec):
+    """Errors of what is measured.
+
+    Attributes:
+        station: standard deviation of each coordinate of the measured orbit, metres.
+        points: standard deviation of each coordinate of a ground point, matching and aerial triangulation together,
+            metres.
+        datum: shift that all ground points share, east, north and up, unknown to the analysis, metres.
+    """
+
+    station: GroundSigma = 0.5
+    points: GroundSigma = 1.5
+    datum: DatumShift = (0.0, 0.0, 0.0)
+
+
+class OrbitAngleSpec(Spec):
+    """The intersection angles of a camera of two or more lines from one moment's ground points.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or scenes/library/instruments, or path of a file of either sort. The
+            lines of a payload are ideal projections, those of an instrument are traced, one for each of its cameras.
+        angles: name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir, aft]
+            where the camera has these lines, or alpha between the lines of a camera that has two.
+        changes: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
+            vector in body axes, for an instrument node path -> perturbation as in a job.
+        earth: its rotation.
+        orbit: true orbit.
+        attitude: true attitude.
+        time: moment of exposure, seconds from the orbit's epoch.
+        strips: where the points lie.
+        terrain: their heights.
+        effects: on the light.
+        errors: of the measured station and points.
+        passes: how often the measurement is repeated with errors drawn anew, for the scatter.
+        seed: of every random number.
+    """
+
+    name: Name
+    description: Text = ""
+    camera: Reference
+    angles: Angles = None
+    changes: Paths[Change] = Field(default_factory=dict, validate_default=True)
+    earth: EarthSpec = EarthSpec()
+    orbit: OrbitSpec
+    attitude: AttitudeSpec = AttitudeSpec()
+    time: Moment = 0.0
+    strips: StripsSpec
+    terrain: TerrainSpec = TerrainSpec()
+    effects: EffectsSpec = EffectsSpec()
+    errors: AngleErrorsSpec = AngleErrorsSpec()
+    passes: Passes = 200
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _is_in_the_orbit(self) -> "OrbitAngleSpec":
+        first, last = -self.orbit.before, self.orbit.after
+        if not first < self.time < last:
+            allowed = f"between {format_quantity(first, MOMENT)} and {format_quantity(last, MOMENT)}, or a longer orbit"
+            found = format_quantity(self.time, MOMENT)
+            raise Problem("outside the orbit data", found, allowed, within=("time",))
+        return self

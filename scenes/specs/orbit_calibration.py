@@ -1,0 +1,344 @@
+"""In-orbit calibration of a three-line camera over test fields, with cameras that may drift, as its file gives it."""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, model_validator
+
+from scenes.specs.orbit_angle import LINES, DatumShift, EffectsSpec, Flag, GroundSigma, Relief, TerrainHeight
+from scenes.specs.orbit_scene import ControlSpec, GroundSpec, ImagePointsSpec
+from scenes.specs.orbit_spec import AngleSigmas, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
+from scenes.yaml.errors import Problem, names_text, nearest
+from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, TIME
+
+LEAST_TIES = 20
+"""Tie points of a strip. Fewer leave most readings of the attitude without a point near them."""
+
+FocalSigma = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="5 mm")]
+ReadingFocal = Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")]
+ReadingAngles = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
+StripLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="1000 km")]
+
+
+class CameraDriftSpec(Spec):
+    """How much a line camera changes from field to field, one standard deviation.
+
+    Attributes:
+        angles: d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
+        focal_length: d_f of the principal distance, metres.
+    """
+
+    angles: AngleSigmas = (0.0, 0.0, 0.0)
+    focal_length: FocalSigma = 0.0
+
+
+class MonitorReadingSpec(Spec):
+    """Standard deviation of what the on-board monitor reads of each line camera in each pass.
+
+    Attributes:
+        angles: of d_alpha, d_beta and d_gamma, radians.
+        focal_length: of d_f, metres.
+    """
+
+    angles: ReadingAngles
+    focal_length: ReadingFocal
+
+
+class StripSpec(Spec):
+    """Every pass is adjusted on its tie points before check points are intersected.
+
+    Attributes:
+        ties: how many tie points are drawn; measured points of images are used as they come.
+        length: of the strip along the track on which they lie, around the field, metres.
+    """
+
+    ties: Annotated[Whole, Field(le=5000)] = 500
+    length: StripLength = 300e3
+
+    @model_validator(mode="after")
+    def _are_enough(self) -> "StripSpec":
+        if self.ties < LEAST_TIES:
+            raise Problem("too few tie points", f"{self.ties}", f"{LEAST_TIES} or more", within=("ties",))
+        return self
+
+
+def _of_lines(drift: Named[CameraDriftSpec]) -> Named[CameraDriftSpec]:
+    for name in drift:
+        if name not in LINES:
+            raise Problem("no such line", name, names_text(LINES), nearest(name, LINES), within=(name,))
+    return drift
+
+
+CameraDrifts = Annotated[Named[CameraDriftSpec], AfterValidator(_of_lines)]
+
+
+LEAST_POINTS = 6
+"""Control points of a field. Three points in three lines give 18 conditions for 12 unknowns, but on a field of a few
+points one wrong one cannot be told."""
+
+LEAST_PATCHES = 2
+"""Patches of a field. One has no width, and the principal distance is open."""
+
+InteriorChange = Annotated[float, Quantity(LENGTH, largest="5 mm")]
+PointChange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)]
+FieldAltitude = Annotated[float, Quantity(DISTANCE, smallest="150 km", largest="2000 km")]
+FieldLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="500 km")]
+FieldSpan = Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")]
+TrackPlace = Annotated[float, Quantity(DISTANCE, largest="200 km")]
+Side = Annotated[Whole, Field(ge=16, le=20_000)]
+LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
+Count = Annotated[Whole, Field(le=5000)]
+Repeats = Annotated[Whole, Field(ge=0, le=1000)]
+
+
+class InteriorChangeSpec(Spec):
+    """How the interior orientation of a line has changed since the laboratory.
+
+    Attributes:
+        focal_length: change of the principal distance, metres.
+        principal_point: change of x (flight) and y (along the line), metres.
+    """
+
+    focal_length: InteriorChange = 0.0
+    principal_point: PointChange = (0.0, 0.0)
+
+
+class FieldSpec(Spec):
+    """A test field and the pass over it.
+
+    Attributes:
+        latitude, longitude: of its middle, which the satellite passes at the epoch, radians.
+        epoch: UTC of the pass.
+        height: mean of the ground above the ellipsoid, metres.
+        relief: heights lie evenly within this on either side of the mean, metres.
+    """
+
+    latitude: Latitude
+    longitude: Longitude
+    epoch: UtcTime
+    height: TerrainHeight = 0.0
+    relief: Relief = 0.0
+
+
+class PointsSpec(Spec):
+    """Ground points of every field, at random places of the nadir line's image; all three lines see each of them.
+
+    Attributes:
+        control: points that are used for the calibration.
+        check: points that only test it.
+        first, last: ends of the part of the nadir line that they lie on, pixels from 0.
+        length: of the field along the track, metres.
+    """
+
+    control: Count = 60
+    check: Annotated[Count, Field(ge=2)] = 100
+    first: Number
+    last: Number
+    length: FieldLength = 50e3
+
+    @model_validator(mode="after")
+    def _are_enough(self) -> "PointsSpec":
+        if self.control < LEAST_POINTS:
+            found = f"{self.control} control points"
+            raise Problem("too few points to calibrate", found, f"{LEAST_POINTS} or more", within=("control",))
+        if not self.first < self.last:
+            found = f"first {self.first:g}, last {self.last:g}"
+            raise Problem("the field has no width", found, "a last pixel after the first", within=("last",))
+        return self
+
+
+class PatchPlaceSpec(Spec):
+    """Where a patch of ground lies.
+
+    Attributes:
+        pixel: of the nadir line that sees its middle.
+        track: of its middle from the field's middle, metres along the flight.
+    """
+
+    pixel: Number
+    track: TrackPlace = 0.0
+
+
+class CalibrationImagesSpec(Spec):
+    """Patches of every field whose images are rendered and measured, instead of drawn image points.
+
+    Attributes:
+        patches: of every field.
+        lines, pixels: size of every image.
+        ground: what is there. The terrain's height is the field's; a real terrain is another part of the model in each
+            patch.
+        control: orthophoto and elevation model. Their errors are drawn for each patch; a shift is common to all.
+        points: of every patch. What its `control` and `height_sigma` say is taken for the accuracy of the reference.
+        oversampling: samples of the ground along each side of a pixel.
+    """
+
+    patches: tuple[PatchPlaceSpec, ...]
+    lines: Side = 500
+    pixels: Side = 500
+    ground: GroundSpec = GroundSpec()
+    control: ControlSpec = ControlSpec()
+    points: ImagePointsSpec = ImagePointsSpec()
+    oversampling: Annotated[Whole, Field(ge=2, le=8)] = 3
+
+    @model_validator(mode="after")
+    def _are_enough(self) -> "CalibrationImagesSpec":
+        if len(self.patches) < LEAST_PATCHES:
+            found = f"{len(self.patches)}"
+            problem = "too few patches to tell focal length from attitude"
+            raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
+        if self.points.control < 1 or self.points.check < 1:
+            found = f"control {self.points.control}, check {self.points.check}"
+            raise Problem(
+                "a calibration needs control and check points", found, "1 or more of each", within=("points",)
+            )
+        return self
+
+
+class CalibrationErrorsSpec(ErrorsSpec):
+    """Errors of what is measured. The star trackers' bias is the change of the angle between them and the cameras since
+    the laboratory.
+
+    Attributes:
+        gps: of the orbit.
+        star_tracker: of the attitude.
+        season: standard deviation of a further constant bias of each field about body X, Y, Z, radians.
+        image: standard deviation of an image point in x and in y, pixels.
+        control: standard deviation of each coordinate of a control point, metres.
+        datum: shift that the coordinates of all control points share, east, north and up, unknown to the analysis,
+            metres. Check points are given in the right datum.
+        switched_on: false for exact image points, control points and orbit, and an attitude with its biases only.
+    """
+
+    season: AngleSigmas = (0.0, 0.0, 0.0)
+    image: Annotated[Number, Field(ge=0, le=10)] = 0.3
+    control: GroundSigma = 1.0
+    datum: DatumShift = (0.0, 0.0, 0.0)
+    switched_on: Flag = True
+
+
+class LaunchSpec(Spec):
+    """How much a launch may change, one standard deviation. The adjustment does not use it; an estimate far beyond it
+    is a sign of wrong ground coordinates or of a wrong camera file, which the fit alone does not show.
+
+    Attributes:
+        bias: angle between star trackers and cameras about body X, Y, Z, radians.
+        interior: principal distances and principal points, metres.
+    """
+
+    bias: AngleSigmas = (2e-4, 2e-4, 2e-4)
+    interior: Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")] = 100e-6
+
+
+class MapLimitsSpec(Spec):
+    """Largest RMS errors without ground control that a map at a scale of 1:50 000 allows.
+
+    Attributes:
+        plan: both axes together, metres; 25 m is 0.5 mm on the map.
+        height: metres.
+    """
+
+    plan: Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")] = 25.0
+    height: Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")] = 6.0
+
+
+def _some_fields(fields: Named[FieldSpec]) -> Named[FieldSpec]:
+    if not fields:
+        raise Problem("no fields", "an empty mapping", "at least one test field")
+    return fields
+
+
+class OrbitCalibrationSpec(Spec):
+    """A calibration over several fields, tested on all of them without ground control.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file, with lines forward, nadir and aft.
+        changes: line -> how its interior has changed since the laboratory. The nadir line's principal point is the
+            gauge and does not change: it cannot be told from a turn of the whole camera, `errors.star_tracker.bias`.
+        earth: its rotation.
+        altitude: of the descending sun-synchronous orbit over each field, metres.
+        span: how long the orbit is followed before and after the field's middle, seconds.
+        line_time: from one image line to the next, seconds.
+        attitude: true attitude.
+        fields: by name.
+        schemes: scheme -> fields whose parameters are averaged for it. One more, by the next number, lets each field
+            use its own.
+        points: of every field, drawn; None where images are measured.
+        images: rendered and measured instead of drawn points.
+        effects: on the light.
+        errors: of what is measured.
+        drift: line -> how its camera changes from field to field.
+        monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
+        strip: tie points for an adjustment of every pass; None for none.
+        launch: how much of a change is no surprise.
+        limits: for the verdict.
+        repeats: campaigns over the same fields with everything drawn anew, for how often the paper's finding holds.
+        seed: of every random number.
+    """
+
+    name: Name
+    description: Text = ""
+    camera: Reference
+    changes: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
+    earth: EarthSpec = EarthSpec()
+    altitude: FieldAltitude = 500e3
+    span: FieldSpan = 60.0
+    line_time: LineTime = 0.7e-3
+    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    fields: Annotated[Named[FieldSpec], AfterValidator(_some_fields)]
+    schemes: tuple[tuple[Name, ...], ...]
+    points: PointsSpec | None = None
+    images: CalibrationImagesSpec | None = None
+    effects: EffectsSpec = EffectsSpec()
+    errors: CalibrationErrorsSpec = CalibrationErrorsSpec()
+    drift: CameraDrifts = Field(default_factory=dict, validate_default=True)
+    monitor: MonitorReadingSpec | None = None
+    strip: StripSpec | None = None
+    launch: LaunchSpec = LaunchSpec()
+    limits: MapLimitsSpec = MapLimitsSpec()
+    repeats: Repeats = 0
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _has_points(self) -> "OrbitCalibrationSpec":
+        if (self.points is None) == (self.images is None):
+            found = "neither" if self.points is None else "both"
+            problem = "points are drawn or measured in images"
+            raise Problem(problem, found, "`points:` or `images:`", within=("points",))
+        if self.images is not None and self.repeats:
+            problem = "campaigns from images are not repeated, for each is rendered anew"
+            raise Problem(problem, str(self.repeats), "0", within=("repeats",))
+        return self
+
+    @model_validator(mode="after")
+    def _can_be_compared(self) -> "OrbitCalibrationSpec":
+        if self.monitor is not None and not self.drift:
+            allowed = "a section `drift:`, with sigmas of zero for cameras that keep"
+            raise Problem("a monitor, but nothing that it reads", None, allowed, within=("monitor",))
+        if self.drift and self.images is not None:
+            problem = (
+                "cameras that drift are compared on drawn points only, for images would be rendered for every size"
+            )
+            raise Problem(problem, None, "`points:` instead of `images:`", within=("drift",))
+        errors = self.errors
+        noise = (*errors.star_tracker.noise, *errors.star_tracker.slow.noise, *errors.gps.noise)
+        if self.strip is not None and not (errors.switched_on and any(noise)):
+            problem = "a strip adjustment without noise of attitude or orbit has nothing to adjust"
+            raise Problem(problem, None, "errors.star_tracker.noise or slow", within=("strip",))
+        return self
+
+    @model_validator(mode="after")
+    def _schemes_name_fields(self) -> "OrbitCalibrationSpec":
+        if not self.schemes:
+            raise Problem("no schemes", "an empty list", "at least one list of fields", within=("schemes",))
+        for scheme in self.schemes:
+            for name in scheme:
+                if name not in self.fields:
+                    hint = nearest(name, self.fields)
+                    raise Problem("no such field", name, names_text(tuple(self.fields)), hint, within=("schemes",))
+            if not scheme or len(set(scheme)) != len(scheme):
+                found = names_text(scheme) or "none"
+                raise Problem("a scheme without fields, or with one twice", found, "each once", within=("schemes",))
+        return self

@@ -1,0 +1,289 @@
+"""What a line camera in orbit sees, what is known of it, and which points are measured in its images."""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
+
+from optics.geometry.polygon import area, hull, intersect, sides
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.band import Diffusion, Spectrum, TdiSpec
+from scenes.yaml.errors import Problem
+from scenes.yaml.quantity import Quantity, Vector, Wavelength
+from scenes.yaml.spec import Number, Reference, Spec, Whole
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+
+_EVEN_TERMS = ("Z4", "Z5", "Z6", "Z11", "Z12", "Z13", "Z14", "Z15", "Z22")
+
+
+def _is_even(term: str) -> str:
+    if term not in _EVEN_TERMS:
+        allowed = f"{', '.join(_EVEN_TERMS)}; the others shift the image, which the interior orientation tells"
+        raise Problem("not a wavefront term of a line", term, allowed)
+    return term
+
+
+EvenTerm = Annotated[str, AfterValidator(_is_even), WithJsonSchema({"type": "string", "enum": list(_EVEN_TERMS)})]
+TermSize = Annotated[float, Quantity(LENGTH, largest="1 um")]
+SceneHeight = Annotated[float, Quantity(LENGTH, smallest="-500 m", largest="9 km")]
+SceneRelief = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="3 km")]
+Spacing = Annotated[float, Quantity(LENGTH, smallest="0.1 m", largest="1 km")]
+GroundLength = Annotated[float, Quantity(LENGTH, smallest="1 m", largest="100 km")]
+GroundError = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 km")]
+Shift2 = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="1 km"), 2)]
+Share = Annotated[Number, Field(ge=0.0, le=1.0)]
+Flag = Annotated[bool, Field(strict=True)]
+Azimuth = Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="360 deg")]
+Elevation = Annotated[float, Quantity(ANGLE, smallest="5 deg", largest="90 deg")]
+
+
+Corner = tuple[Annotated[Number, Field(ge=-10.0, le=10.0)], Annotated[Number, Field(ge=-10.0, le=10.0)]]
+
+
+def _is_convex(outline: tuple[Corner, ...]) -> tuple[Corner, ...]:
+    corners = np.array(outline, float)
+    if (
+        len(corners) < 3
+        or abs(area(corners)) < _SMALLEST
+        or abs(area(hull(corners[None]))[0]) > abs(area(corners)) * (1.0 + 1e-9)
+    ):
+        allowed = "three corners or more, in order, of a convex polygon; give others as several"
+        raise Problem("not a convex polygon", str([list(corner) for corner in outline]), allowed)
+    return outline
+
+
+Outline = Annotated[tuple[Corner, ...], AfterValidator(_is_convex)]
+_SMALLEST = 1e-9
+
+
+def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...], ...]:
+    """Every polygon by itself, and some of the pupil left."""
+    shapes = [np.array(outline, float)[None] for outline in outlines]
+    shapes = [shape if area(shape)[0] > 0.0 else shape[:, ::-1] for shape in shapes]
+    for k, one in enumerate(shapes):
+        for other in shapes[:k]:
+            if abs(area(intersect(one, *sides(other)))[0]) > _SMALLEST:
+                raise Problem("outlines overlap", "", "polygons that do not overlap")
+    turn = 2.0 * np.pi * np.arange(64) / 64
+    disk = np.stack([np.cos(turn), np.sin(turn)], axis=-1)[None]
+    if sum(float(area(intersect(shape, *sides(disk)))[0]) for shape in shapes) > 0.9 * np.pi:
+        raise Problem("the pupil is covered", "", "outlines that leave a tenth of it")
+    return outlines
+
+
+class LineImageSpec(Spec):
+    """How a line forms and records its image.
+
+    Attributes:
+        f_number: of the lens, whose pupil is round and evenly lit.
+        transmission: of the lens, mean over the spectrum.
+        wavefront: error by even Zernike terms (Noll, unit rms), metres.
+        obstruction: outlines of what stands before the lens, convex polygons that do not overlap, corners (along the
+            line, along the track) in units of the pupil's radius.
+        spectrum: first and last wavelength, metres; the light is the Sun's between them.
+        detector: data sheet, by name or path.
+        diffusion: rms spread of charge between pixels, metres.
+        tdi: how the line collects light; its line time is that of the image.
+    """
+
+    f_number: Annotated[Number, Field(ge=1.0, le=100.0)]
+    transmission: Annotated[Number, Field(gt=0.0, le=1.0)] = 0.8
+    wavefront: Annotated[dict[EvenTerm, TermSize], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
+    obstruction: Annotated[tuple[Outline, ...], AfterValidator(_apart)] = ()
+    spectrum: Spectrum
+    detector: Reference
+    diffusion: Diffusion = 0.0
+    tdi: TdiSpec = TdiSpec()
+
+    @model_validator(mode="after")
+    def _spectrum_rises(self) -> "LineImageSpec":
+        first, last = self.spectrum
+        if not first < last:
+            found = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
+            raise Problem("the spectrum is empty", found, "[shortest, longest]", within=("spectrum",))
+        return self
+
+
+class TerrainSpec(Spec):
+    """Heights of the ground above the ellipsoid.
+
+    Attributes:
+        kind: `real`: the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc seconds),
+            mirrored beyond its edges of 30 km x 32 km; `fractal`: drawn.
+        height: mean height, metres.
+        relief: rms of the heights about their mean, metres; for `real` none keeps the heights' own, 121 m.
+        exponent: of a fractal's amplitude spectrum over frequency; larger is smoother.
+        post: of a fractal's posts, metres; between posts the terrain is a cubic spline.
+        longest: wavelength above which a fractal has no more relief, metres.
+        offset: east and north of the patch's centre from the real model's middle, metres.
+    """
+
+    kind: Literal["real", "fractal"] = "real"
+    height: SceneHeight = 500.0
+    relief: SceneRelief | None = None
+    exponent: Annotated[Number, Field(ge=1.0, le=4.0)] = 2.2
+    post: Spacing = 30.0
+    longest: GroundLength = 6000.0
+    offset: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="1000 km"), 2)] = (0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _fractal_has_relief(self) -> "TerrainSpec":
+        if self.kind == "fractal" and self.relief is None:
+            raise Problem(
+                "a fractal terrain without relief", None, "the rms of its heights, '80 m'", within=("relief",)
+            )
+        return self
+
+
+class TextureSpec(Spec):
+    """Reflectance of the ground.
+
+    Attributes:
+        spacing: of the reflectance's cells, metres; the field is a cubic B-spline of them and holds nothing finer.
+        mean: reflectance.
+        contrast: rms of the reflectance over its mean.
+        fields: share of the ground that is fields; the rest varies as a fractal.
+        field_size: side of a field of mean area, metres.
+        roads: metres from one road to the next.
+    """
+
+    spacing: Spacing = 2.0
+    mean: Annotated[Number, Field(ge=0.01, le=0.9)] = 0.18
+    contrast: Annotated[Number, Field(ge=0.0, le=0.6)] = 0.3
+    fields: Share = 0.6
+    field_size: GroundLength = 140.0
+    roads: GroundLength = 1500.0
+
+
+class LightSpec(Spec):
+    """The Sun and the air.
+
+    Attributes:
+        elevation: of the Sun, radians.
+        azimuth: of the Sun, from north over east, radians.
+        transmission: of the air, down and up together.
+        sky: share of the light on level ground that comes evenly from the sky.
+        path: light scattered by the air into the camera, as the reflectance that would give it.
+    """
+
+    elevation: Elevation = math.radians(50.0)
+    azimuth: Azimuth = math.radians(145.0)
+    transmission: Annotated[Number, Field(gt=0.0, le=1.0)] = 0.7
+    sky: Share = 0.15
+    path: Annotated[Number, Field(ge=0.0, le=0.5)] = 0.04
+
+
+class LightEffectsSpec(Spec):
+    """What happens to the light between ground and camera.
+
+    Attributes:
+        light_time: the Earth turns while the light is under way.
+        aberration: the satellite's velocity tilts what it sees.
+        refraction: the standard atmosphere bends the light.
+        wavelength: in vacuum, for the refraction, metres.
+    """
+
+    light_time: Flag = True
+    aberration: Flag = True
+    refraction: Flag = True
+    wavelength: Wavelength = 650e-9
+
+
+class GroundSpec(Spec):
+    """The true ground, on the day of the pass.
+
+    Attributes:
+        terrain: heights.
+        texture: reflectance.
+        light: Sun and air.
+    """
+
+    terrain: TerrainSpec = TerrainSpec()
+    texture: TextureSpec = TextureSpec()
+    light: LightSpec = LightSpec()
+
+
+class DemSpec(Spec):
+    """A reference elevation model.
+
+    Attributes:
+        post: distance of its posts, metres.
+        sigma: standard deviation of a height, metres.
+        correlation: distance over which the heights' errors are alike, metres.
+    """
+
+    post: Spacing = 25.0
+    sigma: GroundError = 2.0
+    correlation: GroundLength = 200.0
+
+
+class ControlSpec(Spec):
+    """The control source: an orthophoto of another date with a reference elevation model; both share one error in plan.
+
+    Attributes:
+        spacing: ground sample distance of the orthophoto, metres.
+        mtf: of the orthophoto at its Nyquist frequency.
+        noise: of the orthophoto, rms, in reflectance.
+        changed: share of the fields that look different on its date.
+        light: of its date.
+        shift: constant error in plan, east and north, metres.
+        sigma: standard deviation of a smooth error in plan, each axis, metres.
+        correlation: distance over which that error changes, metres.
+        dem: elevation model.
+    """
+
+    spacing: Spacing = 2.0
+    mtf: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.2
+    noise: Annotated[Number, Field(ge=0.0, le=0.2)] = 0.004
+    changed: Share = 0.15
+    light: LightSpec = LightSpec.model_validate({"elevation": "60 deg", "azimuth": "160 deg"})
+    shift: Shift2 = (0.0, 0.0)
+    sigma: GroundError = 0.5
+    correlation: GroundLength = 5000.0
+    dem: DemSpec = DemSpec()
+
+
+LEAST_TEMPLATE = 13
+"""Pixels: a margin of 3 on either side leaves least squares matching 7."""
+
+
+def _is_odd(side: int) -> int:
+    if side % 2 == 0:
+        raise Problem("a template needs a middle pixel", str(side), "an odd number of pixels")
+    return side
+
+
+class ImagePointsSpec(Spec):
+    """Points measured in images.
+
+    Attributes:
+        control: points of the orthophoto that are sought in every line.
+        check: more of them, kept apart to test with.
+        tie: points of the nadir line's image that are sought in the others.
+        reach: how far the predicted place may be off, pixels and lines.
+        template: its side, pixels.
+        least_correlation: of image and template after the fit.
+        largest_sigma: of a place along its worst direction, pixels.
+        height_sigma: of the reference heights, as their producer states it, metres.
+        roughness: rms by which noise of the attitude bends the displacement over a patch, pixels: neighbours within it
+            do not contradict each other.
+        false_alarm: share of right matches that consensus may take for wrong.
+    """
+
+    control: Annotated[Whole, Field(ge=0, le=2000)] = 60
+    check: Annotated[Whole, Field(ge=0, le=2000)] = 0
+    tie: Annotated[Whole, Field(ge=0, le=2000)] = 0
+    reach: Annotated[Whole, Field(ge=2, le=200)] = 40
+    template: Annotated[Whole, Field(ge=LEAST_TEMPLATE, le=101), AfterValidator(_is_odd)] = 31
+    least_correlation: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.6
+    largest_sigma: Annotated[Number, Field(gt=0.0, le=2.0)] = 0.2
+    height_sigma: GroundError = 2.0
+    roughness: Annotated[Number, Field(ge=0.0, le=10.0)] = 0.15
+    false_alarm: Annotated[Number, Field(gt=0.0, lt=0.5)] = 1e-3
+
+    @model_validator(mode="after")
+    def _are_some(self) -> "ImagePointsSpec":
+        if not self.control + self.check + self.tie:
+            raise Problem("no points", "control, check and tie 0", "some points, or no section `points`")
+        return self

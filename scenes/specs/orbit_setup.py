@@ -1,0 +1,367 @@
+"""A test in orbit together with everything it refers to."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from pydantic import Field
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.camera import CameraSpec
+from scenes.specs.detector import DetectorSpec, require_detector
+from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.job import DEFAULT_PIVOT
+from scenes.specs.load import (
+    find_orbit_camera,
+    find_payload,
+    load_camera,
+    load_instrument,
+    load_line_detectors,
+    load_orbit_test,
+    load_three_line_camera,
+    paths_of_cameras,
+)
+from scenes.specs.orbit_angle import LINES, OrbitAngleSpec, usual_angles
+from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+from scenes.specs.orbit_monitor import OrbitMonitorSpec
+from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.resolved import ResolvedJob, resolve_job
+from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.yaml.errors import KeyPath, names_text, nearest
+from scenes.yaml.spec import Paths, Spec
+from scenes.yaml.units import ANGLE, MOMENT, format_quantity
+from scenes.yaml.yaml_file import read_yaml
+
+
+class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
+    """An intersection-angle test with its camera: a payload, or an instrument with the cameras that it names.
+
+    Attributes:
+        camera: the payload, None for an instrument.
+        instrument: the instrument, None for a payload.
+        cameras: what `instrument.cameras.<name>.camera` says -> prescription; empty for a payload.
+    """
+
+    camera: ThreeLineCameraSpec | None = None
+    instrument: InstrumentSpec | None = None
+    cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
+
+    @property
+    def pixels(self) -> Mapping[str, int]:
+        """Line -> how many pixels it has, in the order of the file."""
+        if self.instrument is not None:
+            return {name: self.cameras[m.camera].line.pixels for name, m in self.instrument.cameras.items()}
+        assert self.camera is not None
+        return {name: self.camera.pixels_of(name) for name in self.camera.lines}
+
+    @property
+    def usual_pixels(self) -> int:
+        """Of the line in whose pixels the test gives places."""
+        return self.camera.pixels if self.camera is not None else next(iter(self.pixels.values()))
+
+    @property
+    def camera_name(self) -> str:
+        """Of the payload or instrument."""
+        return (self.camera or self.instrument).name  # type: ignore[union-attr]
+
+    @property
+    def angles(self) -> Mapping[str, tuple[str, str]]:
+        """Angle -> its two lines; `resolve_angle` has filled in the usual ones."""
+        return self.test.angles or {}
+
+
+def resolve_angle(path: str | Path) -> AngleSetup:
+    """Read a test and the payload or instrument it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or test and camera do not fit.
+    """
+    setup = read_setup(AngleSetup, path)
+    if setup is None:
+        test = load_orbit_test(OrbitAngleSpec, path)
+        setup = _with_camera(test, find_orbit_camera(test))
+    if (setup.camera is None) == (setup.instrument is None):
+        found = "neither" if setup.camera is None else "both"
+        raise setup.error("one camera is tested", ("camera",), found=found, allowed="`camera:` or `instrument:`")
+    for name, mounted in setup.instrument.cameras.items() if setup.instrument is not None else ():
+        if mounted.camera not in setup.cameras:
+            problem = f"camera {mounted.camera!r} of the instrument's {name} is missing"
+            raise setup.error(problem, ("cameras",), allowed=f"cameras.{mounted.camera}: its prescription")
+    return _checked_angles(setup)
+
+
+def _with_camera(test: OrbitAngleSpec, file: Path) -> AngleSetup:
+    """The test with what its camera's file holds: an instrument has cameras, a payload has lines."""
+    data = read_yaml(file).data
+    if not (isinstance(data, dict) and "cameras" in data):
+        return AngleSetup.model_construct(
+            test=test, camera=load_three_line_camera(file), instrument=None, cameras=FrozenMap()
+        )
+    instrument = load_instrument(file)
+    files = paths_of_cameras(instrument)
+    cameras = {mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()}
+    return AngleSetup.model_construct(test=test, camera=None, instrument=instrument, cameras=FrozenMap(cameras))
+
+
+def _checked_angles(setup: AngleSetup) -> AngleSetup:
+    """The set-up with its angles filled in. InputError unless angles, changes and strips fit the camera's lines."""
+    test, lines = setup.test, tuple(setup.pixels)
+    has = f"{names_text(lines)} in {setup.camera_name}"
+    if len(lines) < 2:
+        raise test.error("an angle needs two lines", ("camera",), found=has, allowed="a camera with two lines or more")
+    angles = test.angles or usual_angles(lines)
+    if angles is None:
+        problem = "which lines the angles lie between is not said"
+        allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
+        raise test.error(problem, ("camera",), found=has, allowed=allowed)
+    for name, pair in angles.items():
+        for k, line in enumerate(pair):
+            if line not in lines:
+                key = ("angles", name, k)
+                meant = nearest(line, lines)
+                raise test.error("no such line", key, found=line, allowed=names_text(lines), suggestion=meant)
+    if setup.camera is not None:
+        _require_turns(test, lines)
+    ends = (test.strips.first, test.strips.last)
+    _require_ends(test, "strips", ends, setup.usual_pixels, f"the lines of {setup.camera_name}")
+    return setup.model_copy(update={"test": test.model_copy(update={"angles": FrozenMap(angles)})})
+
+
+def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
+    """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
+    is built.
+    """
+    _require_lines(test, test.changes, lines)
+    for name, change in test.changes.items():
+        for action in change.uses():
+            if action != "rotate":
+                allowed = "a rotation, or an instrument of traced cameras instead of a payload"
+                raise test.error(
+                    f"a payload's line does not allow {action}", ("changes", name, action), allowed=allowed
+                )
+        if change.pivot != DEFAULT_PIVOT:
+            problem = "a payload's line has no pivots"
+            raise test.error(problem, ("changes", name, "pivot"), found=change.pivot, allowed="no pivot")
+
+
+class CalibrationSetup(ExperimentSetup[OrbitCalibrationSpec]):
+    """An in-orbit calibration with its camera.
+
+    Attributes:
+        camera: the payload.
+        detectors: data sheets of its line CCDs where images are rendered.
+    """
+
+    camera: ThreeLineCameraSpec
+    detectors: Paths[DetectorSpec] = Field(default_factory=FrozenMap)
+
+
+def resolve_calibration(path: str | Path) -> CalibrationSetup:
+    """Read a calibration and the camera it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or test and camera do not fit.
+    """
+    setup = read_setup(CalibrationSetup, path)
+    if setup is None:
+        test = load_orbit_test(OrbitCalibrationSpec, path)
+        camera = load_three_line_camera(find_payload(test))
+        detectors = FrozenMap(load_line_detectors(camera)) if test.images is not None else FrozenMap()
+        setup = CalibrationSetup.model_construct(test=test, camera=camera, detectors=detectors)
+    _require_calibration(setup.test, setup.camera)
+    if setup.test.images is not None:
+        _require_detectors(setup, tuple(setup.camera.lines), setup.camera, setup.detectors)
+    return setup
+
+
+class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
+    """A stereo pair along its orbit, monitored, with its instrument.
+
+    Attributes:
+        instrument: cameras and monitors on their base.
+        cameras: what the instrument's cameras are called -> prescription.
+        detector: data sheet of the monitor's area CCDs.
+    """
+
+    instrument: InstrumentSpec
+    cameras: Paths[CameraSpec]
+    detector: DetectorSpec
+
+    @property
+    def resolved(self) -> ResolvedJob:
+        """The job of the monitor's images, with all that it refers to."""
+        return ResolvedJob.model_construct(
+            job=self.test.job,
+            instrument=self.instrument,
+            cameras=self.cameras,
+            detector=self.detector,
+            line_detectors=None,
+        )
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """The two cameras."""
+        first, second = self.test.cameras or tuple(self.instrument.cameras)
+        return first, second
+
+
+def resolve_monitor(path: str | Path) -> MonitorSetup:
+    """Read a monitored orbit and the instrument it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or test and instrument do not fit.
+    """
+    setup = read_setup(MonitorSetup, path)
+    if setup is None:
+        test = load_orbit_test(OrbitMonitorSpec, path)
+        job = resolve_job(test.job)
+        setup = MonitorSetup.model_construct(
+            test=test, instrument=job.instrument, cameras=FrozenMap(job.cameras), detector=job.detector
+        )
+    _require_pair(setup.test, setup.instrument, setup.cameras)
+    return setup
+
+
+def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]) -> None:
+    """InputError unless the pair has monitors and looks two ways, and the points lie on the second line."""
+    names = tuple(instrument.cameras)
+    for name in names:
+        mounted = instrument.cameras[name].camera
+        if mounted not in cameras:
+            raise test.error(f"camera {mounted!r} of the instrument is missing", ("instrument",))
+    if test.cameras is None and len(names) != 2:
+        found = f"{names_text(names)} in {instrument.name}"
+        allowed = "two cameras for a stereo pair; of more than two, name them as cameras: [first, second]"
+        raise test.error("the instrument is no stereo pair", ("instrument",), found=found, allowed=allowed)
+    pair = test.cameras or names
+    for name in pair:
+        if name not in names:
+            allowed = f"{names_text(names)}, which have monitors in {instrument.name}"
+            hint = nearest(name, names)
+            raise test.error("no camera with a monitor", ("cameras",), found=name, allowed=allowed, suggestion=hint)
+    looks = [instrument.cameras[name].look for name in pair]
+    if abs(looks[0] - looks[1]) < _LEAST_ANGLE:
+        found = " and ".join(format_quantity(look, ANGLE) for look in looks)
+        raise test.error("the cameras look the same way", ("cameras",), found=found, allowed="1 deg apart or more")
+    pixels = cameras[instrument.cameras[pair[1]].camera].line.pixels
+    _require_ends(test, "ground", (test.ground.first, test.ground.last), pixels, f"the line of {pair[1]}")
+
+
+_LEAST_ANGLE = 0.0174
+"""Radians between the cameras of a stereo pair."""
+
+
+class SimulateSetup(ExperimentSetup[OrbitSimulateSpec]):
+    """A pass over a patch of ground with its camera.
+
+    Attributes:
+        camera: the payload.
+        detectors: data sheets of its line CCDs, by the name that the image sections give.
+    """
+
+    camera: ThreeLineCameraSpec
+    detectors: Paths[DetectorSpec]
+
+
+def resolve_simulate(path: str | Path) -> SimulateSetup:
+    """Read a pass and the camera and detectors it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or test and camera do not fit.
+    """
+    setup = read_setup(SimulateSetup, path)
+    if setup is None:
+        test = load_orbit_test(OrbitSimulateSpec, path)
+        camera = load_three_line_camera(find_payload(test))
+        detectors = FrozenMap(load_line_detectors(camera))
+        setup = SimulateSetup.model_construct(test=test, camera=camera, detectors=detectors)
+    _require_images(setup.test, setup.camera)
+    _require_detectors(setup, setup.test.lines, setup.camera, setup.detectors)
+    return setup
+
+
+def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> None:
+    """InputError unless all lines that are named exist and can be rendered, and the patch lies on one of them."""
+    names = tuple(camera.lines)
+    named = [(("patch", "line"), test.patch.line), *((("changes", name), name) for name in test.changes)]
+    for key, name in [*((("lines",), name) for name in test.lines), *named]:
+        if name not in names:
+            allowed = f"{names_text(names)}, the lines of {camera.name}"
+            raise test.error("no such line", key, found=name, allowed=allowed, suggestion=nearest(name, names))
+    _require_images_of(test, test.lines, camera)
+    line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
+    _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
+    first, end = -test.orbit.before, test.orbit.after
+    if not first < test.patch.time < end:
+        allowed = f"between {format_quantity(first, MOMENT)} and {format_quantity(end, MOMENT)}, or a longer orbit"
+        found = format_quantity(test.patch.time, MOMENT)
+        raise test.error("outside the orbit data", ("patch", "time"), found=found, allowed=allowed)
+
+
+def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
+    """InputError unless the camera has the three lines, and points and changes lie on them."""
+    if missing := [name for name in LINES if name not in camera.lines]:
+        found = f"{names_text(tuple(camera.lines))} in {camera.name}"
+        problem = f"the camera has no {' and no '.join(missing)} line"
+        raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
+    _require_lines(test, test.changes)
+    if "nadir" in test.changes and any(test.changes["nadir"].principal_point):
+        raise test.error(
+            "the nadir line's principal point is the gauge",
+            ("changes", "nadir", "principal_point"),
+            allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
+        )
+    fewest = min(camera.pixels_of(name) for name in LINES)
+    if test.points is not None:
+        _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
+    if test.images is None:
+        return
+    _require_images_of(test, LINES, camera)
+    for k, place in enumerate(test.images.patches):
+        key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
+        _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
+
+
+_THREE_LINES = "a camera with lines forward, nadir and aft"
+
+
+def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...] = LINES) -> None:
+    """InputError unless every change is one of a line."""
+    for name in changes:
+        if name not in lines:
+            raise test.error(
+                "no such line", ("changes", name), allowed=names_text(lines), suggestion=nearest(name, lines)
+            )
+
+
+def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:
+    """InputError unless the camera says of each line how it forms its image."""
+    for name in lines:
+        if camera.image_of(name) is None:
+            problem = f"{camera.name} does not say how its line {name} forms an image"
+            raise test.error(problem, ("camera",), found=camera.name, allowed="a payload with a section `image`")
+
+
+def _require_detectors(
+    setup: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec, detectors: Mapping[str, DetectorSpec]
+) -> None:
+    """InputError unless the data sheets of all these lines are there."""
+    for name in lines:
+        image = camera.image_of(name)
+        if image is not None:
+            own = ("lines", name, "image") if camera.lines[name].image is not None else ("image",)
+            require_detector(setup, ("camera", *own, "detector"), image.detector, detectors)
+
+
+def _require_ends(test: Spec, section: str, ends: tuple[float, float], pixels: int, line: str) -> None:
+    """InputError unless ``first`` and ``last`` of a section lie on a line of so many pixels."""
+    for key, pixel in zip(("first", "last"), ends, strict=True):
+        _require_pixel(test, (section, key), pixel, pixels, line)
+
+
+def _require_pixel(test: Spec, key: KeyPath, pixel: float, pixels: int, line: str) -> None:
+    """InputError unless a place lies on a line of so many pixels, which is told as the text says."""
+    last = pixels - 0.5
+    if not -0.5 <= pixel <= last:
+        allowed = f"-0.5 to {last:g}, the ends of {line}"
+        raise test.error("outside the line", key, found=f"pixel {pixel:g}", allowed=allowed)

@@ -1,0 +1,79 @@
+"""Images of a patch of ground by every line of a camera in orbit, as a file in scenes/orbit gives them."""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from scenes.specs.orbit_angle import Moment
+from scenes.specs.orbit_calibration import InteriorChangeSpec, LineTime
+from scenes.specs.orbit_scene import ControlSpec, GroundSpec, ImagePointsSpec, LightEffectsSpec
+from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.yaml.errors import Problem, names_text
+from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
+
+Side = Annotated[Whole, Field(ge=16, le=20_000)]
+
+
+def _each_once(lines: tuple[str, ...]) -> tuple[str, ...]:
+    if not lines or len(set(lines)) != len(lines):
+        raise Problem("no lines, or one twice", names_text(lines) or "none", "each line once")
+    return lines
+
+
+class PatchSpec(Spec):
+    """The patch of ground that is imaged; its middle lies on what one line sees at a moment.
+
+    Attributes:
+        line: of the camera, by name.
+        pixel: of that line that sees the middle.
+        time: at which it does, seconds from the orbit's epoch.
+        lines, pixels: size of every image.
+    """
+
+    line: Name = "nadir"
+    pixel: Number
+    time: Moment = 0.0
+    lines: Side = 1000
+    pixels: Side = 1000
+
+
+class OrbitSimulateSpec(Spec):
+    """A pass over a patch of ground.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file; it needs a section `image`.
+        lines: those that are rendered, by name.
+        changes: line -> how its interior has changed since the laboratory.
+        earth: its rotation.
+        orbit: true orbit.
+        attitude: true attitude.
+        effects: what happens to the light between ground and camera.
+        line_time: from one image line to the next, seconds.
+        patch: where and how large.
+        ground: what is there.
+        control: what is known of the ground.
+        points: that are measured in the images; none without this section.
+        errors: of what the satellite measures of itself.
+        oversampling: samples of the ground along each side of a pixel.
+        seed: of every random number.
+    """
+
+    name: Name
+    description: Text = ""
+    camera: Reference
+    lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "aft")
+    changes: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
+    earth: EarthSpec = EarthSpec()
+    orbit: OrbitSpec
+    attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
+    effects: LightEffectsSpec = LightEffectsSpec()
+    line_time: LineTime = 0.7e-3
+    patch: PatchSpec
+    ground: GroundSpec = GroundSpec()
+    control: ControlSpec = ControlSpec()
+    points: ImagePointsSpec | None = None
+    errors: ErrorsSpec = ErrorsSpec()
+    oversampling: Annotated[Whole, Field(ge=2, le=8)] = 3
+    seed: Seed = 0

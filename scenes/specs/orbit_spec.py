@@ -1,0 +1,265 @@
+"""Instants in UTC, Earth, orbit, attitude and their errors, as files in scenes/orbit give them.
+
+Body axes are those of a base: X forward, Z toward the scene (down), Y = Z x X (right). Components along body or orbital
+axes are written in this order.
+"""
+
+import re
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, WithJsonSchema, model_validator
+
+from scenes.yaml.errors import Problem, shown
+from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.spec import Number, Spec
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, SPEED, TIME, format_quantity
+
+FIRST_YEAR, LAST_YEAR = 1972, 2099
+"""UTC has whole leap seconds since 1972."""
+ALLOWED = f"date and time in UTC, ISO 8601 and ending in Z, {FIRST_YEAR} to {LAST_YEAR}, e.g. '2011-03-05T03:05:00Z'"
+PATTERN = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]{1,6})?)?Z$"
+
+
+def parse_utc(text: Any) -> str:
+    """The same text, checked; a value that is written another way than the pattern is refused, also a leap second.
+
+    Raises:
+        Problem: no text, another form, without its zone, or no such instant.
+    """
+    if not isinstance(text, str):
+        raise Problem("not a date and time", shown(text), ALLOWED)
+    stripped = text.strip()
+    if re.fullmatch(PATTERN.replace("Z$", "$"), stripped):
+        raise Problem("a date and time without its zone", shown(text), ALLOWED)
+    if not re.fullmatch(PATTERN, stripped):
+        raise Problem("not a date and time", shown(text), ALLOWED)
+    try:
+        time = datetime.fromisoformat(stripped).astimezone(UTC)
+    except ValueError:
+        raise Problem("no such date or time", shown(text), ALLOWED) from None
+    if not FIRST_YEAR <= time.year <= LAST_YEAR:
+        raise Problem("outside the years of this time scale", shown(text), ALLOWED)
+    return stripped
+
+
+UtcTime = Annotated[
+    str,
+    BeforeValidator(parse_utc),
+    WithJsonSchema(
+        {"type": "string", "pattern": PATTERN, "description": ALLOWED, "examples": ["2011-03-05T03:05:00Z"]}
+    ),
+]
+"""An instant in UTC, ISO 8601 text ending in Z."""
+
+
+Latitude = Annotated[float, Quantity(ANGLE, largest="90 deg")]
+Longitude = Annotated[float, Quantity(ANGLE, largest="360 deg")]
+Inclination = Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="180 deg")]
+Altitude = Annotated[float, Quantity(DISTANCE, smallest="150 km", largest="2000 km")]
+Span = Annotated[float, Quantity(MOMENT, smallest="0 s", largest="240 h")]
+DayTime = Annotated[float, Quantity(MOMENT, smallest="0 h", largest="24 h")]
+Interval = Annotated[float, Quantity(TIME, above_zero=True, largest="1000 s")]
+Duration = Annotated[float, Quantity(MOMENT, above_zero=True, largest="240 h")]
+TimeDifference = Annotated[float, Quantity(TIME, largest="0.9 s")]
+PolarMotion = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="2 arcsec"), 2)]
+Offset = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="60 deg"))]
+AngleErrors = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="1 deg"))]
+AngleSigmas = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, smallest="0 arcsec", largest="1 deg"))]
+LengthSigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
+SpeedSigmas = Annotated[tuple[float, float, float], Vector(Quantity(SPEED, smallest="0 m/s", largest="100 m/s"))]
+Position = Annotated[tuple[float, float, float], Vector(Quantity(DISTANCE, largest="100000 km"))]
+Velocity = Annotated[tuple[float, float, float], Vector(Quantity(SPEED, largest="20 km/s"))]
+
+_ZERO = (0.0, 0.0, 0.0)
+
+
+class EarthSpec(Spec):
+    """What is not predicted of the Earth's rotation (IERS bulletins).
+
+    Attributes:
+        ut1_utc: UT1 - UTC at the epoch, seconds.
+        polar_motion: x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
+    """
+
+    ut1_utc: TimeDifference = 0.0
+    polar_motion: PolarMotion = (0.0, 0.0)
+
+
+class PassingSpec(Spec):
+    """An orbit that passes a place at the epoch; the osculating orbit is a circle there.
+
+    Attributes:
+        longitude, latitude: geodetic, of the place vertically below the satellite, radians.
+        altitude: of the satellite above the ellipsoid there, metres.
+        direction: of the pass, to the south or to the north.
+        inclination: osculating, radians; without it the orbit is sun-synchronous.
+    """
+
+    longitude: Longitude
+    latitude: Latitude
+    altitude: Altitude = 500e3
+    direction: Literal["descending", "ascending"] = "descending"
+    inclination: Inclination | None = None
+
+
+class ElementsSpec(Spec):
+    """Osculating elements at the epoch, against the true equator of the epoch.
+
+    Attributes:
+        altitude: semi-major axis less the equatorial radius, metres.
+        eccentricity: at most 0.1.
+        inclination: radians; without it the orbit is sun-synchronous.
+        node: right ascension of the ascending node from the celestial intermediate origin, radians.
+        node_local_time: local mean solar time of the descending node instead of `node`, seconds of the day.
+        perigee: argument of the perigee, radians.
+        argument: argument of latitude (perigee + true anomaly) at the epoch, radians.
+    """
+
+    altitude: Altitude
+    eccentricity: Number = 0.0
+    inclination: Inclination | None = None
+    node: Longitude | None = None
+    node_local_time: DayTime | None = None
+    perigee: Longitude = 0.0
+    argument: Longitude
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> "ElementsSpec":
+        if not 0.0 <= self.eccentricity <= 0.1:
+            found = str(self.eccentricity)
+            raise Problem("outside the limits", found, "a number from 0 to 0.1", within=("eccentricity",))
+        if (self.node is None) == (self.node_local_time is None):
+            raise Problem("the node is given twice or not at all", None, "either node or node_local_time")
+        return self
+
+
+class StateSpec(Spec):
+    """State vector at the epoch.
+
+    Attributes:
+        position: in the GCRS, metres.
+        velocity: in the GCRS, m/s.
+    """
+
+    position: Position
+    velocity: Velocity
+
+
+class OrbitSpec(Spec):
+    """An orbit: exactly one of `passing`, `elements` and `state`.
+
+    Attributes:
+        epoch: UTC; all times of the orbit are seconds from it.
+        before, after: how long the orbit is followed to either side of the epoch, seconds.
+        passing: a place that it passes.
+        elements: its osculating elements.
+        state: a state vector.
+    """
+
+    epoch: UtcTime
+    before: Span = 600.0
+    after: Span = 600.0
+    passing: PassingSpec | None = None
+    elements: ElementsSpec | None = None
+    state: StateSpec | None = None
+
+    @model_validator(mode="after")
+    def _is_one_orbit(self) -> "OrbitSpec":
+        given = [name for name in ("passing", "elements", "state") if getattr(self, name) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none of them"
+            raise Problem("the orbit is not given once", found, "one of passing, elements, state")
+        if self.before + self.after == 0.0:
+            found = f"before and after are {format_quantity(0.0, MOMENT)}"
+            raise Problem("the orbit has no length", found, "a time before or after the epoch", within=("after",))
+        return self
+
+
+class AttitudeSpec(Spec):
+    """How the satellite holds itself.
+
+    Attributes:
+        nadir: Z points along the ellipsoid's normal (geodetic) or to the Earth's centre (geocentric).
+        steering: X lies along the inertial velocity (none), or along the track on the turning Earth (yaw), so that the
+            image at nadir does not drift along the line.
+        offset: rotation vector of the body against the orbital frame, radians (roll, pitch, yaw).
+    """
+
+    nadir: Literal["geodetic", "geocentric"] = "geodetic"
+    steering: Literal["none", "yaw"] = "none"
+    offset: Offset = _ZERO
+
+
+class GpsErrorsSpec(Spec):
+    """Errors of the measured orbit, along X, Y and Z of the orbital frame.
+
+    Attributes:
+        interval: between fixes, seconds.
+        noise: standard deviation of a fix, independent from fix to fix, metres.
+        drift: standard deviation of what changes slowly, metres.
+        correlation_time: over which `drift` falls to 1/e in its correlation, seconds.
+        velocity: standard deviation of a fix's velocity, independent from fix to fix, m/s.
+    """
+
+    interval: Interval = 1.0
+    noise: LengthSigmas = _ZERO
+    drift: LengthSigmas = _ZERO
+    correlation_time: Duration = 1800.0
+    velocity: SpeedSigmas = _ZERO
+
+
+class ThermalDriftSpec(Spec):
+    """Angle between star trackers and cameras that changes with the satellite's temperature along the orbit:
+    amplitude x sin(latitude - reference).
+
+    Attributes:
+        amplitude: rotation vector about body X, Y and Z, radians.
+        reference: geodetic latitude at which it vanishes, radians.
+    """
+
+    amplitude: AngleErrors = _ZERO
+    reference: Latitude = 0.0
+
+
+class SlowErrorsSpec(Spec):
+    """Errors of the attitude that last for many readings and change within a pass: a cubic spline through independent
+    values.
+
+    Attributes:
+        noise: standard deviation of a value about body X, Y and Z, radians.
+        interval: between values, seconds.
+    """
+
+    noise: AngleSigmas = _ZERO
+    interval: Interval = 10.0
+
+
+class StarTrackerErrorsSpec(Spec):
+    """Errors of the measured attitude, rotations about body X, Y and Z: measured after true.
+
+    Attributes:
+        interval: between readings, seconds.
+        noise: standard deviation of a reading, independent from reading to reading, radians.
+        bias: constant, radians.
+        thermal: changes with latitude.
+        slow: changes within a pass.
+    """
+
+    interval: Interval = 0.125
+    noise: AngleSigmas = _ZERO
+    bias: AngleErrors = _ZERO
+    thermal: ThermalDriftSpec = ThermalDriftSpec()
+    slow: SlowErrorsSpec = SlowErrorsSpec()
+
+
+class ErrorsSpec(Spec):
+    """Errors of what the satellite measures of itself; all zero unless given.
+
+    Attributes:
+        gps: of the orbit.
+        star_tracker: of the attitude.
+    """
+
+    gps: GpsErrorsSpec = GpsErrorsSpec()
+    star_tracker: StarTrackerErrorsSpec = StarTrackerErrorsSpec()

@@ -1,0 +1,214 @@
+"""The principle experiment of paper 001 (section 3.1): two digital autocollimators, two plane mirrors at an angle on a
+three-axis turntable, as a file in scenes/lab gives it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.instrument import AreaCcdSpec, Frames, GlassName, ReticleSpec
+from scenes.yaml.errors import Problem
+from scenes.yaml.quantity import Length, PositiveLength, Quantity, Wavelength
+from scenes.yaml.spec import Name, Number, Spec, Text, Whole
+from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
+
+HalfAngle = Annotated[float, Quantity(ANGLE, above_zero=True, largest="44 deg")]
+Step = Annotated[float, Quantity(ANGLE, above_zero=True, largest="1 deg")]
+AngleSigma = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg")]
+ScaleSigma = Annotated[float, Quantity(SCALE, smallest="0 ppm", largest="1 percent")]
+SMALLEST_WINDOW, LARGEST_WINDOW = 48, 512
+
+
+class LensSpec(Spec):
+    """The collimator's lens: one element, conic on the front. Radii are positive with the centre of curvature on the
+    side of the focal plane.
+
+    Attributes:
+        front_radius: of the surface toward the mirrors, metres.
+        front_conic: its conic constant.
+        back_radius: of the surface toward the focal plane, metres.
+        thickness: on the axis, metres.
+        glass: of the catalogue.
+        diameter: clear aperture of both surfaces, metres.
+        focal_distance: from the back vertex to the focal plane, metres.
+    """
+
+    front_radius: Length
+    front_conic: Number
+    back_radius: Length
+    thickness: PositiveLength
+    glass: GlassName
+    diameter: PositiveLength
+    focal_distance: PositiveLength
+
+    @model_validator(mode="after")
+    def _is_curved(self) -> "LensSpec":
+        for name in ("front_radius", "back_radius"):
+            radius = getattr(self, name)
+            if 2.0 * abs(radius) <= self.diameter:
+                found, allowed = format_quantity(radius, LENGTH), "a length above half the diameter in size"
+                raise Problem("the surface is too strongly curved for its diameter", found, allowed, within=(name,))
+        return self
+
+
+class AutocollimatorSpec(Spec):
+    """A digital autocollimator; both are alike.
+
+    The pinhole and the area CCD stand side by side, symmetric about the lens's axis, so that a mirror square to the
+    axis sends the pinhole's image to the middle of the CCD.
+
+    Attributes:
+        wavelength: of the source, metres.
+        lens: the collimator.
+        reticle: light source.
+        area_ccd: detector; its offset counts from the pinhole to the middle of the pixel grid along the system's Y
+            (horizontal) and X (up), metres.
+        window: side of the square region around the spot that is read out, pixels.
+        distance: from the lens's front vertex to the turntable's centre, metres.
+        frames: number of frames in one reading.
+    """
+
+    wavelength: Wavelength
+    lens: LensSpec
+    reticle: ReticleSpec
+    area_ccd: AreaCcdSpec
+    window: Annotated[Whole, Field(ge=SMALLEST_WINDOW, le=LARGEST_WINDOW)] = 64
+    distance: PositiveLength
+    frames: Frames = 9
+
+    @model_validator(mode="after")
+    def _window_fits(self) -> "AutocollimatorSpec":
+        side = min(self.area_ccd.rows, self.area_ccd.columns)
+        if self.window > side:
+            raise Problem("larger than the area CCD", str(self.window), f"at most {side}", within=("window",))
+        half = [0.5 * n * self.area_ccd.pitch for n in (self.area_ccd.columns, self.area_ccd.rows)]
+        room = 0.5 * self.reticle.pinhole
+        if all(abs(o) < h + room for o, h in zip(self.area_ccd.offset, half, strict=True)):
+            reach = format_quantity(max(half) + room, LENGTH)
+            raise Problem(
+                "the pinhole stands on the area CCD",
+                ", ".join(format_quantity(o, LENGTH) for o in self.area_ccd.offset),
+                f"{reach} or more along one of the axes",
+                within=("area_ccd", "offset"),
+            )
+        return self
+
+
+class MirrorsSpec(Spec):
+    """The two plane mirrors on the turntable.
+
+    Attributes:
+        aperture: their diameter, metres; it limits the beam.
+        radius: distance of their middles from the turntable's centre, metres.
+    """
+
+    aperture: PositiveLength
+    radius: PositiveLength
+
+
+class StandSpec(Spec):
+    """One series of Table 2: about which half angle theta the mirrors stand for each axis, radians."""
+
+    X: HalfAngle
+    Y: HalfAngle
+    Z: HalfAngle
+
+
+class ProgrammeSpec(Spec):
+    """What is turned by how much.
+
+    Attributes:
+        steps: how many steps follow the first reading at zero.
+        small, table, large: the three step sizes, radians; `table` is the one of the printed Table 2.
+        narrow, wide: the two half angles theta between the mirrors, radians.
+        stands: half angle of each axis in the printed Table 2, radians.
+    """
+
+    steps: Annotated[Whole, Field(ge=1, le=100)]
+    small: Step
+    table: Step
+    large: Step
+    narrow: HalfAngle
+    wide: HalfAngle
+    stands: StandSpec
+
+
+class BenchErrorsSpec(Spec):
+    """Standard deviations of what is not as it should be; all independent and normal, drawn from the seed.
+
+    Attributes:
+        focal_length: relative error of an autocollimator's focal length against its calibration.
+        ccd_rotation: turn of an area CCD in its focal plane, radians.
+        reading: unrest of an autocollimator about its own X and Y from one reading to the next, radians.
+        turntable_step: error of each position of the turntable, radians.
+        axis_tilt: of each axis of the turntable toward the two others, radians.
+        mirror_mount: of each mirror about its X and Y, radians.
+    """
+
+    focal_length: ScaleSigma
+    ccd_rotation: AngleSigma
+    reading: AngleSigma
+    turntable_step: AngleSigma
+    axis_tilt: AngleSigma
+    mirror_mount: AngleSigma
+
+
+class PrincipleExperimentSpec(Spec):
+    """The principle experiment.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        autocollimator: both of them.
+        mirrors: on the turntable.
+        programme: what is turned.
+        errors: of the bench.
+    """
+
+    name: Name
+    description: Text = ""
+    autocollimator: AutocollimatorSpec
+    mirrors: MirrorsSpec
+    programme: ProgrammeSpec
+    errors: BenchErrorsSpec
+
+    @model_validator(mode="after")
+    def _mirrors_fit(self) -> "PrincipleExperimentSpec":
+        least = min(self.programme.narrow, *self._stand_angles())
+        # neighbouring rims touch where the mirrors' planes meet: at radius tan(theta) from either middle
+        from_middle = self.mirrors.radius * math.tan(least)
+        if 0.5 * self.mirrors.aperture >= from_middle:
+            raise Problem(
+                "the mirrors run into each other",
+                format_quantity(self.mirrors.aperture, LENGTH),
+                f"below {format_quantity(round(2.0 * from_middle, 6), LENGTH)} at this radius and angle",
+                within=("mirrors", "aperture"),
+            )
+        if self.mirrors.radius >= self.autocollimator.distance:
+            raise Problem(
+                "the mirrors stand behind the autocollimator's lens",
+                format_quantity(self.mirrors.radius, LENGTH),
+                f"less than the distance, {format_quantity(self.autocollimator.distance, LENGTH)}",
+                within=("mirrors", "radius"),
+            )
+        return self
+
+    def _stand_angles(self) -> tuple[float, float, float]:
+        stands = self.programme.stands
+        return stands.X, stands.Y, stands.Z
+
+
+@dataclass(frozen=True)
+class PrincipleSetup:
+    """A principle experiment with what its file refers to.
+
+    Attributes:
+        spec: the experiment.
+        detector: data sheet of the area CCDs.
+    """
+
+    spec: PrincipleExperimentSpec
+    detector: DetectorSpec

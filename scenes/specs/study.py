@@ -1,0 +1,265 @@
+"""A design trade study, as its file gives it: base job, factors, design, responses, report."""
+
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from scenes.specs.study_factor import MOST_RUNS, FactorSpec, Key
+from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, nearest, shown
+from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Seed, Spec, Text, Whole
+
+
+class DesignSpec(Spec):
+    """Which combinations of the factors' values are run.
+
+    Attributes:
+        kind: grid, every combination; latin_hypercube and sobol, evenly spread over all factors; monte_carlo, drawn
+            independently.
+        runs: number of runs; a grid has as many as there are combinations.
+        seed: of what is drawn, and of the noise of every run.
+    """
+
+    kind: Literal["grid", "latin_hypercube", "sobol", "monte_carlo"] = "grid"
+    runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] | None = None
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _has_runs(self) -> "DesignSpec":
+        if self.kind == "grid" and self.runs is not None:
+            found = f"runs: {self.runs}"
+            raise Problem("a grid has as many runs as combinations", found, "no runs", within=("runs",))
+        if self.kind != "grid" and self.runs is None:
+            raise Problem(f"a design of kind {self.kind} needs its number of runs", None, "runs: 1000")
+        return self
+
+
+_MEMORY = re.compile(r"[0-9]{1,6}(\.[0-9]{1,3})? ?(MB|GB)")
+
+
+def _amount(text: str) -> str:
+    if not _MEMORY.fullmatch(text):
+        raise Problem("not an amount of memory", shown(text), "a number with MB or GB: 4 GB")
+    return text
+
+
+class LimitsSpec(Spec):
+    """What a study may use.
+
+    Attributes:
+        runs: more than these are run only with --yes.
+        memory: of all processes together, with its unit MB or GB.
+    """
+
+    runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] = 20_000
+    memory: Annotated[str, Field(strict=True), AfterValidator(_amount)] = "4 GB"
+
+    @property
+    def bytes(self) -> float:
+        """The memory, bytes."""
+        return float(self.memory[:-2]) * (1e9 if self.memory.endswith("GB") else 1e6)
+
+
+UNITS = {
+    **{name: name for name in ("arcsec", "arcmin", "mas", "deg", "rad", "urad", "mrad")},
+    **{name: name for name in ("pm", "nm", "um", "mm", "m", "km")},
+    **{name: name for name in ("us", "ms", "s", "K", "mK", "percent", "ppm", "waves", "px", "DN", "mW", "W")},
+    "K_per_m": "K/m",
+    "m_per_s": "m/s",
+}
+"""Ending of a result's key -> unit."""
+
+BaseCommand = Literal[
+    "render",
+    "lab focus",
+    "lab distortion",
+    "lab turntable",
+    "orbit angle",
+    "orbit calibrate",
+    "orbit monitor",
+]
+
+
+class BaseSpec(Spec):
+    """The job that every run of the study changes.
+
+    Attributes:
+        command: what runs it, as `python -m twin.COMMAND`.
+        file: its file, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit also a
+            name in the library.
+    """
+
+    command: BaseCommand
+    file: Reference
+
+
+class ResponseSpec(Spec):
+    """A number that is kept of every run.
+
+    Attributes:
+        key: where in the results: the run folder's JSON file without .json, then its keys and list indices.
+        unit: of the number; read from the ending of its key if it is not given.
+        sigma: where its standard deviation stands, if the results have one.
+        minus: where a number stands that is subtracted: an error is what is recovered minus what is true.
+    """
+
+    key: Key
+    unit: Text | None = None
+    sigma: Key | None = None
+    minus: Key | None = None
+
+    @model_validator(mode="after")
+    def _is_of_one_unit(self) -> "ResponseSpec":
+        for name, key in (("minus", self.minus), ("sigma", self.sigma)):
+            if key is not None and unit_of(key) != unit_of(self.key):
+                found = f"{unit_of(key) or 'no unit'} and {unit_of(self.key) or 'no unit'}"
+                raise Problem("two units in one response", found, "keys that end in the same unit", within=(name,))
+        return self
+
+    @property
+    def units(self) -> str:
+        """The unit, empty for a pure number."""
+        return self.unit if self.unit is not None else unit_of(self.key)
+
+
+class ThresholdSpec(Spec):
+    """A requirement on a response, in the response's unit: the report tells the share of runs that meet it.
+
+    Attributes:
+        response: its name.
+        at_most: largest value that is good.
+        at_least: smallest value that is good.
+        magnitude: judge the size of the response, without its sign.
+    """
+
+    response: Name
+    at_most: Number | None = None
+    at_least: Number | None = None
+    magnitude: Annotated[bool, Field(strict=True)] = False
+
+    @model_validator(mode="after")
+    def _asks_something(self) -> "ThresholdSpec":
+        if self.at_most is None and self.at_least is None:
+            raise Problem("the requirement asks nothing", None, "at_most: 1.0, or at_least: 0.2")
+        return self
+
+
+class ParetoSpec(Spec):
+    """Two responses, or a factor and a response, that compete; `max` in place of `min` where more is better.
+
+    Attributes:
+        x: name of a factor or response.
+        y: name of a factor or response.
+        best_x: whether small or large x is wanted.
+        best_y: whether small or large y is wanted.
+    """
+
+    x: Name
+    y: Name
+    best_x: Literal["min", "max"] = "min"
+    best_y: Literal["min", "max"] = "min"
+
+
+class StudyReportSpec(Spec):
+    """What the report shows beside the table of the responses.
+
+    Attributes:
+        histograms: responses whose distribution is drawn; all when it is not given.
+        scatter: pairs of names, of a factor or response along x and of one along y.
+        pareto: pairs whose best compromises are sought.
+        sobol: whether variance-based sensitivity indices are estimated.
+        thresholds: by name, requirements on responses.
+    """
+
+    histograms: tuple[Name, ...] | None = None
+    scatter: tuple[tuple[Name, Name], ...] = ()
+    pareto: tuple[ParetoSpec, ...] = ()
+    sobol: Annotated[bool, Field(strict=True)] = False
+    thresholds: Named[ThresholdSpec] = Field(default_factory=dict, validate_default=True)
+
+    def names(self) -> list[tuple[KeyPath, str, bool]]:
+        """(where it stands, name, whether it must be a response) of everything the report mentions."""
+        out: list[tuple[KeyPath, str, bool]] = [
+            (("histograms", k), name, True) for k, name in enumerate(self.histograms or ())
+        ]
+        out += [(("scatter", k, i), name, False) for k, pair in enumerate(self.scatter) for i, name in enumerate(pair)]
+        for k, pair in enumerate(self.pareto):
+            out += [(("pareto", k, "x"), pair.x, False), (("pareto", k, "y"), pair.y, False)]
+        return out + [(("thresholds", key, "response"), t.response, True) for key, t in self.thresholds.items()]
+
+
+class StudySpec(Spec):
+    """A design trade study.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        base: the job that is varied.
+        factors: by name, what varies in it.
+        design: which combinations are run.
+        noise: own, every run has noise of its own; shared, all have that of the base job's seed.
+        responses: by name, what is kept of each run.
+        limits: what the study may use.
+        report: what the report shows.
+    """
+
+    name: Name
+    description: Text = ""
+    base: BaseSpec
+    factors: Annotated[Named[FactorSpec], Field(min_length=1)]
+    design: Annotated[DesignSpec, NothingIsEmpty] = DesignSpec()
+    noise: Literal["own", "shared"] = "own"
+    responses: Annotated[Named[ResponseSpec], Field(min_length=1)]
+    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec()
+    report: Annotated[StudyReportSpec, NothingIsEmpty] = StudyReportSpec()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "StudySpec":
+        taken: dict[Any, str] = {}
+        for name, factor in self.factors.items():
+            for k, place in enumerate(factor.places):
+                if place in taken:
+                    text = f"the factor {taken[place]} already changes this value"
+                    within = ("factors", name, *factor.key_of(k))
+                    raise Problem(text, key_text(place), "every value changed by one factor", within=within)
+                taken[place] = name
+            self._check_design(name, factor)
+        clash = self._clash()
+        if clash is not None:
+            text = f"{clash!r} would name two columns of the result"
+            raise Problem(text, None, "another name", within=("responses",))
+        names = (*self.factors, *self.responses)
+        for key, name, response in self.report.names():
+            among = tuple(self.responses) if response else names
+            if name not in among:
+                what = "no such response" if response else "no such factor or response"
+                within = ("report", *key)
+                raise Problem(what, name, names_text(among), nearest(name, among), within=within)
+        return self
+
+    def _check_design(self, name: str, factor: FactorSpec) -> None:
+        if self.design.kind != "grid":
+            if factor.count is not None:
+                text = f"a design of kind {self.design.kind} draws the values of a range"
+                raise Problem(text, f"count: {factor.count}", "no count", within=("factors", name, "count"))
+        elif factor.kind in ("uniform", "normal", "truncated"):
+            allowed = "values, or range with count; or a design of kind latin_hypercube, sobol or monte_carlo"
+            text = "a grid needs values that can be counted"
+            raise Problem(text, factor.kind, allowed, within=("factors", name, factor.kind))
+        elif factor.kind == "range" and factor.count is None:
+            text = "a range in a grid needs the number of its values"
+            raise Problem(text, None, "count: 5", within=("factors", name))
+
+    def _clash(self) -> str | None:
+        """A name that two columns of the result would have."""
+        sigmas = [f"{name}_sigma" for name, response in self.responses.items() if response.sigma is not None]
+        names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *sigmas]
+        return next((name for name in names if names.count(name) > 1), None)
+
+
+def unit_of(key: KeyPath) -> str:
+    """The unit that the ending of a result's key says, empty if it says none: "um" for d_f_um and d_f_um_sigma."""
+    last = next((str(part) for part in reversed(key) if isinstance(part, str)), "")
+    last = last.removesuffix("_sigma")
+    endings = [ending for ending in UNITS if last.endswith(f"_{ending}")]
+    return UNITS[max(endings, key=len)] if endings else ""

@@ -1,0 +1,202 @@
+"""The turntable test of paper 004 (section 3.3): a table with a dividing error that nobody knows, and its regional
+comparison with a polygon and an autocollimator, as a file in scenes/lab gives it.
+
+Dividing error = reading - true angle.
+"""
+
+import math
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from scenes.yaml.errors import Problem
+from scenes.yaml.quantity import Quantity
+from scenes.yaml.spec import Name, Number, Seed, Spec, Text, Whole
+from scenes.yaml.units import ANGLE, format_quantity
+
+ErrorSize = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg")]
+TableAngle = Annotated[float, Quantity(ANGLE, largest="360 deg")]
+Step = Annotated[float, Quantity(ANGLE, above_zero=True, largest="30 deg")]
+MOST_LINES = 10_000_000
+
+
+class GraduationSpec(Spec):
+    """Errors of the grating's lines: a random curve from harmonics of the turn.
+
+    Attributes:
+        rms: over the full circle, expected, radians.
+        first, last: harmonics; the shortest wave is 360 deg / last.
+        slope: the amplitude of harmonic k falls as k^-slope.
+    """
+
+    rms: ErrorSize
+    first: Annotated[Whole, Field(ge=1, le=10_000)] = 3
+    last: Annotated[Whole, Field(ge=1, le=10_000)]
+    slope: Annotated[Number, Field(ge=0.0, le=4.0)]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "GraduationSpec":
+        if self.last < self.first:
+            raise Problem(
+                "the last harmonic is below the first", str(self.last), f"{self.first} or more", within=("last",)
+            )
+        return self
+
+
+class SubdivisionSpec(Spec):
+    """Error of the interpolation within one period of the grating's signal.
+
+    Attributes:
+        rms: expected, radians.
+        lines: periods of the signal in a full turn.
+        harmonics: of the signal that carry it, equal in the mean.
+    """
+
+    rms: ErrorSize
+    lines: Annotated[Whole, Field(ge=100, le=MOST_LINES)]
+    harmonics: Annotated[tuple[Annotated[Whole, Field(ge=1, le=64)], ...], Field(min_length=1, max_length=16)] = (
+        1,
+        2,
+        4,
+    )
+
+    @property
+    def period(self) -> float:
+        """Of the signal, radians."""
+        return 2.0 * math.pi / self.lines
+
+
+class DividingErrorSpec(Spec):
+    """What the dividing error is made of. Sizes are RMS values over the full circle that the draws have in the mean;
+    the amplitude and phase of each harmonic are drawn from the seed.
+
+    Attributes:
+        axis: wobble of the axis, first and second harmonic, radians.
+        eccentricity: of the grating, first harmonic, radians.
+        graduation: of the lines.
+        subdivision: within a period of the signal.
+        repeatability: standard deviation of one reading, radians.
+    """
+
+    axis: ErrorSize
+    eccentricity: ErrorSize
+    graduation: GraduationSpec
+    subdivision: SubdivisionSpec
+    repeatability: ErrorSize
+
+
+class ReferenceSpec(Spec):
+    """The reference: a polygon on an indexing table, seen by an autocollimator.
+
+    Attributes:
+        calibration: standard deviation of what its certificate leaves unknown at each position, the same in all
+            repeats, radians.
+        noise: standard deviation of one reading of the autocollimator, radians.
+        gross_error: size of a gross error (a shock, a draught), either sign, radians.
+        gross_probability: of one in a comparison.
+    """
+
+    calibration: ErrorSize
+    noise: ErrorSize
+    gross_error: ErrorSize
+    gross_probability: Annotated[Number, Field(ge=0.0, le=0.2)]
+
+
+class HeldOutSpec(Spec):
+    """Angles that no fit sees, in the middle of the calibration's steps, measured in a series of their own.
+
+    Attributes:
+        repeats: of each.
+        spread: the table is set off the middle by a random amount within +- this, radians, so that readings fall at all
+            phases of the grating's signal, as in use.
+    """
+
+    repeats: Annotated[Whole, Field(ge=2, le=1000)]
+    spread: ErrorSize
+
+
+class CalibrationPlanSpec(Spec):
+    """Which readings are compared how often.
+
+    Attributes:
+        first, last, step: of the readings, radians.
+        repeats: of each.
+        folds: of the cross-validation.
+        held_out: the angles for the comparison of the fits.
+    """
+
+    first: TableAngle
+    last: TableAngle
+    step: Step
+    repeats: Annotated[Whole, Field(ge=1, le=1000)]
+    folds: Annotated[Whole, Field(ge=2, le=1000)] = 10
+    held_out: HeldOutSpec
+
+    @property
+    def count(self) -> int:
+        """Number of calibrated readings."""
+        return round((self.last - self.first) / self.step) + 1
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> "CalibrationPlanSpec":
+        shown = {name: format_quantity(getattr(self, name), ANGLE) for name in ("first", "last", "step")}
+        if self.last == self.first:
+            raise Problem("all angles would be the same", shown["last"], "an angle beyond the first", within=("last",))
+        if self.last < self.first:
+            raise Problem(
+                "the last angle is before the first", shown["last"], f"above {shown['first']}", within=("last",)
+            )
+        steps = (self.last - self.first) / self.step
+        if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+            allowed = f"a whole part of the region, {math.degrees(self.last - self.first):.6g} deg"
+            raise Problem("the region is no whole number of steps", shown["step"], allowed, within=("step",))
+        if self.repeats < 2:
+            raise Problem(
+                "one repeat only: its noise cannot be told",
+                str(self.repeats),
+                "2 or more, and 5 or more for Chauvenet's criterion to reject any",
+                within=("repeats",),
+            )
+        if self.held_out.spread >= 0.5 * self.step:
+            raise Problem(
+                "held-out angles would reach the calibrated ones",
+                format_quantity(self.held_out.spread, ANGLE),
+                f"below half a step, {format_quantity(0.5 * self.step, ANGLE)}",
+                within=("held_out", "spread"),
+            )
+        return self
+
+
+class TurntableTestSpec(Spec):
+    """The turntable test.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        dividing_error: of the table; the analysis does not know it.
+        reference: what the table is compared with.
+        calibration: what is compared.
+        camera_angle: reading of the table at the middle of the camera's field in the distortion test, radians.
+        seed: of everything that is drawn.
+    """
+
+    name: Name
+    description: Text = ""
+    dividing_error: DividingErrorSpec
+    reference: ReferenceSpec
+    calibration: CalibrationPlanSpec
+    camera_angle: TableAngle
+    seed: Seed = 1
+
+    @model_validator(mode="after")
+    def _camera_is_calibrated(self) -> "TurntableTestSpec":
+        plan = self.calibration
+        if not plan.first < self.camera_angle < plan.last:
+            region = f"between {format_quantity(plan.first, ANGLE)} and {format_quantity(plan.last, ANGLE)}"
+            raise Problem(
+                "outside of the calibrated region",
+                format_quantity(self.camera_angle, ANGLE),
+                region,
+                within=("camera_angle",),
+            )
+        return self

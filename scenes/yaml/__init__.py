@@ -1,0 +1,1 @@
+"""YAML at the edge: files, units, errors with line and remedy."""

@@ -1,0 +1,173 @@
+"""Quantities as fields of a specification: text with a unit in YAML, an SI float in the model, text again in YAML.
+
+class Lens(Spec):
+    focal_length: Length                                            # metres
+    tilt: Annotated[float, Quantity(ANGLE, largest="5 deg")]        # radians
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.errors import Problem, shown
+from scenes.yaml.units import (
+    ANGLE,
+    LENGTH,
+    PATTERN,
+    PER_LENGTH3,
+    PER_LENGTH5,
+    PER_LENGTH7,
+    SCALE,
+    TEMPERATURE,
+    TIME,
+    Kind,
+    format_quantity,
+    parse_quantity,
+)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Annotation that makes a float field a quantity with limits.
+
+    Attributes:
+        kind: what it measures.
+        largest: limit on its size (its absolute value), with unit; None for no limit.
+        smallest: limit from below on the signed value, with unit.
+        above_zero: it must be greater than zero.
+    """
+
+    kind: Kind
+    largest: str | None = None
+    smallest: str | None = None
+    above_zero: bool = False
+
+    @cached_property
+    def limits(self) -> str:
+        """The limits in words, for messages and JSON Schema."""
+        parts = []
+        if self.above_zero:
+            parts.append("greater than zero")
+        if self.smallest is not None:
+            parts.append(f"at least {self.smallest}")
+        if self.largest is not None:
+            parts.append(f"at most {self.largest} in size")
+        return " and ".join(parts)
+
+    def parse(self, text: object) -> float:
+        """The SI value of the text.
+
+        Raises:
+            Problem: not a quantity of this kind, or outside the limits.
+        """
+        value = parse_quantity(text, self.kind)
+        outside = (
+            (self.above_zero and not value > 0.0)
+            or (self.smallest is not None and value < parse_quantity(self.smallest, self.kind))
+            or (self.largest is not None and math.fabs(value) > parse_quantity(self.largest, self.kind))
+        )
+        if outside:
+            raise Problem("outside the limits", shown(text), self.limits)
+        return value
+
+    def format(self, value: float) -> str:
+        """Text with unit that `parse` reads back to exactly this value."""
+        return format_quantity(value, self.kind)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self.parse, serialization=core_schema.plain_serializer_function_ser_schema(self.format, when_used="json")
+        )
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        limits = f"; {self.limits}" if self.limits else ""
+        return {
+            "type": "string",
+            "pattern": PATTERN,
+            "description": f"{self.kind.allowed}{limits}",
+            "examples": [self.kind.example],
+        }
+
+
+@dataclass(frozen=True)
+class Vector:
+    """Annotation that makes a tuple field a list of quantities of one sort and fixed length, in YAML `[0 um, 0 um, 3
+    um]`.
+    """
+
+    of: Quantity
+    length: int = 3
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        item = self.of.__get_pydantic_core_schema__(float, handler)
+        items = core_schema.tuple_positional_schema([item] * self.length)
+        return core_schema.no_info_before_validator_function(self._check_length, items)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        item = self.of.__get_pydantic_json_schema__(schema, handler)
+        return {"type": "array", "items": item, "minItems": self.length, "maxItems": self.length}
+
+    def _check_length(self, value: object) -> object:
+        if isinstance(value, list | tuple) and len(value) == self.length:
+            return value
+        example = ", ".join([self.of.kind.example] * self.length)
+        found = f"{len(value)} of them" if isinstance(value, list | tuple) else shown(value)
+        raise Problem(
+            f"not a list of {self.length} quantities", found, f"{self.length} times {self.of.kind.name}: [{example}]"
+        )
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Annotation that makes a mapping field a few optional quantities, each with a unit of its own.
+
+    Attributes:
+        of: name -> quantity.
+    """
+
+    of: Mapping[str, Quantity]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        fields = {
+            name: core_schema.typed_dict_field(item.__get_pydantic_core_schema__(float, handler), required=False)
+            for name, item in self.of.items()
+        }
+        terms = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
+        return core_schema.no_info_after_validator_function(FrozenMap, terms)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        items = {name: item.__get_pydantic_json_schema__(schema, handler) for name, item in self.of.items()}
+        return {"type": "object", "properties": items, "additionalProperties": False}
+
+
+Angle = Annotated[float, Quantity(ANGLE)]
+"""Radians."""
+Length = Annotated[float, Quantity(LENGTH, largest="1000 km")]
+"""Metres."""
+PositiveLength = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1000 m")]
+"""Metres, greater than zero."""
+Wavelength = Annotated[float, Quantity(LENGTH, smallest="100 nm", largest="100 um")]
+"""Metres."""
+Scale = Annotated[float, Quantity(SCALE)]
+"""A relative change, dimensionless: 1e-6 for 1 ppm."""
+Time = Annotated[float, Quantity(TIME)]
+"""Seconds."""
+Temperature = Annotated[float, Quantity(TEMPERATURE, smallest="0 K")]
+"""Kelvin, absolute."""
+AsphereTerms = Annotated[
+    Mapping[str, float],
+    Terms({"A4": Quantity(PER_LENGTH3), "A6": Quantity(PER_LENGTH5), "A8": Quantity(PER_LENGTH7)}),
+]
+"""Terms of an even asphere's sag A4 r^4 + A6 r^6 + A8 r^8, 1/m^3, 1/m^5, 1/m^7; those that are not written are not
+there.
+"""
+Vector2 = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]
+"""Two lengths, metres."""
+Vector3 = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 m"), 3)]
+"""Three lengths, metres."""

@@ -1,0 +1,247 @@
+"""Quantities as users write them, `2 arcsec`, and as the twin computes with them, SI floats.
+
+Every quantity carries its unit; a bare number is an error, even 0. The number is read by a strict pattern and only the
+unit is given to pint, which looks names up and never evaluates an expression. Conversion is done in decimal arithmetic
+with one rounding at the end, so `20 um` is exactly the float 20e-6, and `format_quantity` gives text that reads back to
+the same bits.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation, localcontext
+from functools import cache
+from typing import Any
+
+from scenes.yaml.errors import Problem, names_text, nearest, shown
+
+_NUMBER = r"[-+]?(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][-+]?[0-9]{1,3})?"
+_NAME = r"(?:[A-Za-zµμΩ°]{1,30}|%)(?:\^-?[1-9])?"
+_UNIT = rf"(?:1/)?{_NAME}(?:[*/]{_NAME}){{0,3}}"
+# A unit that begins with a letter may follow the number directly (2um); "1/m^3" may not, or "21/m^3" would read as 2
+# 1/m^3.
+_QUANTITY = re.compile(rf"({_NUMBER})(?:\s+({_UNIT})|({_NAME}(?:[*/]{_NAME}){{0,3}}))")
+_BARE = re.compile(_NUMBER)
+_NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)\b.*", re.IGNORECASE | re.DOTALL)
+LONGEST_TEXT = 100
+PATTERN = rf"^{_NUMBER}\s*{_UNIT}$"
+"""Regular expression of a quantity, for editors; the reader is stricter."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of quantity.
+
+    Attributes:
+        name: with its article, as it appears in messages: "an angle".
+        si: the SI unit that values of this kind have inside the program.
+        units: units to suggest. Others that pint knows are read as well if they measure the same thing.
+        example: a number with unit.
+        writes: units to write in, the preferred one first; empty for the SI unit.
+    """
+
+    name: str
+    si: str
+    units: tuple[str, ...]
+    example: str
+    writes: tuple[str, ...] = ()
+
+    @property
+    def allowed(self) -> str:
+        """What may be written for it, for messages."""
+        return f"{self.name} with its unit ({names_text(self.units)}), e.g. '{self.example}'"
+
+
+ANGLE = Kind(
+    "an angle", "rad", ("arcsec", "deg", "arcmin", "mas", "mrad", "urad", "rad"), "2 arcsec", ("arcsec", "deg")
+)
+LENGTH = Kind("a length", "m", ("um", "mm", "m", "nm", "pm"), "20 um", ("um", "mm", "m", "nm"))
+DISTANCE = Kind("a length", "m", ("km", "m", "mm"), "500 km", ("km", "m"))
+"""How far away something is, as against the size of a part: kilometres come first."""
+SCALE = Kind("a relative change", "", ("ppm", "percent", "um/m"), "10 ppm", ("ppm", "percent"))
+TIME = Kind("a time", "s", ("ms", "s", "us"), "10 ms", ("ms", "s"))
+MOMENT = Kind("a time", "s", ("min", "h", "s"), "12 min", ("min", "h", "s"))
+"""When something is, as against how long it takes: minutes and hours come first."""
+SPEED = Kind("a speed", "m/s", ("m/s", "km/s", "mm/s"), "7.6 km/s", ("m/s", "km/s", "mm/s"))
+POWER = Kind("a power", "W", ("mW", "W", "uW", "nW"), "1 mW", ("mW", "W"))
+TEMPERATURE = Kind("a temperature", "K", ("degC", "K"), "20 degC", ("degC", "K"))
+TEMPERATURE_DIFFERENCE = Kind("a temperature difference", "K", ("K", "mK"), "0.1 K")
+PER_LENGTH = Kind("an inverse length", "1/m", ("1/m", "1/mm"), "0.5 1/m")
+PER_LENGTH3 = Kind("an inverse length cubed", "1/m^3", ("1/m^3", "1/mm^3"), "1e-3 1/m^3")
+PER_LENGTH5 = Kind("an inverse length to the fifth", "1/m^5", ("1/m^5", "1/mm^5"), "1e-3 1/m^5")
+PER_LENGTH7 = Kind("an inverse length to the seventh", "1/m^7", ("1/m^7", "1/mm^7"), "1e-3 1/m^7")
+TEMPERATURE_GRADIENT = Kind("a temperature gradient", "K/m", ("K/m", "mK/m"), "0.1 K/m")
+KINDS = (
+    *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, TEMPERATURE, TEMPERATURE_GRADIENT),
+    *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
+)
+
+_CELSIUS = ("degC", "celsius", "°C")
+_ZERO_CELSIUS = Decimal("273.15")
+
+
+def parse_quantity(text: object, kind: Kind) -> float:
+    """The SI value of a quantity written as number and unit.
+
+    Args:
+        text: for instance "-1.5 arcsec"; anything but text is refused.
+        kind: what it must measure.
+
+    Raises:
+        Problem: no unit, no number, not finite, unknown unit (with the nearest known one), or a unit of something else.
+    """
+    if not isinstance(text, str):
+        _refuse_untyped(text, kind)
+    stripped = str(text).strip()
+    if _NOT_FINITE.fullmatch(stripped):
+        raise Problem("not a finite number", shown(text), kind.allowed)
+    if _BARE.fullmatch(stripped):
+        raise Problem("a number without a unit", stripped, kind.allowed)
+    match = _QUANTITY.fullmatch(stripped) if len(stripped) <= LONGEST_TEXT else None
+    if match is None:
+        raise Problem("not a number with a unit", shown(text), kind.allowed)
+    value = _to_si(match[1], match[2] or match[3], kind)
+    if not math.isfinite(value):
+        raise Problem("not a finite number", shown(text), kind.allowed)
+    return value
+
+
+def format_quantity(value: float, kind: Kind) -> str:
+    """Text for an SI value that `parse_quantity` reads back to exactly the same float.
+
+    A unit that makes the number lie between 1 and 1000 is preferred, then one with few digits, then the earlier one.
+
+    Raises:
+        ValueError: not finite.
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"{value} has no text")
+    choices = []
+    for unit in kind.writes or (kind.si,):
+        number = _shortest_number(value, unit, kind)
+        if number is not None:
+            handy = number == "0" or 1.0 <= abs(float(number)) < 1000.0
+            choices.append((not handy, len(number.strip("-").replace(".", "")), f"{number} {unit}"))
+    # The SI unit has factor one, so it always works.
+    return min(choices, key=lambda choice: choice[:2])[2] if choices else f"{value!r} {kind.si or 'dimensionless'}"
+
+
+def split_quantity(text: object) -> tuple[float, str] | None:
+    """Number and unit of a quantity, without asking what it measures; None for anything that is not a quantity."""
+    match = _QUANTITY.fullmatch(text.strip()) if isinstance(text, str) and len(text) <= LONGEST_TEXT else None
+    if match is None or _look_up(match[2] or match[3]) is None:
+        return None
+    return float(match[1]), match[2] or match[3]
+
+
+def unit_ratio(unit: str, other: str) -> float:
+    """What a number in ``unit`` is multiplied by to be one in ``other``; degrees Celsius are differences here.
+
+    Raises:
+        Problem: the two units measure different things, or one is not known.
+    """
+    one, two = _look_up(unit), _look_up(other)
+    if one is None or two is None or one[1] != two[1]:
+        raise Problem(f"{unit} and {other} do not measure the same", unit, f"the unit {other}, or a multiple of it")
+    with localcontext(prec=50):
+        return float(one[0] / two[0])
+
+
+def _shortest_number(value: float, unit: str, kind: Kind) -> str | None:
+    """The shortest number that, in this unit, reads back to `value`; None if there is none of 17 digits."""
+    with localcontext(prec=50):
+        if value == 0.0 and unit not in _CELSIUS:
+            return "-0" if math.copysign(1.0, value) < 0.0 else "0"
+        factor = _look_up_checked(unit, kind)[0]
+        exact = Decimal(value) / factor if unit not in _CELSIUS else Decimal(value) - _ZERO_CELSIUS
+        for digits in range(1, 18):
+            number = Decimal(f"{exact:.{digits}g}")
+            plain = -5 <= number.adjusted() <= 6
+            text = format(number, "f") if plain else format(number.normalize(), "e")
+            if _to_si(text, unit, kind) == value:
+                return text
+    return None
+
+
+def _refuse_untyped(value: object, kind: Kind) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise Problem("not a finite number", str(value), kind.allowed)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        raise Problem("a number without a unit", repr(value), kind.allowed)
+    raise Problem("not a quantity", shown(value), kind.allowed)
+
+
+def _to_si(number: str, unit: str, kind: Kind) -> float:
+    factor = _look_up_checked(unit, kind)[0]
+    with localcontext(prec=50):
+        try:
+            value = Decimal(number)
+        except InvalidOperation:  # pragma: no cover (the pattern admits only decimals)
+            raise Problem("not a number", shown(number), kind.allowed) from None
+        if unit in _CELSIUS:
+            return float(value + _ZERO_CELSIUS)
+        return float(value * factor)
+
+
+def _look_up_checked(unit: str, kind: Kind) -> tuple[Decimal, str]:
+    """As `_look_up`, but a unit that is unknown or measures something else raises Problem."""
+    found = _look_up(unit)
+    if found is None:
+        raise _unknown(unit, kind)
+    if found[1] != _base(kind) or (unit in _CELSIUS and kind != TEMPERATURE):
+        other = "a temperature" if unit in _CELSIUS else _measured(found[1])
+        raise Problem(
+            f"{unit!r} is a unit of {other}, not of {kind.name}", unit, kind.allowed, nearest(unit, kind.units)
+        )
+    return found
+
+
+def _unknown(unit: str, kind: Kind) -> Problem:
+    return Problem(f"unknown unit {unit!r}", unit, kind.allowed, nearest(unit, kind.units))
+
+
+def _measured(base: str) -> str:
+    """What a unit measures, given what `_look_up` says of it, for messages."""
+    for kind in KINDS:
+        if _base(kind) == base:
+            return kind.name
+    return base or "a pure number"
+
+
+def _base(kind: Kind) -> str:
+    si = _look_up(kind.si)
+    assert si is not None
+    return si[1]
+
+
+@cache
+def _registry() -> Any:
+    # Importing pint and reading its table of units takes half a second, so it waits until a quantity is read.
+    import pint
+
+    return pint.UnitRegistry(non_int_type=Decimal, cache_folder=None)
+
+
+@cache
+def _look_up(unit: str) -> tuple[Decimal, str] | None:
+    """(factor to SI base units, base units as text), or None for an unknown unit.
+
+    Angles and pure numbers have the same dimension; they differ in base units, where angles keep their radian.
+    """
+    import pint
+
+    if not unit:
+        return Decimal(1), ""
+    if unit in _CELSIUS:
+        return Decimal(1), "K"
+    registry = _registry()
+    try:
+        parsed = registry.parse_units("percent" if unit == "%" else unit)
+        factor, base = registry.get_base_units(parsed)
+        # Units with an offset or a logarithm (degF, dB) have no factor.
+        if registry.Quantity(Decimal(0), parsed).to_base_units().magnitude != 0:
+            return None
+    except (pint.errors.PintError, ValueError, TypeError, AttributeError, ArithmeticError):
+        return None
+    text = "" if base == registry.dimensionless else f"{base:~C}"
+    return Decimal(factor), text

@@ -1,0 +1,248 @@
+"""YAML in and out: plain data with line numbers from files that nobody has vetted.
+
+Only the part of YAML that the twin's files need is read: one document of mappings, lists and scalars. Anchors, aliases
+and merge keys (a few lines of which can unfold to gigabytes), tags (which can name types to construct), duplicate keys
+(of which most readers silently keep the last) are refused with the line where they stand. The data are built from the
+parser's events, so a refusal comes before anything is unfolded.
+"""
+
+import io
+import re
+import stat
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedSeq
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    DocumentStartEvent,
+    Event,
+    MappingEndEvent,
+    MappingStartEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+)
+from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+
+from scenes.yaml.errors import InputError, Issue, KeyPath, shown
+
+LARGEST_BYTES = 1_000_000
+DEEPEST = 32
+
+_INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,6})?")
+_SPECIAL = re.compile(r"([-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+_WORDS: dict[str, bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+
+
+@dataclass(frozen=True)
+class YamlFile:
+    """The contents of one YAML file.
+
+    Attributes:
+        file: path as the user gave it.
+        data: dict, list and scalars. Keys are always text.
+        lines: key path -> line, counted from 1; for a mapping's entry the line of its key.
+    """
+
+    file: str
+    data: Any
+    lines: dict[KeyPath, int] = field(repr=False)
+
+
+def read_yaml(path: str | Path) -> YamlFile:
+    """Read a YAML file.
+
+    Raises:
+        InputError: no such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several
+            documents, nested deeper than 32, or with duplicate keys, anchors, aliases, merge keys or tags.
+    """
+    return parse_yaml(_read_text(path), str(path))
+
+
+def parse_yaml(text: str, file: str = "") -> YamlFile:
+    """Read YAML from text; `file` is what error messages call it. Raises InputError as `read_yaml` does."""
+    builder = _Builder(file)
+    try:
+        for event in YAML(typ="safe", pure=True).parse(text):
+            builder.take(event)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        problem = error.problem or error.context or "cannot be read"
+        raise InputError(Issue(f"not valid YAML: {problem}", file, mark.line + 1 if mark else None)) from None
+    except YAMLError as error:
+        raise InputError(Issue(f"not valid YAML: {str(error).splitlines()[0]}", file)) from None
+    if builder.root is None:
+        raise InputError(Issue("the file is empty", file, 1))
+    return YamlFile(file, builder.root, builder.lines)
+
+
+def dump_yaml(data: Any) -> str:
+    """Plain data (dict, list, text, numbers, None) as YAML text, in the order given; `read_yaml` gives the same data
+    back.
+
+    Lists of scalars are written on one line, everything else in blocks.
+    """
+    yaml = YAML(typ="rt", pure=True)
+    yaml.allow_unicode = True
+    yaml.width = 120
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    stream = io.StringIO()
+    yaml.dump(_styled(data), stream)
+    return stream.getvalue()
+
+
+def _styled(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {_styled(key): _styled(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        items = CommentedSeq(_styled(item) for item in value)
+        if not any(isinstance(item, dict | list) for item in items):
+            items.fa.set_flow_style()
+        return items
+    # Text that would be read as a number or a word such as null has to stand in quotes.
+    if isinstance(value, str) and (value in _WORDS or not isinstance(_number_or_text(value), str)):
+        return DoubleQuotedScalarString(value)
+    return value
+
+
+def _read_text(path: str | Path) -> str:
+    file = str(path)
+    try:
+        mode = Path(path).stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(Issue("is a directory", file, allowed="a YAML file"))
+        # A device or a pipe could be endless or block.
+        if not stat.S_ISREG(mode):
+            raise InputError(Issue("is not a regular file", file, allowed="a YAML file"))
+        with Path(path).open("rb") as stream:
+            content = stream.read(LARGEST_BYTES + 1)
+    except FileNotFoundError:
+        raise InputError(Issue("no such file", file)) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
+    if len(content) > LARGEST_BYTES:
+        raise InputError(Issue("too large", file, allowed="at most 1 MB"))
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError(Issue(f"not UTF-8 text: byte 0x{content[error.start]:02x}", file, line)) from None
+
+
+class _Builder:
+    """Builds plain data from parser events and refuses what the twin's files do not need."""
+
+    def __init__(self, file: str) -> None:
+        self.root: Any = None
+        self.lines: dict[KeyPath, int] = {}
+        self._file = file
+        self._documents = 0
+        # Open collections from the root down, each with its key path and, for a mapping, the key whose value comes
+        # next.
+        self._open: list[tuple[dict[str, Any] | list[Any], KeyPath]] = []
+        self._key: list[str | None] = []
+
+    def take(self, event: Event) -> None:
+        """Take the next event of the parser."""
+        line = event.start_mark.line + 1
+        if isinstance(event, DocumentStartEvent):
+            self._documents += 1
+            if self._documents > 1:
+                self._refuse("a second document starts here", line, "one document in a file")
+            if event.tags:
+                self._refuse("%TAG directives are not allowed", line)
+        elif isinstance(event, AliasEvent):
+            self._refuse(f"aliases are not allowed, found *{event.anchor}", line, "writing the value again")
+        elif isinstance(event, ScalarEvent | MappingStartEvent | SequenceStartEvent):
+            if event.anchor:
+                self._refuse(
+                    f"anchors are not allowed, found &{event.anchor}", line, "writing the value where it is used"
+                )
+            if event.tag is not None:
+                self._refuse(f"tags are not allowed, found {event.tag}", line, "plain values")
+            self._value(event, line)
+        elif isinstance(event, MappingEndEvent | SequenceEndEvent):
+            self._open.pop()
+            self._key.pop()
+
+    def _value(self, event: ScalarEvent | MappingStartEvent | SequenceStartEvent, line: int) -> None:
+        awaits_key = bool(self._open) and isinstance(self._open[-1][0], dict) and self._key[-1] is None
+        if awaits_key:
+            self._take_key(event, line)
+            return
+        value: Any
+        if isinstance(event, ScalarEvent):
+            value = _scalar(event)
+        else:
+            value = {} if isinstance(event, MappingStartEvent) else []
+        path = self._place(value, line)
+        if not isinstance(event, ScalarEvent):
+            if len(self._open) == DEEPEST:
+                self._refuse("nested too deeply", line, f"at most {DEEPEST} levels")
+            self._open.append((value, path))
+            self._key.append(None)
+
+    def _take_key(self, event: Event, line: int) -> None:
+        mapping, path = self._open[-1]
+        if not isinstance(event, ScalarEvent):
+            self._refuse("a key must be a plain name", line)
+            return
+        key = event.value
+        if key == "<<" and event.implicit[0]:
+            self._refuse("merge keys are not allowed, found <<", line, "writing the entries out", path)
+        if key in mapping:
+            first = self.lines[(*path, key)]
+            self._refuse(f"duplicate key {shown(key)}, first on line {first}", line, "each key once", (*path, key))
+        self.lines[(*path, key)] = line
+        self._key[-1] = key
+
+    def _place(self, value: Any, line: int) -> KeyPath:
+        if not self._open:
+            self.root = value
+            self.lines[()] = line
+            return ()
+        container, path = self._open[-1]
+        if isinstance(container, dict):
+            key = self._key[-1]
+            assert key is not None
+            container[key] = value
+            self._key[-1] = None
+            return (*path, key)
+        container.append(value)
+        own = (*path, len(container) - 1)
+        self.lines[own] = line
+        return own
+
+    def _refuse(self, problem: str, line: int, allowed: str | None = None, key: KeyPath = ()) -> None:
+        raise InputError(Issue(problem, self._file, line, key, allowed=allowed))
+
+
+def _scalar(event: ScalarEvent) -> Any:
+    """The value of a scalar by the core schema of YAML 1.2; quoted scalars are always text."""
+    text = event.value
+    if not event.implicit[0]:
+        return text
+    if text in _WORDS:
+        return _WORDS[text]
+    return _number_or_text(text)
+
+
+def _number_or_text(text: str) -> int | float | str:
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    if _FLOAT.fullmatch(text):
+        return float(text)
+    special = _SPECIAL.fullmatch(text)
+    if special:
+        return float("nan") if special[3] else float(special[1] + "inf")
+    return text

@@ -1,0 +1,489 @@
+"""What a distortion test gives: distortion.json, the main table, figures, the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from analysis.spots.centroid import mean_frames
+from analysis.turntable.chauvenet import rejection_rate
+from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.lab_setup import DistortionSetup
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.laboratory import printed_004
+from twin.laboratory.distortion_bench import Advance, DistortionBench, silent
+from twin.laboratory.distortion_run import DistortionRun, measure, rms
+from twin.laboratory.turntable_report import FIT_NAMES
+from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.result import LabResult, Section
+from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+
+
+def to_dict(run: DistortionRun) -> dict[str, Any]:
+    """distortion.json: every number in the unit that its key ends in."""
+    fit, smooth = run.compensated.fit, run.compensated.smooth
+    names = ("principal_distance", "principal_point")
+    f, p = (fit.terms.index(name) for name in names)
+    return {
+        "name": run.setup.test.name,
+        "seed": run.seed,
+        "principal_distance_mm": 1e3 * fit.value(names[0]),
+        "principal_distance_mm_sigma": 1e3 * fit.sigma(names[0]),
+        "principal_point_mm": 1e3 * fit.value(names[1]),
+        "principal_point_mm_sigma": 1e3 * fit.sigma(names[1]),
+        "correlation": float(fit.correlation[f, p]),
+        "principal_point_observable": bool(fit.point.observable),
+        "principal_point_statement": fit.point.statement,
+        "rms_raw_um": 1e6 * rms(run.raw.smooth.residual),
+        "rms_compensated_um": 1e6 * rms(smooth.residual),
+        "zero_arcsec": run.compensated.zero / ARCSEC,
+        "points": _points(run),
+        "radial3_mm": 1e3 * smooth.value("radial3"),
+        "radial3_mm_sigma": 1e3 * smooth.sigma("radial3"),
+        "correlations": {"terms": list(smooth.terms), "matrix": smooth.correlation.tolist()},
+        "estimates": {
+            name: {
+                "principal_distance_mm": 1e3 * e.f,
+                "principal_distance_mm_sigma": None if e.f_sigma is None else 1e3 * e.f_sigma,
+                "principal_point_mm": 1e3 * e.p,
+                "principal_point_mm_sigma": None if e.p_sigma is None else 1e3 * e.p_sigma,
+                "distortion_rms_um": 1e6 * e.rms,
+            }
+            for name, e in run.estimates.items()
+        },
+        "noise": {
+            "centroid_um": 1e6 * rms(run.spots.temporal),
+            "centroid_columns_um": 1e6 * rms(run.spots.fixed),
+            "exposure_um": 1e6 * run.means.scatter,
+            "white_raw_um": 1e6 * run.raw.white,
+            "white_compensated_um": 1e6 * run.compensated.white,
+            "rejected": int(np.sum(~run.means.keep)),
+            "rejected_expected_of_good": rejection_rate(run.means.keep.shape[1]) * run.means.keep.size,
+        },
+        "compensation": {
+            "fit": run.compensation.fit.name,
+            "repeatability_arcsec": run.compensation.repeatability / ARCSEC,
+            "common_arcsec": run.compensation.common / ARCSEC,
+            "smooth_arcsec": run.compensation.smooth / ARCSEC,
+            "white_arcsec": run.compensation.white / ARCSEC,
+        },
+        "truth": _truth(run),
+    }
+
+
+def _truth(run: DistortionRun) -> dict[str, Any]:
+    exact = run.true_fit()
+    raw, compensated = (rms(run.error(measured)) for measured in (run.raw, run.compensated))
+    left = run.bench.true_offset - run.bench.design_offset
+    return {
+        "principal_distance_mm": 1e3 * exact.value("principal_distance"),
+        "principal_point_mm": 1e3 * exact.value("principal_point"),
+        "zero_arcsec": run.truth.zero / ARCSEC,
+        "axis_tilt_arcsec": (run.truth.axis[1:] / run.truth.axis[0] / ARCSEC).tolist(),
+        "distortion_um": (1e6 * run.true_distortion).tolist(),
+        "error_rms_raw_um": 1e6 * raw,
+        "error_rms_compensated_um": 1e6 * compensated,
+        "reduction": 1.0 - compensated / raw,
+        "principal_distance_error_sigma": (
+            (run.compensated.fit.value("principal_distance") - exact.value("principal_distance"))
+            / run.compensated.fit.sigma("principal_distance")
+        ),
+        "gross_errors": int(np.sum(run.truth.gross)),
+        "gross_errors_kept": int(np.sum(run.truth.gross & run.means.keep)),
+        "row_smile_um": 1e6 * float(np.ptp(run.truth.place[..., 1])),
+        "estimates": {
+            name: {
+                "principal_distance_mm": 1e3 * e.f_true,
+                "principal_point_mm": 1e3 * e.p_true,
+                "distortion_error_rms_um": 1e6 * e.error,
+            }
+            for name, e in run.estimates.items()
+        },
+        "centroid_minus_chief_ray_left_um": (1e6 * left).tolist(),
+    }
+
+
+def _points(run: DistortionRun) -> list[dict[str, Any]]:
+    raw, own = run.raw, run.compensated
+    columns = {
+        "reading_deg": np.degrees(run.means.mean(run.record.reading)),
+        "field_deg": np.degrees(own.fit.angle),
+        "position_mm": 1e3 * own.fit.position,
+        "distortion_raw_um": 1e6 * raw.distortion,
+        "distortion_compensated_um": 1e6 * own.distortion,
+        "sigma_raw_um": 1e6 * raw.sigma,
+        "sigma_um": 1e6 * own.sigma,
+        "residual_raw_um": 1e6 * raw.smooth.residual,
+        "residual_compensated_um": 1e6 * own.smooth.residual,
+        "rms_over_sets_raw_um": 1e6 * raw.rms_over_sets,
+        "rms_over_sets_compensated_um": 1e6 * own.rms_over_sets,
+    }
+    kept = run.means.keep.sum(axis=1)
+    return [
+        {"point": i + 1, **{name: float(values[i]) for name, values in columns.items()}, "sets_kept": int(kept[i])}
+        for i in range(len(kept))
+    ]
+
+
+RAW, COMPENSATED = "angles as read", "compensated angles"
+
+
+def curve_svg(run: DistortionRun) -> str:
+    """Distortion over the field, and its error against the truth."""
+    with look("distortion-curve"):
+        figure = new_figure(6.4)
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0))
+        field = np.degrees(run.compensated.fit.angle)
+        above.plot(field, 1e6 * run.true_distortion, color=INK, lw=1.0, label="exact chief rays")
+        for measured, name, colour, marker, shift in (
+            (run.raw, RAW, ORANGE, "s", -0.005),
+            (run.compensated, COMPENSATED, BLUE, "o", 0.005),
+        ):
+            style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
+            above.errorbar(field + shift, 1e6 * measured.distortion, 1e6 * measured.sigma, **style)
+            below.errorbar(field + shift, 1e6 * run.error(measured), 1e6 * measured.sigma, **style)
+        accuracy = printed_004.DISTORTION_ACCURACY_UM
+        below.axhspan(-accuracy, accuracy, color="#eef3f8", lw=0, label=f"±{accuracy} µm (paper 004)")
+        below.axhline(0.0, color=GREY, lw=0.8)
+        above.set_title("Distortion D = L − c − f tan W + p tan² W", loc="left")
+        below.set_title("Measured − true", loc="left")
+        below.set_xlabel("field angle W, deg")
+        for axes in (above, below):
+            axes.set_ylabel("µm")
+            _dress(axes)
+        return to_svg(figure)
+
+
+def points_svg(run: DistortionRun) -> str:
+    """Each point's error and its departure from a smooth curve, raw and compensated, and Table 2 of the paper."""
+    with look("distortion-points"):
+        figure = new_figure(6.6)
+        both = run.raw, run.compensated
+        panels = {
+            "Here: error of the distortion against the truth": [1e6 * np.abs(run.error(one)) for one in both],
+            "Here: distance from the smooth curve": [1e6 * np.abs(one.smooth.residual) for one in both],
+            "Paper 004, Table 2: “RMS of distortion”": [
+                np.array(printed_004.DISTORTION_RAW_UM),
+                np.array(printed_004.DISTORTION_COMPENSATED_UM),
+            ],
+        }
+        every = figure.subplots(len(panels), 1)
+        for axes, (title, (raw, compensated)) in zip(every, panels.items(), strict=True):
+            number = np.arange(1, len(raw) + 1)
+            axes.bar(number - 0.2, raw, 0.4, color=ORANGE, label=f"{RAW}, rms {_rms(raw):.2f} µm")
+            axes.bar(number + 0.2, compensated, 0.4, color=BLUE, label=f"{COMPENSATED}, rms {_rms(compensated):.2f} µm")
+            axes.set_title(title, loc="left")
+            axes.set_ylabel("µm")
+            axes.set_xlim(0.0, len(raw) + 1.0)
+            _dress(axes)
+        every[-1].set_xlabel("point")
+        return to_svg(figure)
+
+
+def spot_svg(run: DistortionRun) -> str:
+    """The spot in the middle of the field, and the row through its centre."""
+    with look("distortion-spot"):
+        figure = new_figure(3.6)
+        picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
+        point = len(run.record.column) // 2
+        image = mean_frames(run.record.frames[point, 0])
+        pitch = run.bench.ccd.band.pitch
+        column = run.spots.position[point, 0] + run.bench.design_offset[point]
+        column = column / pitch + run.bench.middle_column - run.record.column[point, 0]
+        row = run.spots.row[point, 0]
+        shown = picture.imshow(image, cmap="gray", interpolation="nearest", origin="upper")
+        picture.plot(column, row, "+", color=VERMILION, ms=12, mew=1.4)
+        angle = np.linspace(0.0, 2.0 * np.pi, 181)
+        radius = run.bench.radius
+        picture.plot(column + radius * np.cos(angle), row + radius * np.sin(angle), color=BLUE, lw=0.9)
+        picture.set(xlabel="column, along the line", ylabel="row, along the track")
+        figure.colorbar(shown, ax=picture, label="DN")
+        values = image[round(row)]
+        profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
+        profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
+        profile.set(xlabel="column", ylabel="DN")
+        _dress(profile, columns=1)
+        return to_svg(figure)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _dress(axes: Axes, columns: int = 3) -> None:
+    low, high = axes.get_ylim()
+    # room for the legend above the data
+    axes.set_ylim(low, high + 0.18 * (high - low))
+    axes.grid(axis="y", color=LIGHT, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(loc="upper right" if columns == 1 else "upper center", ncols=columns)
+    plain_axes(axes)
+
+
+Array = NDArray[np.float64]
+SHOWN = 3
+"""Points whose frames are kept: first, middle, last."""
+
+
+def run_distortion(setup: DistortionSetup, backend: Backend, seed: int, advance: Advance = silent) -> LabResult:
+    """``python -m twin.lab distortion``.
+
+    Raises:
+        InputError: ``as_built`` names what the camera does not have.
+        BenchError: the test cannot be carried out or measured as its file says.
+    """
+    return lab_result(measure(DistortionBench.build(setup, backend, advance), seed, advance))
+
+
+def lab_result(run: DistortionRun) -> LabResult:
+    """The test as the command gives it."""
+    data = to_dict(run)
+    truth, test = data["truth"], run.setup.test
+    fit = run.compensated.fit
+    count, sets = run.record.reading.shape
+    numbers = np.linspace(0, count - 1, SHOWN).astype(int)
+    width = run.bench.images.width
+    return LabResult(
+        kind="distortion",
+        title="Interior orientation and distortion",
+        lead=(
+            f"Principal distance {data['principal_distance_mm']:.3f} ± {data['principal_distance_mm_sigma']:.3f} mm "
+            f"(truth {truth['principal_distance_mm']:.3f} mm).",
+            typeset(fit.point.statement),
+            f"Distortion is measured to {truth['error_rms_compensated_um']:.2f} µm rms with compensated angles and "
+            f"{truth['error_rms_raw_um']:.2f} µm with angles as read (paper 004 claims "
+            f"{printed_004.DISTORTION_ACCURACY_UM} µm).",
+        ),
+        facts=(
+            ("camera", f"{test.camera}, band {test.band}"),
+            (
+                "points, sets",
+                f"{count} over ±{np.degrees(run.bench.turn[-1]):.3f}°, {sets} sets of {test.frames} frames",
+            ),
+            (
+                "pinhole",
+                f"{format_quantity(test.pinhole, LENGTH)} in a collimator of "
+                f"{format_quantity(test.collimator.focal_length, LENGTH)}: {width:.1f} pixels in the image",
+            ),
+            ("turntable", f"{run.setup.turntable.name}, dividing error by {FIT_NAMES[run.compensation.fit.name]}"),
+            (
+                "spots along the track",
+                f"over {truth['row_smile_um']:.0f} µm: smile of the mapping and tilt of the axis",
+            ),
+        ),
+        data=data,
+        summary=_summary(data),
+        sections=(_curve(run), _compensation(run), _estimates(run), _noise(run, data)),
+        images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
+        warnings=_warnings(run),
+    )
+
+
+def typeset(text: str) -> str:
+    """A statement of the analysis, which is plain ASCII, as the report and the terminal show it."""
+    for plain, shown in (("+-", "±"), ("tan^2", "tan²"), (" um", " µm"), (" deg", "°"), ("= -", "= −")):
+        text = text.replace(plain, shown)
+    return text
+
+
+def _warnings(run: DistortionRun) -> tuple[str, ...]:
+    out = []
+    kept = int(np.sum(run.truth.gross & run.means.keep))
+    if kept:
+        out.append(f"gross errors that Chauvenet's criterion does not find and that stay in the means: {kept}")
+    left = run.bench.true_offset - run.bench.design_offset
+    slope = float(np.polyfit(np.tan(run.bench.turn), left, 1)[0])
+    sigma = run.compensated.fit.sigma("principal_distance")
+    if abs(slope) > 0.5 * sigma:
+        out.append(
+            "as-built coma that grows over the field moves energy centroids against chief rays and f by "
+            f"{1e6 * slope:.0f} µm, which no sigma holds ({1e6 * sigma:.0f} µm): measure the wavefront at several "
+            "fields"
+        )
+    return tuple(out)
+
+
+def _summary(data: Mapping[str, Any]) -> Table:
+    truth = data["truth"]
+    rows: list[tuple[Cell, ...]] = [
+        (
+            "principal distance, mm",
+            # six digits, which tables show of a number, are too few here
+            f"{data['principal_distance_mm']:.4f}",
+            data["principal_distance_mm_sigma"],
+            f"{truth['principal_distance_mm']:.4f}",
+        ),
+        (
+            "principal point, mm",
+            data["principal_point_mm"],
+            data["principal_point_mm_sigma"],
+            truth["principal_point_mm"],
+        ),
+        ("correlation of the two", data["correlation"], None, None),
+        ("residual of smooth model, raw angles, µm rms", data["rms_raw_um"], None, None),
+        ("residual of smooth model, compensated, µm rms", data["rms_compensated_um"], None, None),
+        ("error of distortion, raw angles, µm rms", truth["error_rms_raw_um"], None, None),
+        ("error of distortion, compensated, µm rms", truth["error_rms_compensated_um"], None, None),
+    ]
+    caption = (
+        "f and p with compensated angles, by least squares with a constant: paper 004, eq. 2, with an unknown zero of "
+        "the angles."
+    )
+    return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows, (None, 3, 3, 3))
+
+
+def _curve(run: DistortionRun) -> Section:
+    own = run.compensated
+    ratio = rms(run.error(own) / own.sigma)
+    text = (
+        "D is what is left of the spots' places after a constant, f tan W and p tan² W, measured and true alike. "
+        "Error bars hold the scatter of the sets, the covariance of the turntable's calibration (compensated angles "
+        "only) and what the points scatter about a smooth curve beyond that. With angles as read the long waves of "
+        "the dividing error pass for distortion, and no error bar knows of them.",
+        f"The errors are {ratio:.2f} sigma rms with compensated angles, "
+        f"{rms(run.error(run.raw) / run.raw.sigma):.2f} with angles as read.",
+    )
+    figure = SvgFigure(
+        "distortion-curve",
+        "Distortion over the field",
+        "Above: measured with sigma, and by exact chief rays of the as-built camera. Below: the error.",
+        curve_svg(run),
+    )
+    return Section("Distortion", text, (figure,))
+
+
+def _compensation(run: DistortionRun) -> Section:
+    raw, own = run.raw, run.compensated
+    printed = [np.array(v) for v in (printed_004.DISTORTION_RAW_UM, printed_004.DISTORTION_COMPENSATED_UM)]
+    pairs: tuple[tuple[str, Array, Array], ...] = (
+        ("error of the distortion (needs the truth)", 1e6 * run.error(raw), 1e6 * run.error(own)),
+        ("distance from the smooth curve", 1e6 * raw.smooth.residual, 1e6 * own.smooth.residual),
+        ("RMS of distortion over the sets", 1e6 * raw.rms_over_sets, 1e6 * own.rms_over_sets),
+        ("paper 004, Table 2", printed[0], printed[1]),
+    )
+    rows: list[tuple[Cell, ...]] = [
+        (name, a, b, 100.0 * (1.0 - b / a), float(np.max(np.abs(first))), float(np.max(np.abs(second))))
+        for name, first, second in pairs
+        for a, b in ((rms(first), rms(second)),)
+    ]
+    lower = [100.0 * (1.0 - size(printed[1]) / size(printed[0])) for size in (rms, np.sum, np.max)]
+    text = (
+        "Paper 004 says that compensated angles lower the RMS of the distortion by "
+        f"{100 * printed_004.REDUCTION:.0f}%. Its own table gives {lower[0]:.0f}% in the RMS of all points, "
+        f"{lower[1]:.0f}% in their sum and {lower[2]:.0f}% in the largest.",
+        "How much an RMS falls depends on what else is in it. That of the distortion itself holds the design's "
+        "distortion, which a dividing error may even cancel in part, so that it can rise. The distance from a "
+        "smooth curve does not see the long waves of the dividing error. Only the error against the truth tells "
+        "what compensation brings. It differs from table to table: the constant, f and p take up what is longer "
+        "than the field.",
+    )
+    table = Table(
+        "distortion-reduction",
+        "What compensation brings",
+        "RMS over the points, and the largest.",
+        ("quantity", "raw, µm", "compensated, µm", "reduction, %", "largest raw, µm", "largest compensated, µm"),
+        rows,
+        (None, 2, 2, 0, 1, 1),
+    )
+    figure = SvgFigure(
+        "distortion-points",
+        "Point by point",
+        "Here without the design's distortion; the paper's table holds whatever distortion its camera has.",
+        points_svg(run),
+    )
+    return Section("Raw and compensated angles", text, (figure, table))
+
+
+_ESTIMATES = {
+    "eq2": "(2): f and p",
+    "eq3": "(3): f, p = 0",
+    "eq4": "(4): p, with f of (3)",
+    "eq2_zero_from_constant": "(2), W counted from the fitted zero",
+    "constant": "constant, f, p (taken)",
+    "constant_radial3": "constant, f, p, radial",
+}
+
+
+def _estimates(run: DistortionRun) -> Section:
+    mm = 1e3
+    rows: list[tuple[Cell, ...]] = [
+        (
+            _ESTIMATES[name],
+            f"{mm * e.f:.4f}",
+            None if e.f_sigma is None else mm * e.f_sigma,
+            mm * (e.f - e.f_true),
+            mm * e.p,
+            None if e.p_sigma is None else mm * e.p_sigma,
+            mm * (e.p - e.p_true),
+            1e6 * e.error,
+        )
+        for name, e in run.estimates.items()
+    ]
+    smooth = run.compensated.smooth
+    zero = (run.compensated.zero - run.truth.zero) / ARCSEC
+    text = (
+        "The printed equations (1) to (4) have no constant: W has to count exactly from the direction that is "
+        f"imaged to the line's middle. The middle was put on the pinhole to {run.truth.zero / ARCSEC:.2f}″, and the "
+        "compensation at that reading has an error of its own. (2) turns such an offset into a principal point, (3) "
+        f"leaves it in the distortion of every point. The constant finds it: {run.compensated.zero / ARCSEC:.2f}″, "
+        f"{zero:+.3f}″ from the truth.",
+        "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
+        "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
+        "own truth.",
+        typeset(run.compensated.fit.point.statement),
+    )
+    estimates = Table(
+        "distortion-estimates",
+        "The printed equations and fits with a constant",
+        "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
+        (
+            *("estimate", "f, mm", "sigma of f, mm", "error of f, mm"),
+            *("p, mm", "sigma of p, mm", "error of p, mm", "error of D, µm rms"),
+        ),
+        rows,
+        (None, 3, 3, 3, 2, 2, 2, 2),
+    )
+    correlation = Table(
+        "distortion-correlation",
+        "Correlation of the terms",
+        "Of the fit with radial distortion.",
+        ("", *(name.replace("_", " ") for name in smooth.terms)),
+        [
+            (name.replace("_", " "), *(float(v) for v in row))
+            for name, row in zip(smooth.terms, smooth.correlation, strict=True)
+        ],
+        (None, *(3 for _ in smooth.terms)),
+    )
+    return Section("Estimators and what can be observed", text, (estimates, correlation))
+
+
+def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+    noise, truth = data["noise"], data["truth"]
+    plan = run.setup.turntable.dividing_error
+    about = run.compensated.fit.value("principal_distance")
+    text = (
+        f"One exposure scatters by {noise['exposure_um']:.2f} µm between the sets; the table's repeatability, "
+        f"{format_quantity(plan.repeatability, ANGLE)}, makes {1e6 * about * plan.repeatability:.2f} µm of it and "
+        f"noise of the frames {noise['centroid_um']:.3f} µm. Chauvenet's criterion takes out {noise['rejected']} of "
+        f"{run.record.reading.size} exposures, {noise['rejected_expected_of_good']:.0f} of them expected without any "
+        f"gross error; {truth['gross_errors']} had one.",
+        f"Differences of the line's columns move a spot by {noise['centroid_columns_um']:.3f} µm; every row of a TDI "
+        "line sees the same columns.",
+        f"Beyond this, points scatter by {noise['white_compensated_um']:.2f} µm about a smooth curve "
+        f"({noise['white_raw_um']:.2f} µm with angles as read): the subdivision error, which the calibration's steps "
+        "cannot see.",
+    )
+    figure = SvgFigure(
+        "distortion-spot",
+        "A spot, enlarged",
+        "Mean of the frames of one exposure in the middle of the field; the cross is the energy centroid, the "
+        "circle its window.",
+        spot_svg(run),
+    )
+    return Section("Spots and noise", text, (figure,))

@@ -1,0 +1,375 @@
+"""What a focal-plane alignment gives: focus.json, the main table, the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.units import ARCSEC
+from optics.geometry.pose import rotation_vector
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from optics.targets.collimator import TooNarrowError
+from twin.laboratory.focus_alignment import Alignment, Shimming, State, align, mount_of
+from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_figures import defocus_svg, edges_svg, mtf_svg, through_focus_svg
+from twin.laboratory.focus_scan import VERTEX_ERROR
+from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
+from twin.run.artefact import SvgFigure, Table, fixed
+from twin.run.result import Advance, BenchError, LabResult, Section
+from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
+
+if TYPE_CHECKING:
+    from scenes.specs.lab_setup import FocusSetup
+
+
+ARCMIN = 60.0 * ARCSEC
+UM = 1e6
+
+
+def to_dict(alignment: Alignment) -> dict[str, Any]:
+    """focus.json."""
+    states, shimmings = alignment.states, alignment.shimmings
+    return {
+        "camera": alignment.bench.setup.camera.name,
+        "seed": alignment.seed,
+        "initial": _state(alignment, states[0]),
+        "rounds": [
+            {**_state(alignment, after), **_shims(done)} for after, done in zip(states[1:], shimmings, strict=True)
+        ],
+        "mtf_budget": [
+            {"band": line.band, "direction": line.edge, "factors": dict(line.factors), "total": line.total}
+            for line in alignment.bench.budget()
+        ],
+        "truth": {
+            "initial": _truth(alignment, states[0]),
+            "rounds": [_truth(alignment, state) for state in states[1:]],
+        },
+    }
+
+
+def _state(alignment: Alignment, state: State) -> dict[str, Any]:
+    out: dict[str, Any] = {
+        "confocal_um_max": UM * float(np.max(np.abs(state.defocus))),
+        "confocal_um_sigma": UM * float(np.hypot(np.max(state.defocus_sigma), VERTEX_ERROR)),
+        "line_level_arcmin": state.level.angle / ARCMIN,
+        "line_level_arcmin_sigma": state.level.sigma / ARCMIN,
+        "sites": [
+            {
+                "band": site.band,
+                "field": site.field,
+                "defocus_um": UM * float(defocus),
+                "defocus_um_sigma": UM * float(sigma),
+            }
+            for site, defocus, sigma in zip(alignment.bench.sites, state.defocus, state.defocus_sigma, strict=True)
+        ],
+    }
+    if state.focus:
+        for edge, key in ((TRACK, "mtf_nyquist"), (ALONG, "mtf_nyquist_along_line")):
+            values = {band: _mean_mtf(alignment, state, band, edge) for band in alignment.bench.ccds}
+            out[key] = {band: value for band, (value, _) in values.items()}
+            out[f"{key}_sigma"] = {band: sigma for band, (_, sigma) in values.items()}
+    return out
+
+
+def _mean_mtf(alignment: Alignment, state: State, band: str, edge: str) -> tuple[float, float]:
+    """Mean over the fields of the measured MTF at Nyquist, and its sigma."""
+    pairs = [f.by_edge[edge] for f, s in zip(state.focus, alignment.bench.sites, strict=True) if s.band == band]
+    values, sigmas = np.array(pairs).T
+    return float(np.mean(values)), float(np.sqrt(np.sum(sigmas**2)) / len(sigmas))
+
+
+def _shims(shimming: Shimming) -> dict[str, Any]:
+    plane, plan = shimming.plane, shimming.plan
+    assert plan.thickness is not None
+    names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
+    piston, slope_x, slope_y = np.sqrt(np.diag(shimming.covariance))
+    return {
+        # whole steps of the workshop; beyond picometres there is only rounding
+        "shims_um": {n: round(UM * float(t), 6) for n, t in zip(names, plan.thickness, strict=True)},
+        "shim_changes_um": {n: round(UM * float(t), 6) for n, t in zip(names, plan.rounded_change, strict=True)},
+        "slides_mm": {n: [1e3 * float(x) for x in s] for n, s in zip(names, plan.slide, strict=True)},
+        "turn_by_hand_arcmin": plan.turn / ARCMIN,
+        "line_level_without_turn_arcmin": plan.level_coupling / ARCMIN,
+        "correction": {
+            "rotation_arcmin": [float(v) / ARCMIN for v in plan.wanted.rotation],
+            "shift_um": [UM * float(v) for v in plan.wanted.shift],
+            "piston_um_sigma": UM * float(piston),
+            "slope_x_arcsec_sigma": float(slope_x) / ARCSEC,
+            "slope_y_arcsec_sigma": float(slope_y) / ARCSEC,
+        },
+        "chips_um_rms": UM * plane.extra_sigma,
+    }
+
+
+def _truth(alignment: Alignment, state: State) -> dict[str, Any]:
+    bench, standing = alignment.bench, state.standing
+    mtf = {}
+    for band in bench.ccds:
+        values = [
+            s.imagers[TRACK].mtf(float(s.crossing(standing.pose, standing.heights[band])[2]), s.nyquist)
+            for s in bench.sites
+            if s.band == band
+        ]
+        mtf[band] = float(np.mean(values))
+    return {
+        "confocal_um_max": UM * float(np.max(np.abs(state.true_defocus))),
+        "line_level_arcmin": state.true_level / ARCMIN,
+        "mtf_nyquist": mtf,
+        "rotation_arcmin": [float(v) / ARCMIN for v in rotation_vector(standing.pose.rotation)],
+        "shift_um": [UM * float(v) for v in standing.pose.translation],
+        "chip_height_um": {band: UM * height for band, height in standing.heights.items()},
+        "defocus_um": [UM * float(v) for v in state.true_defocus],
+    }
+
+
+def run_focus(setup: FocusSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
+    """Build the bench, align, and put the result together.
+
+    Raises:
+        InputError: the camera cannot be built as the file says.
+        BenchError: what the file asks for cannot be done.
+    """
+    mount_of(setup.test)
+    try:
+        bench = FocusBench(setup, backend, advance)
+    except TooNarrowError as error:
+        raise BenchError(str(error), ("collimator", "aperture"), "a wider collimator") from error
+    except (AimError, BeamMissedError, ValueError) as error:
+        raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
+    _check_light(bench)
+    return focus_result(align(bench, seed, advance))
+
+
+def _check_light(bench: FocusBench) -> None:
+    """BenchError when the bright side of the edge would saturate, which would falsify its MTF."""
+    most = {name: ccd.largest_white for name, ccd in bench.ccds.items()}
+    name = min(most, key=lambda n: most[n])
+    white = bench.setup.test.white
+    if white > most[name]:
+        raise BenchError(
+            f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}",
+            ("white",),
+            f"{np.floor(100 * most[name]):.0f} percent or less",
+        )
+
+
+def focus_result(alignment: Alignment) -> LabResult:
+    """Numbers, table and report of an alignment."""
+    first, last = alignment.states[0], alignment.states[-1]
+    bench = alignment.bench
+    data = to_dict(alignment)
+    end = data["rounds"][-1]
+    lead = (
+        f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
+        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} µm from best focus, in every "
+        f"field and band (the paper reached {CONFOCAL_UM:.0f} µm), "
+        f"and the line to {abs(end['line_level_arcmin']):.2f}′ of level (the paper: {LINE_LEVEL_ARCMIN:g}′).",
+    )
+    images = {
+        f"{bench.sites[i].band}_field{k}_{edge}": scan.frames[edge]
+        for i, scan in enumerate(last.focus)
+        for edge in DIRECTIONS
+        for k in [bench.setup.test.fields.index(bench.sites[i].field) + 1]
+    }
+    return LabResult(
+        "focus",
+        f"Focal-plane alignment of {bench.setup.camera.name}",
+        lead,
+        _facts(alignment),
+        data,
+        _summary(data),
+        (_alignment_section(alignment), _mtf_section(alignment, data), _shim_section(alignment)),
+        images,
+    )
+
+
+def _number(rounds: int) -> str:
+    return "One round" if rounds == 1 else f"{rounds} rounds"
+
+
+def _thousands(value: float) -> str:
+    """A large number with narrow spaces."""
+    return f"{value:,.0f}".replace(",", "\u202f")
+
+
+def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
+    setup = alignment.bench.setup
+    test, camera = setup.test, setup.camera
+    bands = ", ".join(
+        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM * b.pitch:g} µm"
+        for name, b in camera.bands.items()
+    )
+    level = test.white
+    electrons = ", ".join(
+        f"{name} {_thousands(level * ccd.detector.full_well_e)} e" for name, ccd in alignment.bench.ccds.items()
+    )
+    return (
+        (
+            "Camera",
+            f"{camera.name}: f {alignment.bench.focal_length:.3f} m (geometric mean of both directions), pupil "
+            f"{camera.entrance_pupil:g} m; {bands}",
+        ),
+        (
+            "Collimator",
+            f"f {test.collimator.focal_length:g} m, aperture {test.collimator.aperture:g} m; a slanted edge of "
+            f"{np.degrees(test.edge.angle):g}° at its focus, regions of {test.edge.region} × {test.edge.region} pixels",
+        ),
+        ("Light", f"bright side at {100 * level:.0f}% of the full well ({electrons}); {test.frames} frames averaged"),
+        ("Fields", ", ".join(f"{f:g}".replace("-", "−") for f in test.fields) + " of half the line, all bands"),
+        (
+            "Mount",
+            f"{len(test.mount.holes)} holes, surface inclined by {np.degrees(test.mount.tilt):g}° against the focal "
+            f"plane, shims ground in steps of {UM * test.mount.step:g} µm",
+        ),
+    )
+
+
+def _summary(data: Mapping[str, Any]) -> Table:
+    stages = [("before", data["initial"], data["truth"]["initial"])]
+    for k, (measured, true) in enumerate(zip(data["rounds"], data["truth"]["rounds"], strict=True)):
+        stages.append((f"after round {k + 1}", measured, true))
+    rows = []
+    for name, measured, true in stages:
+        rows.append(
+            (
+                name,
+                f"{measured['confocal_um_max']:.1f} ± {measured['confocal_um_sigma']:.1f}",
+                fixed(true["confocal_um_max"], 1),
+                f"{fixed(measured['line_level_arcmin'], 2)} ± {measured['line_level_arcmin_sigma']:.2f}",
+                fixed(true["line_level_arcmin"], 2),
+            )
+        )
+    rows.append(("paper 004", f"{CONFOCAL_UM:.0f}", "", f"{LINE_LEVEL_ARCMIN:g}", ""))
+    return Table(
+        "alignment",
+        "Before and after",
+        "Confocal error: largest distance of any CCD from best focus, over all fields and bands.",
+        ("", "confocal error, µm", "true", "line level, arcmin", "true"),
+        rows,
+    )
+
+
+def _alignment_section(alignment: Alignment) -> Section:
+    text = (
+        "The target is moved through the collimator's focus; a slanted edge is recorded at every position in both "
+        "directions, and its MTF at the band's Nyquist frequency is fitted by its main peak. The image moves along the "
+        "line's direction with f² of that direction over the collimator's f², which differ by "
+        f"{100 * _anamorphism(alignment):.1f}% in this camera; each direction is reduced with its own.",
+        "Best focus is midway between those of the two directions, which astigmatism moves apart.",
+    )
+    figures = (
+        SvgFigure(
+            "through-focus",
+            "Through focus",
+            "Measured MTF at Nyquist with one sigma; dotted, the fitted best focus of each field. Black: the CCD.",
+            through_focus_svg(alignment),
+        ),
+        SvgFigure(
+            "defocus",
+            "Where the CCDs stand",
+            "Points: measured with one sigma. Dashes: truth from the traced pupils. Grey band: what the paper reached.",
+            defocus_svg(alignment),
+        ),
+    )
+    return Section("Alignment", text, figures)
+
+
+def _anamorphism(alignment: Alignment) -> float:
+    site = alignment.bench.sites[0]
+    return float(abs(site.nominal_per_shift[TRACK] / site.nominal_per_shift[ALONG] - 1.0))
+
+
+def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
+    end, true = data["rounds"][-1], data["truth"]["rounds"][-1]
+    rows = [
+        (
+            band,
+            f"{MTF_NYQUIST[band]:.2f}" if band in MTF_NYQUIST else "",
+            f"{end['mtf_nyquist'][band]:.4f} ± {end['mtf_nyquist_sigma'][band]:.4f}",
+            f"{true['mtf_nyquist'][band]:.4f}",
+            f"{end['mtf_nyquist_along_line'][band]:.4f} ± {end['mtf_nyquist_along_line_sigma'][band]:.4f}",
+        )
+        for band in alignment.bench.ccds
+    ]
+    names = list(data["mtf_budget"][0]["factors"])
+    budget = [
+        (
+            line["band"],
+            DIRECTION_NAMES[line["direction"]],
+            *(f"{line['factors'][n]:.3f}" for n in names),
+            f"{line['total']:.3f}",
+        )
+        for line in data["mtf_budget"]
+    ]
+    text = (
+        "The paper's values are compared with the MTF along the track, which has everything in it: optics, pixel, "
+        "charge diffusion and the motion of the image over the stages.",
+        "The camera as designed would have the product of diffraction, design and pixel. The others are the "
+        "degradations that bring it to the paper's class; the paper names none of them, so that they are one "
+        "plausible set among others.",
+    )
+    return Section(
+        "MTF at the Nyquist frequency",
+        text,
+        (
+            Table(
+                "mtf",
+                "Measured in focus, mean over the fields",
+                "The noise's sigma; truth from the traced pupils at the places where the CCDs really stand.",
+                ("band", "paper 004", "along the track", "along the track, true", "along the line"),
+                rows,
+            ),
+            Table(
+                "mtf-budget",
+                "What makes it, in the middle of the field",
+                "Transfer of each effect at Nyquist, from the trace and the data sheets; diffraction: the pupil "
+                "without aberrations; design: those of the prescription, at best focus of each direction; "
+                "wavefront: the camera's and the collimator's errors, at best focus midway between the directions.",
+                ("band", "direction", *(n.replace("_", " ").replace("tdi", "TDI") for n in names), "product"),
+                budget,
+            ),
+            SvgFigure(
+                "mtf-curves",
+                "MTF curves in the middle of the field, after the alignment",
+                "Measured from the slanted edge, with two sigma; dashed: the traced pupil times the detector's "
+                "factors. Dotted: Nyquist frequency.",
+                mtf_svg(alignment),
+            ),
+            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", edges_svg(alignment)),
+        ),
+    )
+
+
+def _shim_section(alignment: Alignment) -> Section:
+    tables = []
+    for number, shimming in enumerate(alignment.shimmings):
+        plan = shimming.plan
+        assert plan.thickness is not None
+        rows = [
+            (
+                f"{k + 1}",
+                f"{fixed(UM * float(plan.change[k]), 1)} ± {UM * float(plan.change_sigma[k]):.1f}",
+                fixed(UM * float(plan.rounded_change[k]), 0),
+                fixed(UM * float(plan.thickness[k]), 0),
+                fixed(1e3 * float(np.linalg.norm(plan.slide[k])), 3),
+            )
+            for k in range(len(plan.thickness))
+        ]
+        tables.append(
+            Table(
+                f"shims-{number + 1}",
+                f"Shims of round {number + 1}",
+                "Changes of thickness under each hole; their sigma has in it that the sites do not lie on one plane "
+                f"({UM * shimming.plane.extra_sigma:.1f} µm rms: chips, curvature of field). The turn in the mounting "
+                f"surface of {fixed(plan.turn / ARCMIN, 2)}′ is set by hand; without it the line would be off level by "
+                f"{fixed(plan.level_coupling / ARCMIN, 2)}′, "
+                "since the mounting surface is not parallel to the focal plane.",
+                ("hole", "change, µm", "ground, µm", "new shim, µm", "slide, mm"),
+                rows,
+            )
+        )
+    return Section("Shims", (), tuple(tables))

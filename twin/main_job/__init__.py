@@ -1,0 +1,1 @@
+"""The job of `python -m twin.render`: its run, files and report."""

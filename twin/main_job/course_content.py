@@ -1,0 +1,228 @@
+"""What the report says of a series over times, with its figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.recovery import ESTIMATORS
+from analysis.units import ARCSEC
+from scenes.specs.channel import BASE
+from scenes.specs.course import moment
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import PARAMETERS
+from twin.main_job.spot_figures import MARKS
+from twin.monitor.time_series import CourseRun
+from twin.run.artefact import FAR, MINUS, decimals_for, fixed
+from twin.run.svg import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    look,
+    new_figure,
+    plain_axes,
+    to_svg,
+)
+
+ANGLE_MEANING = "angle between the two lines of sight"
+
+
+def course_content(run: RenderRun) -> dict[str, Any] | None:
+    """Facts and the table of errors; None for a job without a course."""
+    course = run.course
+    if course is None:
+        return None
+    tables = []
+    for name, estimators in course.parameters.items():
+        rows = []
+        for k, p in enumerate(PARAMETERS):
+            values = {e: (v.vector[:, k] * PER_SI[k], v.sigma[:, k] * PER_SI[k]) for e, v in estimators.items()}
+            key = f"course.{name}.{p.key}"
+            rows.append(_row(key, f"{p.symbol} [{p.unit}]", p.meaning, course.truth[name][k] * PER_SI[k], values))
+        tables.append({"title": f"Camera {name}", "rows": rows})
+    if course.recovered_angle:
+        values = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in course.recovered_angle.items()}
+        row = _row("course.angle", "Δθ [arcsec]", ANGLE_MEANING, course.angle_change / ARCSEC, values)
+        tables.append({"title": "Angle between the cameras", "rows": [row]})
+    return {
+        "count": len(course.times),
+        "first": moment(float(course.times[0])),
+        "last": moment(float(course.times[-1])),
+        "shown": moment(float(course.times[course.shown])),
+        "tables": tables,
+        "worst": _worst(course),
+        "files": [f"images/{c.camera}_{c.side}_course.tiff" for c in run.experiment.path.channels],
+    }
+
+
+def _row(
+    key: str, name: str, meaning: str, true: np.ndarray, values: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> dict[str, Any]:
+    cells = []
+    finest = min(float(np.median(sigma)) for _, sigma in values.values())
+    places = decimals_for(finest)
+    for estimator in ESTIMATORS:
+        value, sigma = values[estimator]
+        error = float(np.sqrt(np.mean((value - true) ** 2)))
+        size = float(np.sqrt(np.mean(sigma**2)))
+        cells.append(
+            {
+                "key": f"{key}.{estimator}",
+                "value": fixed(error, decimals_for(size)),
+                "sigma": fixed(size, decimals_for(size)),
+                "far": size > 0 and error > FAR * size,
+            }
+        )
+    low, high = fixed(float(true.min()), places), fixed(float(true.max()), places)
+    return {"key": key, "name": name, "meaning": meaning, "true": _range(low, high), "cells": cells}
+
+
+def _range(low: str, high: str) -> str:
+    low, high = low.strip(MINUS) if not low.strip(f"{MINUS}0.") else low, high
+    return low if low == high else f"{low} … {high}"
+
+
+def _worst(course: CourseRun) -> str:
+    """The camera that the model reads worst in Δα, by how much, when, and how much truly happened."""
+    errors = {
+        name: (estimators["model"].vector[:, 0] - course.truth[name][0]) * PER_SI[0]
+        for name, estimators in course.parameters.items()
+    }
+    name = max(errors, key=lambda n: float(np.max(np.abs(errors[n]))))
+    k = int(np.argmax(np.abs(errors[name])))
+    sigma = float(course.parameters[name]["model"].sigma[k, 0]) * PER_SI[0]
+    true = float(course.truth[name][0, k]) * PER_SI[0]
+    places = decimals_for(sigma)
+    return (
+        f"The model's largest error of Δα is {fixed(float(errors[name][k]), places, sign=True)} arcsec, camera {name} "
+        f"at {moment(float(course.times[k]))}, where it truly is {fixed(true, places, sign=True)} "
+        f"arcsec; the noise is {fixed(sigma, places)} arcsec."
+    )
+
+
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, INK, GREY)
+"""Of the nodes; after the last one they begin again, with the next line style."""
+STYLES = ("-", "--", ":")
+"""Of the first nodes, and of those whose colour has been used before."""
+UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
+"""From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
+
+
+def time_axis(course: CourseRun) -> tuple[np.ndarray, str]:
+    """Times of a course in a unit that suits its length, and the axis label."""
+    span = float(course.times[-1] - course.times[0])
+    size, unit = next((size, unit) for least, size, unit in UNITS if span >= least)
+    return course.times / size, f"time [{unit}]"
+
+
+def temperatures_svg(course: CourseRun) -> str:
+    """Change at the origin and gradient along each axis of every node of the course."""
+    with look("temperatures"):
+        time, label = time_axis(course)
+        figure = new_figure(4.1 + 0.2 * -(-len(course.temperatures) // 3))
+        panels = figure.subplots(2, 2, sharex=True)
+        panels[0, 1].sharey(panels[1, 0])
+        panels[1, 1].sharey(panels[1, 0])
+        handles = []
+        for number, (path, fields) in enumerate(course.temperatures.items()):
+            colour, style = COLOURS[number % len(COLOURS)], STYLES[number // len(COLOURS) % len(STYLES)]
+            change = np.array([[field.change] for field in fields])
+            values = np.concatenate([change, 1e3 * np.array([field.gradient for field in fields])], axis=1)
+            for axes, value in zip(panels.flat, values.T, strict=True):
+                axes.plot(time, value, color=colour, ls=style, lw=1.4, label=path.removeprefix(f"{BASE}/"))
+            handles.append(panels[0, 0].get_lines()[-1])
+        titles = ("change at the origin [K]", *(f"gradient along {axis} [mK/m]" for axis in "XYZ"))
+        for axes, title in zip(panels.flat, titles, strict=True):
+            _frame(axes, course, time)
+            axes.set_title(title, loc="left")
+        for axes in panels[1]:
+            axes.set_xlabel(label)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        return to_svg(figure)
+
+
+def parameters_svg(course: CourseRun, names: dict[str, str]) -> str:
+    """True parameters as lines, recovered ones as marks, camera by camera, and the angle between two cameras.
+
+    Args:
+        course: the course.
+        names: estimator -> its name for readers.
+    """
+    with look("course"):
+        time, label = time_axis(course)
+        cameras = list(course.parameters)
+        rows = len(PARAMETERS) + bool(course.recovered_angle)
+        figure = new_figure(0.7 + 1.5 * rows)
+        grid = figure.add_gridspec(rows, len(cameras))
+        for column, name in enumerate(cameras):
+            for row, parameter in enumerate(PARAMETERS):
+                axes = figure.add_subplot(grid[row, column])
+                size = PER_SI[row]
+                values = {
+                    e: (size * p.vector[:, row], size * p.sigma[:, row]) for e, p in course.parameters[name].items()
+                }
+                _panel(axes, course, time, size * course.truth[name][row], values, names)
+                if column == 0:
+                    axes.set_ylabel(f"{parameter.symbol} [{parameter.unit}]")
+                if row == 0:
+                    axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
+                axes.tick_params(labelbottom=row == rows - 1)
+                if row == rows - 1:
+                    axes.set_xlabel(label)
+        if course.recovered_angle:
+            axes = figure.add_subplot(grid[-1, :])
+            angles = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in course.recovered_angle.items()}
+            _panel(axes, course, time, course.angle_change / ARCSEC, angles, names)
+            axes.set_ylabel("Δθ [arcsec]")
+            axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
+            axes.set_xlabel(label)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        figure.align_ylabels()
+        return to_svg(figure)
+
+
+def _panel(
+    axes: Axes,
+    course: CourseRun,
+    time: np.ndarray,
+    true: np.ndarray,
+    values: dict[str, tuple[np.ndarray, np.ndarray]],
+    names: dict[str, str],
+) -> None:
+    _frame(axes, course, time)
+    for estimator, (marker, colour) in MARKS.items():
+        value, sigma = values[estimator]
+        axes.errorbar(
+            time, value, sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,
+            label=names[estimator],
+        )  # fmt: skip
+    axes.plot(time, true, color=INK, lw=1.5, label="true", zorder=1.5)
+    low, high = axes.get_ylim()
+    # noise alone must not fill a panel
+    least = 6.0 * max(float(np.max(sigma)) for _, sigma in values.values())
+    if high - low < least:
+        middle = 0.5 * (low + high)
+        axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)
+
+
+def _frame(axes: Axes, course: CourseRun, time: np.ndarray) -> None:
+    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    axes.axvline(time[course.shown], color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+    plain_axes(axes)
+    axes.grid(axis="y", color=LIGHT, lw=0.5)
+    axes.set_axisbelow(True)
+    axes.yaxis.set_major_formatter(_number_text)
+
+
+def _number_text(value: float, place: float) -> str:
+    return f"{round(value, 9) + 0.0:g}".replace("-", MINUS)

@@ -1,0 +1,217 @@
+"""Side view of the instrument with its light, and the footprints of the beams on every mirror."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from scipy.spatial import ConvexHull
+
+from optics.geometry.solid import Solid, solid_mesh
+from scenes.models.camera_model import CameraModel
+from scenes.models.instrument_model import Instrument
+from scenes.specs.channel import BASE, CENTRAL_PRISM, SIDES
+from twin.pictures.light_paths import RIM, Beam, LightPaths
+from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
+
+FIELD_COLOURS = {"left edge": SKY, "centre": BLUE, "right edge": PURPLE}
+SIDE_COLOURS = {"left": VERMILION, "right": ORANGE}
+ARROW = 0.3
+"""Length of the arrow along a line of sight, metres."""
+_GLASS, _BLOCK = (0.34, 0.71, 0.91, 0.25), (0.0, 0.62, 0.45, 0.22)  # fills, red, green, blue and opacity
+_UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the stop: the ones in the plane of symmetry
+
+
+def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
+    """Base X-Z plane, metres; the mirrors are cut in the camera's plane of symmetry."""
+    with look("side-view"):
+        spread = np.concatenate([b.vertices.reshape(-1, 3) for b in paths.beams])
+        low, high = spread[:, [0, 2]].min(axis=0) - 0.3, spread[:, [0, 2]].max(axis=0) + 0.3 + 0.5 * ARROW
+        width, height = high - low
+        figure = new_figure(min(10.6 * height / width + 0.6, 9.0))
+        axes = figure.subplots()
+        for camera in instrument.cameras:
+            _camera_side(axes, instrument, paths, camera)
+        _prisms(axes, instrument, paths)
+        axes.set(xlabel="base X, flight direction [m]", ylabel="base Z, toward the scene [m]", aspect="equal")
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.grid(color=LIGHT, lw=0.5)
+        axes.set_axisbelow(True)
+        plain_axes(axes)
+        handles = [
+            Line2D([], [], color=BLUE, lw=1.2, label="imaging beam: chief and marginal rays, field centre"),
+            Line2D([], [], color=VERMILION, lw=1.2, label="monitor beam, left channel (out and back)"),
+            Line2D([], [], color=INK, lw=3, label="mirrors, clear apertures"),
+            Line2D([], [], color=GREEN, lw=3, label="focal plane; return faces"),
+            Patch(fc=_GLASS, ec=INK, lw=0.8, label="glass prisms"),
+            Patch(fc=_BLOCK, ec=INK, lw=0.8, label="central prism, common reference"),
+        ]
+        figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        return to_svg(figure)
+
+
+def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str) -> None:
+    model, placed = instrument.cameras[camera], paths.placed
+    imaging = next(b for b in paths.of(camera, monitor=False) if b.name.endswith("centre"))
+    monitor = paths.of(camera, monitor=True)[0]
+    _fan(axes, imaging, BLUE, 0.09)
+    _fan(axes, monitor, VERMILION, 0.30)
+    centres = [placed.pose(f"{BASE}/{camera}/{m}").apply(_section(model, m).mean(axis=0)) for m in model.mirrors]
+    middle = np.mean(centres, axis=0)
+    for mirror in model.mirrors:
+        curve = placed.pose(f"{BASE}/{camera}/{mirror}").apply(_section(model, mirror))
+        axes.plot(curve[:, 0], curve[:, 2], color=INK, lw=3, solid_capstyle="butt", zorder=4)
+        centre = curve[len(curve) // 2]
+        away = (centre - middle)[[0, 2]]
+        away = 15.0 * away / np.linalg.norm(away)
+        _label(axes, mirror, centre[[0, 2]], (float(away[0]), float(away[1])), "center", bold=True)
+    _focal_plane(axes, paths, camera)
+    for channel in instrument.channels:
+        if channel.camera == camera:
+            pose = placed.pose(channel.face_body)
+            aperture = instrument.assembly.elements[f"{channel.key}/return_face"].aperture
+            assert aperture is not None
+            radius = aperture.bounds[1]
+            ends = pose.apply(radius * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+            axes.plot(*_widest(ends), color=GREEN, lw=3, solid_capstyle="butt", zorder=5)
+    origin = placed.pose(f"{BASE}/{camera}")
+    end = imaging.vertices[0, 0]
+    tip = end + ARROW * (end - imaging.vertices[0, 1]) / np.linalg.norm(end - imaging.vertices[0, 1])
+    axes.annotate("", xy=tip[[0, 2]], xytext=end[[0, 2]], arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.3})
+    look_deg = float(np.degrees(instrument.spec.cameras[camera].look))
+    text = f"{camera}, look {look_deg:+.4g}°".replace("-", "\N{MINUS SIGN}")
+    first = placed.pose(f"{BASE}/{camera}/{model.mirrors[0]}").apply(_section(model, model.mirrors[0]))
+    _label(axes, text, np.array([origin.translation[0], first[:, 2].min()]), (-4, -22), "top", bold=True)
+
+
+def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
+    """Outlines of all glass bodies; left and right ones lie behind each other and get one label."""
+    small = []
+    for solid in instrument.solids:
+        outline = _outline(solid, paths)
+        fill = _GLASS if solid.transparent else _BLOCK
+        axes.add_patch(Polygon(outline, closed=True, fc=fill, ec="none", zorder=1.6))
+        axes.add_patch(Polygon(outline, closed=True, fill=False, ec=INK, lw=0.8, zorder=3))
+        if not solid.transparent:
+            middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
+            _label(axes, "central prism", np.array([middle, outline[:, 1].min()]), (0, -4), "top")
+        elif solid.path.endswith("prism_0"):
+            small.append(outline)
+        elif f"/{SIDES[0]}/" in solid.path:
+            _label(axes, "180° prism", outline[np.argmax(outline[:, 1])], (0, 5), "bottom")
+    corners = np.concatenate(small)
+    among = np.array([np.mean([outline[:, 0].mean() for outline in small]), corners[:, 1].max()])
+    _label(axes, "0° prisms", among, (0, 6), "bottom")
+
+
+def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
+    """A convex body as the side view sees it: corners of its outline in order, x and z, metres."""
+    corners = paths.placed.pose(solid.path).apply(solid_mesh(solid, paths.placed).mesh.vertices)[:, [0, 2]]
+    return np.asarray(corners[ConvexHull(corners).vertices])
+
+
+def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
+    """Seen along the line CCD a focal plane is a point: it is drawn as a bar wide enough to be seen."""
+    pose = paths.placed.pose(f"{BASE}/{camera}/focal_plane")
+    bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))
+    axes.plot(bar[:, 0], bar[:, 2], color=GREEN, lw=4, solid_capstyle="butt", zorder=5)
+    # beside the monitor beams, which go to the central prism
+    prism = paths.placed.pose(CENTRAL_PRISM).translation
+    aside = -17.0 if prism[0] > pose.translation[0] else 10.0
+    _label(axes, "focal plane", pose.translation[[0, 2]], (aside, 10.0), "bottom")
+
+
+def _widest(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of two diameters of a disk, the one that the side view sees longer: x and z of its ends."""
+    pairs = ends.reshape(2, 2, 3)[..., [0, 2]]
+    best = int(np.argmax(np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1)))
+    return pairs[best, :, 0], pairs[best, :, 1]
+
+
+def _section(model: CameraModel, mirror: str) -> np.ndarray:
+    """Points of a mirror in its plane of symmetry, in its own frame."""
+    _, _, low, high = model.apertures[mirror].bounds
+    y = np.linspace(low, high, 25)
+    return np.stack([np.zeros_like(y), y, model.surfaces[mirror].sag(np.zeros_like(y), y)], axis=-1)
+
+
+def _fan(axes: Axes, beam: Beam, colour: str, alpha: float) -> None:
+    """A beam as seen from the side: shaded segment by segment, its middle ray and its outermost rays drawn."""
+    flat = beam.vertices[:, :, [0, 2]]
+    for k in range(flat.shape[1] - 1):
+        outline = np.concatenate([flat[[_UP, _DOWN], k], flat[[_DOWN, _UP], k + 1]])
+        axes.add_patch(Polygon(outline, closed=True, color=colour, alpha=alpha, lw=0))
+    for ray, width in ((0, 0.9), (_UP, 0.7), (_DOWN, 0.7)):
+        axes.plot(flat[ray, :, 0], flat[ray, :, 1], color=colour, lw=width)
+
+
+def _label(
+    axes: Axes,
+    text: str,
+    at: np.ndarray,
+    offset: tuple[float, float],
+    vertical: str,
+    bold: bool = False,
+) -> None:
+    axes.annotate(
+        text,
+        xy=(float(at[0]), float(at[1])),
+        xytext=offset,
+        textcoords="offset points",
+        ha="center",
+        va=vertical,
+        fontsize=8.5,
+        fontweight="bold" if bold else "normal",
+        zorder=6,
+        bbox={"boxstyle": "square,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.8},
+    )
+
+
+def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
+    """Where the beams meet each mirror, millimetres in the mirror's own x, y; a row per camera."""
+    with look("footprints"):
+        cameras = list(instrument.cameras)
+        columns = max(len(model.mirrors) for model in instrument.cameras.values())
+        figure = new_figure(0.7 + 3.0 * len(cameras))
+        grid = figure.subplots(len(cameras), columns, squeeze=False)
+        for line, camera in enumerate(cameras):
+            model = instrument.cameras[camera]
+            for k, mirror in enumerate(model.mirrors):
+                axes = grid[line, k]
+                _footprints(axes, instrument, paths, camera, mirror)
+                stop = " (stop)" if mirror == model.spec.stop else ""
+                axes.set_title(f"{camera} {mirror}{stop}")
+                axes.set_xlabel("x, along the line [mm]")
+                if k == 0:
+                    axes.set_ylabel("y, in the plane of symmetry [mm]")
+            for k in range(len(model.mirrors), columns):
+                grid[line, k].set_axis_off()
+        handles = [Line2D([], [], color=INK, lw=1.3, label="clear aperture")]
+        handles += [Line2D([], [], color=c, lw=1.3, label=f"imaging, {f}") for f, c in FIELD_COLOURS.items()]
+        marks = [
+            Patch(fc=SIDE_COLOURS["left"], alpha=0.5, label="monitor, left"),
+            Patch(fill=False, ec=SIDE_COLOURS["right"], lw=1.4, label="monitor, right"),
+        ]
+        figure.legend(handles=[*handles, *marks], loc="outside upper center", ncols=6, columnspacing=1.3)
+        return to_svg(figure)
+
+
+def _footprints(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str, mirror: str) -> None:
+    outline = 1e3 * instrument.cameras[camera].apertures[mirror].outline()
+    axes.plot(outline[:, 0], outline[:, 1], color=INK, lw=1.3)
+    for beam in paths.of(camera, monitor=False):
+        edge = 1e3 * beam.footprints[mirror, 0][1:]
+        axes.add_patch(Polygon(edge, closed=True, fill=False, ec=FIELD_COLOURS[beam.name.rpartition("/")[2]], lw=1.2))
+    for beam in paths.of(camera, monitor=True):
+        colour = SIDE_COLOURS.get(beam.name.rpartition("/")[2], VERMILION)
+        for (where, _), points in beam.footprints.items():
+            if where == mirror:
+                # the sides may coincide: one is filled, the other an outline
+                fill = {"fc": colour, "alpha": 0.5} if beam.name.endswith("left") else {"fill": False, "lw": 1.4}
+                axes.add_patch(Polygon(1e3 * points[1:], closed=True, ec=colour, **fill))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.grid(color=LIGHT, lw=0.4)
+    axes.set_axisbelow(True)
+    axes.tick_params(length=2.5)

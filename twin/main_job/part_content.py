@@ -1,0 +1,219 @@
+"""What the report says of image quality, of stray light and of targets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from twin.main_job.render_results import RenderRun
+from twin.monitor.image_quality import PLACES, CameraQuality
+from twin.path_tracing.path_result import Family
+from twin.run.artefact import FAR, fixed, plain, residual, residual_text, significant
+from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
+from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, PlaceTargets
+
+WHEN = ("before", "after")
+WAVES, MICROMETRES, MTF, PERCENT = 4, 1, 4, 2
+"""Decimals."""
+
+
+def quality_content(run: RenderRun) -> dict[str, Any] | None:
+    """Table and what it is about; None when it was not asked for."""
+    quality = run.quality
+    if quality is None:
+        return None
+    where = {place: quality.fields.index(field) for place, field in PLACES.items()}
+    return {
+        "wavelength": plain(1e9 * quality.wavelength),
+        "fields": len(quality.fields),
+        "places": list(where),
+        "obstruction": quality.obstruction,
+        "bodies": {name: ", ".join(camera.bodies) or "nothing" for name, camera in quality.cameras.items()},
+        "rows": [_camera(name, camera, where) for name, camera in quality.cameras.items()],
+    }
+
+
+def _camera(name: str, camera: CameraQuality, where: dict[str, int]) -> dict[str, Any]:
+    lines: list[tuple[str, str, np.ndarray, float, int]] = [
+        ("wfe_rms_waves", "wavefront error, rms [waves]", camera.wfe, 1.0, WAVES),
+        ("wfe_rms_waves_focus_removed", "the same at best focus [waves]", camera.wfe_refocused, 1.0, WAVES),
+        ("defocus_um", "best focus − line CCD [µm]", camera.defocus, 1e6, MICROMETRES),
+        ("mtf_along_line", "MTF at Nyquist along the line", camera.mtf_along_line, 1.0, MTF),
+        ("mtf_along_track", "MTF at Nyquist along the track", camera.mtf_along_track, 1.0, MTF),
+        ("light_lost", "light taken by bodies in the beam [%]", camera.light_lost, 1e2, PERCENT),
+    ]
+    rows = []
+    for key, label, values, unit, decimals in lines:
+        sign = key == "defocus_um"
+        cells = [
+            {
+                "key": f"quality.{name}.{key}.{place}.{when}",
+                "value": fixed(unit * float(values[s, k]), decimals, sign=sign),
+            }
+            for place, k in where.items()
+            for s, when in enumerate(WHEN)
+        ]
+        rows.append({"label": label, "cells": cells})
+    first, last = (plain(1e9 * wavelength) for wavelength in camera.wavelengths)
+    return {
+        "name": name,
+        "light": f"{first} nm" if first == last else f"{first} to {last} nm",
+        "nyquist": plain(1e-3 * camera.nyquist, 4),
+        "rows": rows,
+    }
+
+
+STRONGEST = 4
+"""Families listed of each source."""
+
+
+def stray_content(run: RenderRun) -> dict[str, Any] | None:
+    """Shares and families of the perturbed state; None when no stray light was asked for."""
+    if run.stray is None:
+        return None
+    after = run.stray.after
+    channels = run.experiment.path.channels
+    nominal = run.photons_after - after.photons
+    shares = after.share(nominal)
+    rows = []
+    for i, channel in enumerate(channels):
+        name = f"{channel.key}/area_ccd"
+        families = [pair for pair in after.traced.relative(channel.key) if pair[0].detector == name]
+        families.sort(key=lambda pair: -pair[1])
+        by_kind = {kind: sum(share for f, share in families if f.kind == kind) for kind in ("ghost", "stray")}
+        rows.append(
+            {
+                "channel": channel.key,
+                "share": significant(float(shares[i])),
+                "ghosts": significant(by_kind["ghost"]),
+                "scattered": significant(by_kind["stray"]),
+                "peak": significant(float(after.photons[i].max())),
+                "families": [_family(f, share, name) for f, share in families[:STRONGEST]],
+            }
+        )
+    taken = [
+        {"body": o.body, "beam": o.beam, "share": fixed(100.0 * o.share, 1), "used": fixed(100.0 * o.used, 1)}
+        for o in run.stray.obstructions
+    ]
+    return {"paths": f"{after.paths:,}".replace(",", "\N{THIN SPACE}"), "rows": rows, "taken": taken}
+
+
+def _family(family: Family, share: float, detector: str) -> dict[str, str]:
+    x, y = (fixed(1e6 * c, 1) for c in family.centroid)
+    way = [str(touch) for touch in family.touches]
+    common = _common(way)
+    text = " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)
+    return {
+        "kind": family.kind,
+        "share": significant(share),
+        "x": x,
+        "y": y,
+        "way": text or "not looked up",
+        "detector": detector,
+        "paths": str(family.count),
+    }
+
+
+def _common(way: list[str]) -> str:
+    """``base/<camera>/monitor/<side>/`` of the prisms' names, which every step repeats."""
+    prisms = [step for step in way if "/monitor/" in step]
+    return "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
+
+
+METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
+DECIMALS = 4
+"""Of an MTF."""
+
+
+def target_content(run: RenderRun) -> dict[str, Any] | None:
+    """Table and settings; None when no targets were asked for."""
+    if run.targets is None:
+        return None
+    images = run.resolved.job.render.target_images
+    edges, bars = "knife_edge" in images, "bars" in images
+    kinds = [name for name, is_there in (("edge", edges), ("bars", bars)) if is_there]
+    rows = (
+        [_target_content_camera(name, camera, kinds) for name, camera in run.targets.cameras.items()] if kinds else []
+    )
+    return {
+        "frames": run.targets.frames,
+        "white": plain(100.0 * run.resolved.targets.white),
+        "obstruction": run.targets.obstruction,
+        "edges": edges,
+        "bars": bars,
+        "kinds": kinds,
+        "methods": ", ".join(METHODS[kind] for kind in kinds),
+        "width": 2 + 4 * len(kinds),
+        "rows": rows,
+        "bias": _largest_bias(run) if edges else "",
+    }
+
+
+def _target_content_camera(name: str, camera: CameraTargets, kinds: list[str]) -> dict[str, Any]:
+    rows = []
+    for place, targets in camera.places.items():
+        for direction in DIRECTIONS:
+            cells = [
+                _cell(f"mtf.{name}.{place}.{direction}.{when}.{kind}", reading)
+                for kind in kinds
+                for when, reading in _readings(targets, direction, kind)
+            ]
+            first = direction == DIRECTIONS[0]
+            along, across = (fixed(1e6 * float(value), 2, sign=True) for value in targets.shift)
+            rows.append(
+                {
+                    "place": place,
+                    "direction": DIRECTION_NAMES[direction],
+                    "cells": cells,
+                    "shift": f"{along if first else across} {DIRECTION_NAMES[direction]}",
+                }
+            )
+    return {
+        "name": name,
+        "band": camera.band,
+        "pitch": plain(1e6 * camera.pitch),
+        "nyquist": plain(1e-3 * NYQUIST / camera.pitch, 4),
+        "rows": rows,
+    }
+
+
+def _readings(targets: PlaceTargets, direction: str, kind: str) -> list[tuple[str, EdgeReading | BarReading]]:
+    """Before and after."""
+    return [
+        (when, shots.edges[direction] if kind == "edge" else shots.bars[direction])
+        for when, shots in targets.shots.items()
+    ]
+
+
+def _cell(key: str, reading: EdgeReading | BarReading) -> dict[str, str]:
+    """One measured value and its truth."""
+    found = reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
+    if found is None:
+        nothing = dict.fromkeys(("sigma", "residual", "mark"), "")
+        return {"key": key, "value": "not measurable", "true": fixed(reading.true_nyquist, DECIMALS), **nothing}
+    value, sigma = found
+    true = reading.true_nyquist
+    ratio = residual(value - true, sigma)
+    far = ratio is not None and abs(ratio) > FAR
+    return {
+        "key": key,
+        "value": fixed(value, DECIMALS),
+        "sigma": fixed(sigma, DECIMALS),
+        "residual": f"{residual_text(ratio)} \N{GREEK SMALL LETTER SIGMA}",
+        "mark": "far" if far else "near",
+        "true": fixed(true, DECIMALS),
+    }
+
+
+def _largest_bias(run: RenderRun) -> str:
+    assert run.targets is not None
+    found = [
+        edge.nyquist_bias
+        for camera in run.targets.cameras.values()
+        for place in camera.places.values()
+        for shots in place.shots.values()
+        for edge in shots.edges.values()
+    ]
+    known = [bias for bias in found if bias is not None]
+    return f"at most {significant(max(known), 2, floor=0.0)}" if known else "an unknown amount"

@@ -1,0 +1,128 @@
+"""Files of a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from twin.main_job.render_report import write_report
+from twin.main_job.render_results import RenderRun, quality_dict, stated
+from twin.main_job.summary_figure import write_summary
+from twin.monitor.time_series import CourseRun
+from twin.pictures.scene_file import write_scene
+from twin.run.data_files import SPOT_STRETCH, netcdf, preview_png, tiff
+from twin.run.reference_frames import described, frames_text
+from twin.run.run_folder import MANIFEST, RunFolder
+from twin.run.versions import versions
+from twin.targets.target_result import TargetRun
+
+
+def write_run(
+    run: RenderRun, folder: RunFolder, started: float, clock: float, also: Callable[[], None] = lambda: None
+) -> None:
+    """Write all files of a run into an open run folder.
+
+    Args:
+        run: what to write.
+        folder: where.
+        started: time of the start, seconds since the epoch.
+        clock: seconds that the computation took.
+        also: writes more files into the folder, before the manifest lists them all.
+    """
+    # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
+    channels = run.experiment.path.channels
+    folder.write_text("config.yaml", run.resolved.to_yaml())
+    crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
+    recovered = stated(run.recovered_dict())
+    for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
+        _write_numbers(folder, kind, data)
+    for i, channel in enumerate(channels):
+        for when, frames in (("before", run.before[i]), ("after", run.after[i])):
+            stem = f"images/{channel.camera}_{channel.side}_{when}"
+            folder.write_bytes(f"{stem}.tiff", tiff(frames))
+            folder.write_bytes(f"{stem}.png", preview_png(frames))
+    folder.write_bytes("irradiance.nc", netcdf(_irradiance(run)))
+    if run.stray is not None:
+        _write_numbers(folder, "stray", run.stray.to_dict())
+    if run.course is not None:
+        _write_course(run, run.course, folder)
+    if run.targets is not None:
+        _write_targets(run.targets, folder)
+    if run.quality is not None:
+        _write_numbers(folder, "quality", quality_dict(run.quality))
+    folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
+    folder.write_with("report.html", lambda place: write_report(run, place))
+    folder.write_with("summary.png", lambda place: write_summary(run, place))
+    also()
+    manifest = {
+        "program": "twin.render",
+        "versions": versions(),
+        "backend": run.experiment.backend.name,
+        "seed": run.seed,
+        "frames": run.frames,
+        "started_unix_s": started,
+        "wall_time_s": clock,
+        "warnings": list(run.warnings),
+        "sha256": folder.checksums(),
+    }
+    folder.write_json(MANIFEST, manifest)
+
+
+def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:
+    """``KIND.json`` with its schema and frames."""
+    folder.write_json(f"{kind}.json", described(kind, data))
+
+
+def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
+    """Numbers, expected images, and of each channel the first frame of every time as one page."""
+    _write_numbers(folder, "course", course.to_dict())
+    for i, channel in enumerate(run.experiment.path.channels):
+        folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", tiff(course.frames[:, i]))
+    time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
+    folder.write_bytes("course.nc", netcdf(_images(run, "time", time, course.photons)))
+
+
+def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
+    """MTF and frames; the faint rings of a pinhole are stretched in its preview, levels of the others are not."""
+    _write_numbers(folder, "mtf", targets.to_dict())
+    for stem, name, frames in targets.images():
+        folder.write_bytes(f"images/{stem}.tiff", tiff(frames))
+        folder.write_bytes(f"images/{stem}.png", preview_png(frames, SPOT_STRETCH if name == "pinhole" else None))
+
+
+def _irradiance(run: RenderRun) -> xr.Dataset:
+    photons = np.stack([run.photons_before, run.photons_after])
+    images = _images(run, "state", ("state", ["before", "after"]), photons)
+    if run.stray is not None:
+        stray = np.stack([run.stray.before.photons, run.stray.after.photons])
+        about = {"long_name": "of these, ghosts and stray light"}
+        images["stray_photons"] = (("state", "channel", "row", "column"), stray, about)
+    return images
+
+
+def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np.ndarray) -> xr.Dataset:
+    """Expected images (N, C, rows, columns) with the coordinate of their first axis."""
+    path = run.experiment.path
+    return xr.Dataset(
+        {
+            "photons": (
+                (first, "channel", "row", "column"),
+                photons,
+                {"long_name": "expected photons per pixel and frame"},
+            )
+        },
+        coords={
+            first: coordinate,
+            "channel": [c.key for c in path.channels],
+            "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x"}),
+            "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y"}),
+        },
+        attrs={
+            "wavelength_m": path.wavelength,
+            "pitch_m": path.pitch,
+            "reference_frames": frames_text("course" if first == "time" else "irradiance"),
+        },
+    )

@@ -1,0 +1,283 @@
+"""The main job: perturb, render, detect, recover, compare."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from analysis.monitor.recovery import Recovery, recover
+from analysis.spots.spot_positions import SpotError
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.models.obstruction import find_obstructions
+from scenes.specs.job import check_nodes
+from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import InputError
+from twin.main_job.render_results import RenderRun, StrayPair
+from twin.monitor.crosstalk import crosstalk
+from twin.monitor.image_quality import image_quality
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_path import SpotFocus
+from twin.monitor.time_series import course_states, run_course, too_large
+from twin.monitor.truth import trace_truth
+from twin.path_tracing.stray_light import stray_light
+from twin.path_tracing.stray_rays import NominalPathLost
+from twin.targets.target_images import TargetLostError
+from twin.targets.target_measurement import check_targets, render_targets
+from twin.targets.target_result import TargetRun
+
+STAGES = (
+    "build the instrument",
+    "perturb",
+    "trace the truth",
+    "calibrate",
+    "render the spots",
+    "expose",
+    "recover",
+    "crosstalk",
+)
+
+COURSE = "times of the course"
+"""A long part of jobs with a course."""
+
+STRAY = "trace ghosts and stray light"
+"""A long part of jobs that ask for it."""
+
+TARGETS = "render the targets"
+"""Another one."""
+
+FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
+"""Said where the job asks for it."""
+
+MIN_LIGHT = 0.5
+"""Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
+
+SHARP = 1.0 / 14.0
+"""Wavefront error below which a nominal spot is as good as perfect, waves rms (Marechal: Strehl ratio 0.8)."""
+
+Progress = Callable[[str], None]
+Advance = Callable[[str, int, int], None]
+
+
+def render_job(
+    resolved: ResolvedJob,
+    backend: Backend,
+    frames: int | None = None,
+    seed: int | None = None,
+    progress: Progress = lambda stage: None,
+    advance: Advance = lambda part, done, total: None,
+) -> RenderRun:
+    """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
+
+    Args:
+        resolved: the job.
+        backend: where to trace.
+        frames: per state; overrides the job's.
+        seed: of all noise; overrides the job's.
+        progress: called with each of STAGES when it begins.
+        advance: told of the long parts COURSE, STRAY and TARGETS how many of how many times, paths or places are done.
+
+    Raises:
+        InputError: an unknown node, or a perturbation so large that light misses the mirrors or a spot its CCD.
+    """
+    count = resolved.frames if frames is None else frames
+    number = resolved.job.render.seed if seed is None else seed
+    # the run's config.yaml has to repeat the run, overrides included
+    resolved = resolved.with_render(count, number)
+    check_targets(resolved)
+    progress(STAGES[0])
+    experiment = MonitorExperiment(resolved, backend)
+    check_nodes(resolved.job, experiment.instrument.nodes)
+    progress(STAGES[1])
+    course = resolved.job.course
+    states = [experiment.state(resolved.job)] if course is None else course_states(experiment, resolved.job)
+    shown = 0 if course is None else course.shown
+    state = states[shown]
+    progress(STAGES[2])
+    try:
+        focus = experiment.nominal_focus
+    except (AimError, BeamMissedError) as error:
+        raise _no_spots(resolved, str(error)) from error
+    try:
+        truth = trace_truth(experiment.instrument, backend, [state])
+        progress(STAGES[3])
+        calibration = experiment.calibration
+        progress(STAGES[4])
+        nominal = experiment.nominal_photons
+        photons = experiment.path.expected_photons([state], single=False) if course is None else None
+    except (AimError, BeamMissedError) as error:
+        raise _too_large(resolved, str(error)) from error
+    series = None
+    if photons is None:
+        series = run_course(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
+        # rendered among other states a state differs in the last bit, and with it all noise; the run shows one of both
+        photons = series.shown_photons[None]
+    stray = None
+    if resolved.job.render.stray is not None:
+        stray = _stray(experiment, resolved, state, number, advance)
+        nominal, photons = nominal + stray.before.photons, photons + stray.after.photons
+    progress(STAGES[5])
+    before = experiment.frames_before(count, number, 0.0 if stray is None else stray.before.photons)
+    after = experiment.frames_after(photons, count, number, shown)
+    progress(STAGES[6])
+    try:
+        recovery = recover(before, after, calibration, resolved.job.analysis.centroid)
+    except SpotError as error:
+        channels = experiment.path.channels
+        reasons = "; ".join(f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items())
+        raise _too_large(resolved, f"a spot cannot be measured ({reasons})") from error
+    progress(STAGES[7])
+    tables = crosstalk(experiment, _covariances(recovery))
+    targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
+    instrument = experiment.instrument
+    render = resolved.job.render
+    quality = None
+    if render.quality:
+        quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
+    return RenderRun(
+        resolved=resolved,
+        experiment=experiment,
+        state=state,
+        frames=count,
+        seed=number,
+        truth=truth,
+        photons_before=nominal,
+        photons_after=photons[0],
+        before=before,
+        after=after[0],
+        recovery=recovery,
+        crosstalk=tables,
+        warnings=(
+            *_blurred(experiment, focus),
+            *_warnings(experiment, nominal, photons[0], before, after[0]),
+            *(series.warnings if series is not None else ()),
+            *(_in_the_way(stray) if stray is not None else ()),
+            *(targets.warnings if targets is not None else ()),
+            *(quality.warnings if quality is not None else ()),
+            *((FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
+        ),
+        course=series,
+        stray=stray,
+        targets=targets,
+        quality=quality,
+    )
+
+
+def _stray(
+    experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
+) -> StrayPair:
+    """Stray light before and after the perturbation.
+
+    Raises:
+        InputError: no light comes back to a CCD.
+    """
+    assert resolved.job.render.stray is not None
+    paths = resolved.job.render.stray.paths
+    sources = len(experiment.path.channels) * paths
+    try:
+        before = stray_light(experiment, {}, paths, seed, lambda done, _: advance(STRAY, done, 2 * sources))
+        taken = find_obstructions(experiment.instrument, experiment.backend)
+        if not state:
+            return StrayPair(before, before, taken)
+        say = partial(_second_half, advance, sources)
+        return StrayPair(before, stray_light(experiment, state, paths, seed, say), taken)
+    except NominalPathLost as error:
+        raise _too_large(resolved, str(error)) from error
+
+
+def _targets(
+    experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
+) -> TargetRun:
+    """Test targets before and after the perturbation.
+
+    Raises:
+        InputError: their light is lost.
+    """
+    say = partial(advance, TARGETS)
+    try:
+        return render_targets(resolved, experiment.instrument, experiment.backend, state, seed, say)
+    except TargetLostError as error:
+        raise _too_large(resolved, str(error)) from error
+
+
+def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
+    return tuple(
+        f"{o.body} stands in the beam {o.beam} and takes {100.0 * o.share:.1f}% of it"
+        for o in stray.obstructions
+        if o.used == 0.0
+    )
+
+
+def _second_half(advance: Advance, first: int, done: int, _: int) -> None:
+    advance(STRAY, first + done, 2 * first)
+
+
+def _covariances(recovery: Recovery) -> dict[str, np.ndarray]:
+    return {name: recovery.shift_covariance[0, k] for k, name in enumerate(recovery.parameters)}
+
+
+def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
+    if resolved.job.course is not None:
+        return too_large(resolved.job, resolved.job.course.shown, reason)
+    moved = ", ".join(resolved.job.perturb) or "nothing"
+    return resolved.job.error(
+        f"the perturbed instrument cannot be rendered: {reason}",
+        ("perturb",),
+        found=f"motions of {moved}",
+        allowed="motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller",
+    )
+
+
+def _no_spots(resolved: ResolvedJob, reason: str) -> InputError:
+    return resolved.instrument.error(
+        f"the monitor does not work even as designed, without any perturbation: {reason}",
+        ("monitor",),
+        allowed="prism widths, angle_errors, pupil_offset, return_face.aperture and a camera with which the beams pass "
+        "the prisms twice, and an area_ccd (rows, columns, pitch) that the spots fall on",
+    )
+
+
+def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:
+    """One warning for each camera whose spots are not sharp as designed; it is a camera, but hardly the one meant."""
+    out = []
+    for name in experiment.instrument.cameras:
+        own = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
+        worst = max(own, key=lambda i: focus.error[i])
+        if focus.error[worst] > SHARP:
+            model = experiment.instrument.cameras[name]
+            # image.z counts along the parent axis, +-Z of the focal plane
+            shift = model.focal_plane.rotation[2, 2] * focus.defocus[worst]
+            out.append(
+                f"{name}: the spots of camera {model.spec.name} are out of focus as designed, "
+                f"{focus.error[worst]:.2g} waves rms; they would be sharpest with image.z {1e3 * shift:+.3g} mm from "
+                "where it is"
+            )
+    return tuple(out)
+
+
+def _warnings(
+    experiment: MonitorExperiment,
+    nominal: np.ndarray,
+    photons: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+) -> tuple[str, ...]:
+    """What the user should know before using the numbers."""
+    out = []
+    channels = experiment.path.channels
+    for name, recorded in (("before", before), ("after", after)):
+        saturated = experiment.detector.saturated(recorded)
+        bad = [c.key for c, pixels in zip(channels, np.ravel(saturated.pixels), strict=True) if pixels]
+        if bad:
+            out.append(
+                f"saturated pixels in the spots {', '.join(bad)} ({name}): centroids are biased; reduce the light"
+            )
+    for i, channel in enumerate(channels):
+        share = float(photons[i].sum() / nominal[i].sum())
+        if share < MIN_LIGHT:
+            out.append(f"{channel.key}: only {100 * share:.0f}% of the nominal light reaches the CCD")
+    return tuple(out)

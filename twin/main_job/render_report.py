@@ -1,0 +1,82 @@
+"""``report.html``: one self-contained page that says what a run did, what it found and how far to trust it."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from twin.main_job import course_content, crosstalk_content, part_content, report_content, report_labels
+from twin.main_job.course_content import parameters_svg, temperatures_svg
+from twin.main_job.light_path_figures import footprints_svg, side_view_svg
+from twin.main_job.render_results import RenderRun
+from twin.main_job.spot_figures import residuals_svg, spots_svg
+from twin.main_job.target_figures import curves_svg, images_svg, pupils_svg
+from twin.pictures.light_paths import trace_light_paths
+from twin.run.artefact import FAR
+from twin.run.versions import versions
+
+__all__ = ["render_report", "write_report"]
+
+TEMPLATE = "report.html.j2"
+
+
+def write_report(run: RenderRun, place: Path) -> None:
+    """Write the report of a run.
+
+    Args:
+        run: the run.
+        place: the HTML file.
+    """
+    place.write_text(render_report(run), encoding="utf-8")
+
+
+def render_report(run: RenderRun) -> str:
+    """The page as text."""
+    experiment = run.experiment
+    paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
+    tables = report_content.results(run)
+    names = list(experiment.instrument.cameras)
+    figures = {
+        "spots": {name: Markup(spots_svg(run, name)) for name in names},
+        "residuals": Markup(residuals_svg(report_content.residual_panels(tables), report_labels.ESTIMATOR_NAMES)),
+        "side": Markup(side_view_svg(experiment.instrument, paths)),
+        "footprints": Markup(footprints_svg(experiment.instrument, paths)),
+    }
+    if run.course is not None:
+        figures["temperatures"] = Markup(temperatures_svg(run.course))
+        figures["course"] = Markup(parameters_svg(run.course, report_labels.ESTIMATOR_NAMES))
+    if run.targets is not None:
+        cameras = run.targets.cameras
+        figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}
+        if run.targets.has_edges:
+            figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
+    if run.quality is not None and run.quality.obstruction:
+        figures["pupils"] = Markup(pupils_svg(run.quality))
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
+    return template.render(
+        setup=report_content.setup(run),
+        course=course_content.course_content(run),
+        stray=part_content.stray_content(run),
+        targets=part_content.target_content(run),
+        quality=part_content.quality_content(run),
+        tables=tables,
+        summary=report_content.summary(tables),
+        spots=report_content.spots(run),
+        goodness=report_content.goodness(run),
+        crosstalk=crosstalk_content.crosstalk_tables(run),
+        wrong_percent=round(100 * crosstalk_content.WRONG),
+        factors=crosstalk_content.factors(run),
+        statements=crosstalk_content.statements(run),
+        figures=figures,
+        labels=report_labels,
+        far=f"{FAR:g}",
+        run=run,
+        pitch_um=f"{1e6 * experiment.path.pitch:g}",
+        config=run.resolved.to_yaml(),
+        versions=versions(),
+        backend=experiment.backend.name,
+    )

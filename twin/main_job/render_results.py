@@ -1,0 +1,185 @@
+"""Everything one render run finds, and its JSON forms (the contract of truth.json and recovered.json)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.recovery import Recovery
+from analysis.units import ARCSEC
+from optics.geometry.tree import State
+from scenes.models.obstruction import Obstruction
+from scenes.specs.resolved import ResolvedJob
+from twin.monitor.crosstalk import CameraCrosstalk
+from twin.monitor.image_quality import ImageQuality
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.time_series import CourseRun
+from twin.monitor.truth import Truth
+from twin.path_tracing.stray_light import StrayLight
+from twin.targets.target_result import TargetRun
+
+
+@dataclass(frozen=True, eq=False)
+class StrayPair:
+    """Stray light of the nominal and of the perturbed instrument, and which prisms stand in whose beam."""
+
+    before: StrayLight
+    after: StrayLight
+    obstructions: tuple[Obstruction, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Contents of stray.json."""
+        taken = [{"body": o.body, "beam": o.beam, "share": o.share, "used": o.used} for o in self.obstructions]
+        return {"before": self.before.to_dict(), "after": self.after.to_dict(), "obstructions": taken}
+
+
+@dataclass(frozen=True, eq=False)
+class RenderRun:
+    """One job's outcome.
+
+    Attributes:
+        resolved: the job with everything it names.
+        experiment: the instrument and its calibration.
+        state: what was perturbed.
+        frames, seed: of the exposures.
+        truth: by exact tracing.
+        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns), stray light included.
+        before, after: grey values, uint16 (C, frames, rows, columns).
+        recovery: what the images say (one state).
+        crosstalk: camera -> response to elementary motions.
+        warnings: what the user should know.
+        course: all times of the job's course, None if it has none; the rest is then about the time it shows.
+        stray: ghosts and stray light, None if not asked for.
+        targets: test targets on the line CCDs, None if not asked for.
+        quality: image quality of the nominal and of the perturbed state, None if not asked for.
+    """
+
+    resolved: ResolvedJob
+    experiment: MonitorExperiment
+    state: State
+    frames: int
+    seed: int
+    truth: Truth
+    photons_before: np.ndarray
+    photons_after: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    recovery: Recovery
+    crosstalk: Mapping[str, CameraCrosstalk]
+    warnings: tuple[str, ...]
+    course: CourseRun | None = None
+    stray: StrayPair | None = None
+    targets: TargetRun | None = None
+    quality: ImageQuality | None = None
+
+    def true_parameters(self, camera: str) -> dict[str, float]:
+        """True change of a camera in the units of the keys."""
+        change = self.truth.cameras[camera]
+        values = np.array([change.d_alpha[0], change.d_beta[0], change.d_gamma[0], change.d_f[0]]) * PER_SI
+        # adding 0.0 turns a negative zero into a plain one
+        return {key: float(value) + 0.0 for key, value in zip(PARAMETERS, values, strict=True)}
+
+    def truth_dict(self) -> dict[str, Any]:
+        """Contents of truth.json."""
+        out: dict[str, Any] = {
+            "cameras": {
+                name: {
+                    **self.true_parameters(name),
+                    "principal_distance_mm": 1e3 * float(self.truth.principal_distance[name]),
+                }
+                for name in self.truth.cameras
+            }
+        }
+        if len(self.truth.cameras) == 2:
+            out["intersection_angle"] = {
+                "nominal_deg": float(np.degrees(self.truth.angle)),
+                "change_arcsec": float(self.truth.angle_change[0] / ARCSEC),
+            }
+        return out
+
+    def recovered_dict(self) -> dict[str, Any]:
+        """Contents of recovered.json."""
+        cameras = {
+            name: {estimator: _first(p.to_dict()) for estimator, p in estimators.items()}
+            for name, estimators in self.recovery.parameters.items()
+        }
+        spots: dict[str, Any] = {}
+        r = self.recovery
+        for i, channel in enumerate(self.experiment.path.channels):
+            spots.setdefault(channel.camera, {})[channel.side] = {
+                "before": _spot(r.before[0, i], r.sigma_before[0, i]),
+                "after": _spot(r.after[0, i], r.sigma_after[0, i]),
+            }
+        out: dict[str, Any] = {"cameras": cameras, "spots": spots}
+        if r.angle:
+            out["intersection_angle"] = {e: _first(a.to_dict()) for e, a in r.angle.items()}
+        out["centroid"] = self.resolved.job.analysis.centroid
+        out["frames"] = self.frames
+        return out
+
+
+STATED = 6
+"""Decimals of a reading's sigma to which files state the reading."""
+STATED_SIGMA = 8
+"""Significant digits of a sigma."""
+
+
+def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
+    """Readings with as many digits as files state: each to a millionth of its sigma, the sigmas to eight digits.
+
+    What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
+
+    Args:
+        readings: nested; the sigma of ``x`` is ``x_sigma`` or ``sigma_x`` beside it. Other numbers stay as they are.
+    """
+    out: dict[str, Any] = {}
+    for key, value in readings.items():
+        sigma = readings.get(f"{key}_sigma", readings.get(f"sigma_{key}"))
+        if isinstance(value, Mapping):
+            out[key] = stated(value)
+        elif isinstance(value, float) and (key.endswith("_sigma") or key.startswith("sigma_")):
+            out[key] = float(f"{value:.{STATED_SIGMA - 1}e}")
+        elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
+            # adding 0.0 turns a negative zero into a plain one
+            out[key] = round(value, STATED - math.floor(math.log10(sigma))) + 0.0
+        else:
+            out[key] = value
+    return out
+
+
+def quality_dict(quality: ImageQuality) -> dict[str, Any]:
+    """Contents of quality.json: ``cameras`` of the perturbed state, and ``before`` those of the nominal one."""
+    before, after = quality.to_dicts()
+    light = {
+        name: {
+            "nyquist_per_mm": 1e-3 * camera.nyquist,
+            "spectrum_nm": [1e9 * wavelength for wavelength in camera.wavelengths],
+        }
+        for name, camera in quality.cameras.items()
+    }
+    about = {
+        "obstruction": "traced" if quality.obstruction else "ignore",
+        "wavelength_nm": 1e9 * quality.wavelength,
+        "fields": list(quality.fields),
+        "mtf": light,
+    }
+    return {**after, "before": before, **about}
+
+
+def _first(arrays: Mapping[str, Any]) -> dict[str, float]:
+    """The only state's values."""
+    return {key: float(np.ravel(value)[0]) for key, value in arrays.items()}
+
+
+def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:
+    return {
+        "row": float(position[0]),
+        "column": float(position[1]),
+        "sigma_row": float(sigma[0]),
+        "sigma_column": float(sigma[1]),
+    }

@@ -1,0 +1,334 @@
+"""What the main report says: set-up, results, goodness of fit, systematic errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor.recovery import ESTIMATORS
+from analysis.units import ARCSEC
+from optics.geometry.tree import Motion
+from optics.thermal.heat import Temperature
+from scenes.specs.channel import BASE, CENTRAL_PRISM
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import CENTROID_NOTES, PARAMETERS
+from twin.monitor.crosstalk import CameraCrosstalk
+from twin.monitor.monitor_experiment import motions_of
+from twin.monitor.motions import ElementaryMotion
+from twin.run.artefact import FAR, decimals_for, fixed, plain, residual, residual_text
+
+FAMILY = 4
+"""The first motions of a crosstalk table are the family that the estimators assume."""
+SHOWN = 1e-3
+"""Least amount of a motion, in its table unit, that is spoken of."""
+
+
+HEAT = "temperatures (expansion, bending, change of index)"
+"""How the effects of temperatures are called; a table of motions of single bodies holds only their carried motions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Systematics:
+    """What the crosstalk table makes of a run's motions, for one camera.
+
+    Attributes:
+        bias: estimator -> (4,) reading minus truth, to first order, in the units of the results.
+        outside: motions of this run outside the family, as text with amounts.
+        uncovered: what was moved but is in no row of the table.
+    """
+
+    bias: dict[str, np.ndarray]
+    outside: tuple[str, ...]
+    uncovered: tuple[str, ...]
+
+
+def systematics(run: RenderRun, camera: str) -> Systematics:
+    """Sum the crosstalk table over the motions of a run."""
+    table = run.crosstalk[camera]
+    amounts = np.array([_amount(run, motion) for motion in table.motions])
+    bias = {e: (table.readings[e] - table.true) @ amounts for e in ESTIMATORS}
+    pairs = list(zip(table.motions, amounts, strict=True))[FAMILY:]
+    outside = tuple(f"{m.label}, {plain(float(a), 4)} {m.unit}" for m, a in pairs if abs(a) > SHOWN)
+    return Systematics(bias, outside, _uncovered(run, camera, table))
+
+
+def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
+    """How much of an elementary motion the run's state holds, in its table unit; pivots converted to first order."""
+    motion = run.state.get(elementary.body)
+    if motion is None:
+        return 0.0
+    if elementary.kind == "rotate":
+        value = motion.rotate[elementary.axis]
+    elif elementary.kind == "scale":
+        value = motion.scale
+    elif elementary.kind == "figure":
+        value = motion.figure.get(elementary.axis, 0.0)
+    else:
+        value = _shift_at(run, elementary.body, motion, elementary.pivot)[elementary.axis]
+    return float(value) / elementary.unit_size
+
+
+def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:
+    """The shift, metres, that makes the same rotation and scale about another pivot the same motion to first order."""
+    pivots = next(b for b in run.experiment.instrument.assembly.tree.bodies if b.path == body).pivots
+    arm = np.array(pivots[motion.pivot]) - np.array(pivots[pivot])
+    return np.asarray(np.array(motion.shift) - np.cross(motion.rotate, arm) - motion.scale * arm)
+
+
+def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
+    """Bodies that moved, reach this camera and have no row in the table."""
+    own = f"{BASE}/{camera}"
+    bodies = {motion.body for motion in table.motions}
+    out = []
+    given = run.resolved.job.perturb
+    for path, motion in run.state.items():
+        if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
+            continue
+        if motion.stretch or motion.index or any(motion.index_gradient):
+            out.append(HEAT)
+        if path not in given:
+            continue
+        if path not in bodies and (any(motion.rotate) or any(motion.shift) or motion.scale):
+            out.append(path)
+        covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
+        missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]
+        if missing:
+            out.append(f"{path} (figure {', '.join(missing)})")
+    return tuple(out)
+
+
+def joined(names: Sequence[str]) -> str:
+    """``a; b; c`` without repetitions."""
+    return "; ".join(dict.fromkeys(names))
+
+
+ZERO_CELSIUS = 273.15
+ANGLE_LABEL = "change of the angle between the two lines of sight"
+
+
+def setup(run: RenderRun) -> dict[str, Any]:
+    """Instrument, exposure and perturbations."""
+    spec, instrument = run.resolved.instrument, run.experiment.instrument
+    cameras = []
+    for name, model in instrument.cameras.items():
+        focal = run.experiment.nominal_truth.principal_distance[name]
+        site, line = spec.cameras[name], model.spec.line
+        cameras.append(
+            {
+                "name": name,
+                "model": model.spec.name,
+                "look": fixed(float(np.degrees(site.look)), 2, sign=True),
+                "focal": fixed(focal, 4),
+                "f_number": fixed(focal / model.spec.entrance_pupil, 1),
+                "line": f"{line.pixels} × {plain(1e6 * line.pitch)} µm = {fixed(1e3 * line.pixels * line.pitch, 1)} mm",
+                "separation": fixed(1e3 * instrument.separation[name], 2),
+            }
+        )
+    monitor = spec.monitor
+    ccd = monitor.area_ccd
+    facts = [
+        ("Instrument", f"{spec.name}: {spec.description}".rstrip(": ")),
+        (
+            "Monitor",
+            f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
+            f"{plain(1e3 * monitor.return_face.aperture)} mm wide, area CCDs at "
+            f"±{plain(float(np.degrees(monitor.field)))}° of field",
+        ),
+        (
+            "Area CCD",
+            f"{ccd.rows} × {ccd.columns} pixels of {plain(1e6 * ccd.pitch)} µm, "
+            f"{run.resolved.detector.bit_depth} bits, exposure {plain(1e3 * ccd.exposure)} ms",
+        ),
+        (
+            "Light",
+            f"{plain(1e-6 * monitor.reticle.photons_per_frame)} million photons per spot and frame expected at the CCD",
+        ),
+        ("Frames", f"{run.frames} before and {run.frames} after, seed {run.seed}"),
+        ("Spot centres", CENTROID_NOTES[run.resolved.job.analysis.centroid]),
+    ]
+    return {
+        "cameras": cameras,
+        "facts": facts,
+        "perturbations": _perturbations(run),
+        "reference": fixed(spec.temperature - ZERO_CELSIUS, 2),
+        "heated": _heated(run),
+        "warnings": run.warnings,
+    }
+
+
+def _perturbations(run: RenderRun) -> list[dict[str, str]]:
+    """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
+    job = run.resolved.job
+    motions, fields = motions_of(job), job.fields(None if run.course is None else run.course.shown)
+    out = []
+    for path in dict.fromkeys((*motions, *fields)):
+        motion = motions.get(path, Motion())
+        parts = [_motion_text(motion)] if _motion_text(motion) or path not in fields else []
+        parts += [_heat_text(fields[path])] if path in fields else []
+        out.append({"node": path, "motion": "; ".join(parts) or "nothing (all zero)", "pivot": motion.pivot})
+    return out
+
+
+def _heated(run: RenderRun) -> int:
+    """How many bodies have another temperature than nominal, faces of prisms not counted."""
+    job = run.resolved.job
+    fields = run.experiment.thermal.fields(job.fields(None if run.course is None else run.course.shown))
+    return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
+
+
+def _motion_text(motion: Motion) -> str:
+    parts = []
+    for name, vector, unit, size in (("rotate", motion.rotate, "arcsec", ARCSEC), ("shift", motion.shift, "µm", 1e-6)):
+        if any(vector):
+            parts.append(f"{name} ({', '.join(plain(v / size) for v in vector)}) {unit}")
+    if motion.scale:
+        parts.append(f"scale {plain(1e6 * motion.scale)} ppm")
+    terms = [f"Z{j} {plain(1e9 * a)} nm" for j, a in motion.figure.items() if a]
+    if terms:
+        parts.append(f"figure {', '.join(terms)}")
+    return "; ".join(parts)
+
+
+def _heat_text(field: Temperature) -> str:
+    text = f"temperature {plain(field.change)} K"
+    if any(field.gradient):
+        text += f", gradient ({', '.join(plain(1e3 * g) for g in field.gradient)}) mK/m"
+    return text
+
+
+def results(run: RenderRun) -> list[dict[str, Any]]:
+    """Tables of recovered against true: one per camera, one for the angle."""
+    recovered, truth = run.recovered_dict(), run.truth_dict()
+    tables = []
+    for name, estimators in recovered["cameras"].items():
+        rows = []
+        for p in PARAMETERS:
+            values = {e: (estimators[e][p.key], estimators[e][f"{p.key}_sigma"]) for e in ESTIMATORS}
+            rows.append(_row(f"{name}.{p.key}", p.symbol, p.unit, p.meaning, truth["cameras"][name][p.key], values))
+        tables.append({"title": f"Camera {name}", "rows": rows})
+    if "intersection_angle" in truth:
+        angle = recovered["intersection_angle"]
+        values = {e: (angle[e]["change_arcsec"], angle[e]["change_arcsec_sigma"]) for e in ESTIMATORS}
+        true = truth["intersection_angle"]
+        nominal = fixed(true["nominal_deg"], 4)
+        row = _row("intersection_angle", "Δθ", "arcsec", ANGLE_LABEL, true["change_arcsec"], values)
+        tables.append({"title": f"Angle between the cameras, nominally {nominal}°", "rows": [row]})
+    return tables
+
+
+def _row(
+    key: str, symbol: str, unit: str, meaning: str, true: float, values: dict[str, tuple[float, float]]
+) -> dict[str, Any]:
+    finest = min((s for _, s in values.values() if s > 0), default=0.0)
+    cells = []
+    for estimator, (value, sigma) in values.items():
+        places = decimals_for(sigma)
+        ratio = residual(value - true, sigma)
+        cells.append(
+            {
+                "key": f"{key}.{estimator}",
+                "value": fixed(value, places),
+                "sigma": fixed(sigma, places),
+                "residual": residual_text(ratio),
+                "far": ratio is not None and abs(ratio) > FAR,
+                "ratio": ratio,
+            }
+        )
+    return {
+        "key": key,
+        "symbol": symbol,
+        "unit": unit,
+        "meaning": meaning,
+        "true": fixed(true, decimals_for(finest)),
+        "cells": cells,
+    }
+
+
+def residual_panels(tables: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float | None]]]:
+    """The residuals of ``results`` for the figure."""
+
+    def ratios(row: dict[str, Any]) -> dict[str, float | None]:
+        return {e: cell["ratio"] for e, cell in zip(ESTIMATORS, row["cells"], strict=True)}
+
+    return {table["title"]: {row["symbol"]: ratios(row) for row in table["rows"]} for table in tables}
+
+
+def spots(run: RenderRun) -> list[dict[str, Any]]:
+    """Measured spot positions and shifts."""
+    rows = []
+    pitch = 1e6 * run.experiment.path.pitch
+    measured = run.recovered_dict()["spots"]
+    for i, channel in enumerate(run.experiment.path.channels):
+        one = measured[channel.camera][channel.side]
+        covariance = run.recovery.shift_covariance[0, i // 2]
+        for j, axis in enumerate(("row", "column")):
+            start, end = one["before"], one["after"]
+            shift = end[axis] - start[axis]
+            k = 2 * (i % 2) + j
+            sigma = float(np.sqrt(covariance[k, k]))
+            rows.append(
+                {
+                    "key": f"{channel.key}.{axis}",
+                    "channel": f"{channel.camera} {channel.side}",
+                    "first": axis == "row",
+                    "axis": axis,
+                    "before": _with_sigma(start[axis], start[f"sigma_{axis}"]),
+                    "after": _with_sigma(end[axis], end[f"sigma_{axis}"]),
+                    "shift_px": _with_sigma(shift, sigma, sign=True),
+                    "shift_um": _with_sigma(shift * pitch, sigma * pitch, sign=True),
+                }
+            )
+    return rows
+
+
+def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
+    places = decimals_for(sigma)
+    return f"{fixed(value, places, sign)} ± {fixed(sigma, places)}"
+
+
+def goodness(run: RenderRun) -> list[dict[str, Any]]:
+    """Residuals of the model against what the crosstalk table says they must be."""
+    out = []
+    recovered, truth = run.recovered_dict()["cameras"], run.truth_dict()["cameras"]
+    for name in run.experiment.instrument.cameras:
+        found = systematics(run, name)
+        rows = []
+        for k, p in enumerate(PARAMETERS):
+            sigma = recovered[name]["model"][f"{p.key}_sigma"]
+            error = recovered[name]["model"][p.key] - truth[name][p.key]
+            bias = float(found.bias["model"][k])
+            places = decimals_for(sigma)
+            left = residual(error - bias, sigma)
+            rows.append(
+                {
+                    "symbol": p.symbol,
+                    "unit": p.unit,
+                    "error": fixed(error, places, sign=True),
+                    "in_sigma": residual_text(residual(error, sigma)),
+                    "bias": fixed(bias, places, sign=True),
+                    "left": fixed(error - bias, places, sign=True),
+                    "left_in_sigma": residual_text(left),
+                    "far": left is not None and abs(left) > FAR,
+                }
+            )
+        out.append({"name": name, "rows": rows, "outside": joined(found.outside), "uncovered": joined(found.uncovered)})
+    return out
+
+
+def summary(tables: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many of each estimator's readings agree with the truth."""
+    counts = {e: [0, 0] for e in ESTIMATORS}
+    for table in tables:
+        for row in table["rows"]:
+            for estimator, cell in zip(ESTIMATORS, row["cells"], strict=True):
+                counts[estimator][1] += 1
+                counts[estimator][0] += not cell["far"]
+    return {e: {"good": good, "all": every} for e, (good, every) in counts.items()}
+
+
+def body_name(path: str) -> str:
+    """A body's path without the base."""
+    return path.removeprefix(f"{BASE}/")

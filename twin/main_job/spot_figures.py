@@ -1,0 +1,210 @@
+"""Figures of the spots and of what the estimators leave over."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import AsinhNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from analysis.monitor.recovery import ESTIMATORS
+from twin.main_job.render_results import RenderRun
+from twin.run.artefact import FAR, tick_text
+from twin.run.svg import (
+    AFTER,
+    BEFORE,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    VERMILION,
+    look,
+    new_figure,
+    plain_axes,
+    to_svg,
+)
+
+STRETCH = 150.0
+"""The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
+GRAY, DIVERGING = "gray", "RdBu_r"
+LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
+LEAST_CORE = 7.0
+"""Half-width of the core's window, pixels, when the spot moves less."""
+
+
+def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
+    """Mean frame of every channel before and after, DN, (C, rows, columns)."""
+    return run.before.mean(axis=1), run.after.mean(axis=1)
+
+
+def stretch(images: np.ndarray) -> Normalize:
+    """Common asinh stretch from the background to the peak."""
+    low, high = float(np.percentile(images, 5)), float(images.max())
+    high = max(high, low + 1.0)
+    return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
+
+
+def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | None = None) -> None:
+    """A cross with an open middle, so that the core stays visible; data coordinates are pixels."""
+    (row, column), inner = at, 0.3 * size
+    xs, ys = [], []
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        xs += [column + dx * inner, column + dx * size, np.nan]
+        ys += [row + dy * inner, row + dy * size, np.nan]
+    axes.plot(xs, ys, color=colour, lw=1.3, solid_capstyle="butt", label=label)
+
+
+def core_window(before: np.ndarray, after: np.ndarray, radius: float) -> tuple[float, float, float]:
+    """Centre (row, column) and half-width of a square that holds both centres, pixels."""
+    centre = 0.5 * (before + after)
+    half = max(LEAST_CORE, 0.5 * float(np.max(np.abs(after - before))) + 0.75 * radius)
+    return float(centre[0]), float(centre[1]), half
+
+
+def airy_radius(run: RenderRun) -> float:
+    """Radius of the first dark ring that the return face's aperture gives, pixels."""
+    path = run.experiment.path
+    camera = next(iter(run.experiment.instrument.cameras.values()))
+    focal = float(camera.first_order.focal_length[0])
+    return float(1.2197 * path.wavelength * focal / (2.0 * path.face_radius) / path.pitch)
+
+
+def spots_svg(run: RenderRun, camera: str) -> str:
+    """One camera's spots, a row per channel."""
+    with look(f"spots-{camera}"):
+        return to_svg(_draw(run, camera))
+
+
+def _draw(run: RenderRun, camera: str) -> Figure:
+    channels = [i for i, c in enumerate(run.experiment.path.channels) if c.camera == camera]
+    before, after = mean_images(run)
+    norm = stretch(np.stack([before[channels], after[channels]]))
+    difference = after - before
+    largest = max(float(np.abs(difference[channels]).max()), 1.0)
+    figure = new_figure(0.5 + 2.62 * len(channels), {"w_pad": 0.03, "h_pad": 0.03, "wspace": 0.01, "hspace": 0.02})
+    grid = figure.subplots(len(channels), 4, squeeze=False)
+    positions = run.recovery.before[0], run.recovery.after[0]
+    radius = airy_radius(run)
+    shown = map_of = None
+    for line, i in enumerate(channels):
+        start, end = positions[0][i], positions[1][i]
+        moved = end - start
+        row = grid[line]
+        for axes, image in ((row[0], before[i]), (row[1], after[i])):
+            shown = axes.imshow(image, cmap=GRAY, norm=norm, interpolation="none")
+        size = 0.11 * before.shape[-1]
+        cross(row[0], start, BEFORE, size)
+        cross(row[1], end, AFTER, size)
+        row[2].imshow(after[i], cmap=GRAY, norm=norm, interpolation="none")
+        y, x, half = core_window(start, end, radius)
+        cross(row[2], start, BEFORE, 0.3 * half, "before")
+        cross(row[2], end, AFTER, 0.3 * half, "after")
+        row[2].xaxis.set_major_locator(MaxNLocator(5, integer=True))
+        row[2].yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        row[2].set(xlim=(x - half, x + half), ylim=(y + half, y - half))
+        map_of = row[3].imshow(difference[i], cmap=DIVERGING, vmin=-largest, vmax=largest, interpolation="none")
+        side = run.experiment.path.channels[i].side
+        row[0].set_ylabel(f"{side} channel\nrow [px]")
+        title = f"moved {moved[0]:+.3f} px in row, {moved[1]:+.3f} px in column".replace("-", "\N{MINUS SIGN}")
+        row[2].set_title(title, fontsize=8.5)
+        if line == 0:
+            row[0].set_title("before")
+            row[1].set_title("after")
+            row[3].set_title("after \N{MINUS SIGN} before")
+            row[2].legend(loc="upper left", labelcolor="white", handlelength=1.2, borderaxespad=0.3, **LEGEND)
+        for axes in row[[1, 3]]:
+            axes.tick_params(labelleft=False)
+        for axes in row:
+            if line == len(channels) - 1:
+                axes.set_xlabel("column [px]")
+            elif axes is not row[2]:
+                axes.tick_params(labelbottom=False)
+    assert shown is not None
+    assert map_of is not None
+    bars: dict[str, Any] = {"orientation": "horizontal", "fraction": 0.05, "pad": 0.01}
+    bar = figure.colorbar(
+        shown, ax=list(grid[:, :3].ravel()), label="mean frame [DN], asinh stretch", aspect=40, **bars
+    )
+    ticks = _dn_ticks(norm)
+    bar.set_ticks(ticks, labels=[f"{t:.0f}" for t in ticks])
+    bar.minorticks_off()
+    figure.colorbar(map_of, ax=list(grid[:, 3]), label="difference [DN]", aspect=13, ticks=MaxNLocator(4), **bars)
+    for axes in grid.ravel():
+        axes.tick_params(length=2.5, color=INK)
+    return figure
+
+
+def _dn_ticks(norm: Normalize) -> list[float]:
+    """Round numbers, one or two a decade, inside the stretch."""
+    assert norm.vmin is not None
+    assert norm.vmax is not None
+    found = [float(m * 10**k) for k in range(1, 8) for m in (1, 2, 5)]
+    span = norm.vmax - norm.vmin
+    return [t for t in found if norm.vmin + 0.004 * span <= t <= norm.vmax]
+
+
+MARKS = dict(
+    zip(
+        ESTIMATORS,
+        (("s", ORANGE), ("^", VERMILION), ("D", GREEN), ("o", BLUE)),
+        strict=True,
+    )
+)
+"""Estimator -> marker and colour: told apart by shape as well as by colour."""
+
+
+def residuals_svg(panels: dict[str, dict[str, dict[str, float | None]]], names: dict[str, str]) -> str:
+    """Residuals in sigma.
+
+    Args:
+        panels: panel title -> row label -> estimator -> residual in sigma (None without noise).
+        names: estimator -> its name for readers.
+    """
+    with look("residuals"):
+        rows = [len(panel) for panel in panels.values()]
+        figure = new_figure(1.0 + 0.36 * sum(rows) + 0.32 * len(rows))
+        heights = [n + 0.4 for n in rows]
+        all_axes = figure.subplots(len(rows), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
+        largest = max(
+            (abs(r) for panel in panels.values() for row in panel.values() for r in row.values() if r is not None),
+            default=FAR,
+        )
+        for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
+            _panel(axes, title, panel, names)
+            axes.set_xscale("symlog", linthresh=FAR, linscale=1.0)
+            axes.set_xlim(-2.5 * max(largest, 2.0 * FAR), 2.5 * max(largest, 2.0 * FAR))
+            axes.xaxis.set_major_formatter(lambda value, _: tick_text(value))
+            decades = [10.0**k for k in range(1, int(np.ceil(np.log10(max(largest, 10.0)))) + 1)]
+            axes.set_xticks([*(-d for d in decades[::-1]), -FAR, 0.0, FAR, *decades], minor=False)
+            axes.minorticks_off()
+            axes.grid(axis="x", color=LIGHT, lw=0.6)
+            axes.set_axisbelow(True)
+        label = "(recovered \N{MINUS SIGN} true) / sigma        linear inside the band, logarithmic outside"
+        all_axes[-1].set_xlabel(label)
+        handles, labels = all_axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        return to_svg(figure)
+
+
+def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], names: dict[str, str]) -> None:
+    axes.axvspan(-FAR, FAR, color="#eef3f8", lw=0)
+    axes.axvline(0.0, color=GREY, lw=0.8)
+    place = {label: k for k, label in enumerate(panel)}
+    for j, estimator in enumerate(MARKS):
+        marker, colour = MARKS[estimator]
+        points = [(r, place[label]) for label, row in panel.items() if (r := row.get(estimator)) is not None]
+        offset = (j - 0.5 * (len(MARKS) - 1)) * 0.19
+        x, y = [p[0] for p in points], [p[1] + offset for p in points]
+        axes.plot(x, y, marker, color=colour, ms=5.5, mec="white", mew=0.5, ls="none", label=names[estimator])
+    axes.set_yticks(list(place.values()), list(place))
+    axes.set_ylim(len(place) - 0.5, -0.5)
+    axes.set_title(title, loc="left", fontweight="bold")
+    for k in range(1, len(place)):
+        axes.axhline(k - 0.5, color=LIGHT, lw=0.6)
+    axes.tick_params(axis="y", length=0)
+    plain_axes(axes)

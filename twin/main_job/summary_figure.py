@@ -1,0 +1,104 @@
+"""``summary.png``: the result of a run in one picture, spots before and after and the recovered parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from analysis.monitor.recovery import ESTIMATORS
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_content import results
+from twin.main_job.report_labels import ESTIMATOR_NAMES
+from twin.main_job.spot_figures import GRAY, airy_radius, core_window, cross, mean_images, stretch
+from twin.run.artefact import FAR
+from twin.run.svg import AFTER, BEFORE, BLUE, GREY, INK, LIGHT, VERMILION, look, to_png
+
+WIDTH, DPI = 14.0, 100
+"""Inches and dots per inch: 1400 px wide."""
+REACH = 2.2
+"""Half-width of the pictures in Airy radii around both centres."""
+
+
+def write_summary(run: RenderRun, place: Path) -> None:
+    """Write the picture.
+
+    Args:
+        run: the run.
+        place: the PNG file.
+    """
+    with look("summary"):
+        place.write_bytes(to_png(_draw(run), DPI))
+
+
+def _draw(run: RenderRun) -> Figure:
+    channels = run.experiment.path.channels
+    columns = max(len(channels), 1)
+    tables = results(run)
+    lines = 1 + sum(1 + len(table["rows"]) for table in tables)
+    picture = WIDTH / columns
+    heights = (2.0 * picture + 0.5, 0.27 * lines + 0.5)
+    figure = Figure(figsize=(WIDTH, sum(heights)), facecolor="white")
+    top = heights[0] / sum(heights)
+    before, after = mean_images(run)
+    norm = stretch(before)
+    positions = run.recovery.before[0], run.recovery.after[0]
+    height = picture / sum(heights)
+    windows = [core_window(b, a, REACH * airy_radius(run) / 0.75) for b, a in zip(*positions, strict=True)]
+    half = max(window[2] for window in windows)  # one scale for all pictures
+    for i, channel in enumerate(channels):
+        row, column, _ = windows[i]
+        for k, (image, when) in enumerate(((before[i], "before"), (after[i], "after"))):
+            bottom = 1.0 - (k + 1) * height - 0.36 / sum(heights) + (0.02 * height)
+            axes = figure.add_axes((i / columns + 0.004, bottom, 1.0 / columns - 0.008, 0.96 * height))
+            axes.imshow(image, cmap=GRAY, norm=norm, interpolation="none")
+            cross(axes, positions[0][i], BEFORE, 0.22 * half)
+            if k:
+                cross(axes, positions[1][i], AFTER, 0.22 * half)
+            axes.set(xlim=(column - half, column + half), ylim=(row + half, row - half), xticks=[], yticks=[])
+            axes.text(0.03, 0.03, when, color="white", transform=axes.transAxes, fontsize=12)
+            if k:
+                _scale_bar(axes, run, column, row, half)
+            else:
+                axes.set_title(f"{channel.camera} camera, {channel.side} spot", fontsize=13, pad=7)
+    _table(figure, tables, 1.0 - top - 0.1 / sum(heights), run)
+    return figure
+
+
+def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: float) -> None:
+    """Ten pixels, and how many micrometres they are."""
+    y, x = row + 0.86 * half, column + 0.9 * half
+    axes.plot([x - 10.0, x], [y, y], color="white", lw=2.5, solid_capstyle="butt")
+    text = f"10 px = {1e7 * run.experiment.path.pitch:.4g} µm"
+    axes.text(x, y - 0.05 * half, text, color="white", ha="right", va="bottom", fontsize=10)
+
+
+def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: RenderRun) -> None:
+    """Recovered against true, drawn as text on a grid of lines."""
+    axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
+    axes.set_axis_off()
+    count = 1 + sum(1 + len(table["rows"]) for table in tables)
+    axes.set_ylim(count + 1.2, 0.0)
+    edges = [0.30, *(0.475 + 0.172 * k for k in range(len(ESTIMATORS)))]
+    heads = ["true", *ESTIMATOR_NAMES.values()]
+    y = 0.6
+    axes.text(0.01, y, f"{run.resolved.instrument.name}, {run.frames} frames", fontsize=12.5, va="center", color=GREY)
+    for x, head in zip(edges, heads, strict=True):
+        axes.text(x, y, head, fontsize=12.5, fontweight="bold", ha="right", va="center")
+    for table in tables:
+        y += 1.0
+        axes.axhline(y - 0.5, color=LIGHT, lw=1)
+        axes.text(0.01, y, table["title"], fontsize=12.5, fontweight="bold", va="center")
+        for row in table["rows"]:
+            y += 1.0
+            axes.text(0.02, y, f"{row['symbol']} [{row['unit']}]", fontsize=12.5, va="center")
+            axes.text(edges[0], y, row["true"], fontsize=12.5, ha="right", va="center", fontweight="bold")
+            for x, cell in zip(edges[1:], row["cells"], strict=True):
+                text = f"{cell['value']} ± {cell['sigma']}"
+                axes.text(x - 0.013, y, text, fontsize=12.5, ha="right", va="center", color=INK)
+                mark, colour = ("▲", VERMILION) if cell["far"] else ("●", BLUE)
+                axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
+    note = f"● within {FAR:g} sigma of the truth, ▲ beyond: a wrong factor, or a motion that the formula does not know"
+    axes.text(0.99, count + 0.7, note, fontsize=10.5, ha="right", va="center", color=GREY)

@@ -1,0 +1,174 @@
+"""Figures of targets, of their MTF and of the pupils with their shadows."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import AsinhNorm, Normalize
+from matplotlib.patches import Polygon
+
+from twin.monitor.image_quality import PLACES, ImageQuality, PupilOutline
+from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
+from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading
+
+COLOURS = {"before": BLUE, "after": VERMILION}
+MARKS = {"before": "o", "after": "D"}
+BAND = 2.0
+"""Half width of the band about zero, sigma."""
+LEAST_SPAN = 4.0
+"""Half height of the panels of differences at least, thousandths."""
+EVERY = 2
+"""Every how many-th frequency gets a dot."""
+IMAGE_NAMES = {
+    "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
+    "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
+    "bars_along": "bars, along line",
+    "bars_track": "bars, along track",
+    "star": "star",
+    "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
+}
+"""Of the images that are shown, with the direction of their MTF; even fields are not."""
+CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
+"""Side of what is shown, pixels; the others are shown whole."""
+STRETCH = 100.0
+"""The pinhole's stretch is linear up to this fraction (1/STRETCH) of the peak."""
+
+
+def curves_svg(name: str, camera: CameraTargets) -> str:
+    """Measured and true MTF, a row for each direction and a column for each place."""
+    with look(f"mtf-{name}"):
+        figure = new_figure(8.4)
+        heights = (3.0, 1.2) * len(DIRECTIONS)
+        panels = figure.subplots(
+            len(heights), len(camera.places), sharex=True, sharey="row", squeeze=False, height_ratios=heights
+        )
+        for column, (place, targets) in enumerate(camera.places.items()):
+            for row, direction in enumerate(DIRECTIONS):
+                axes, below = panels[2 * row : 2 * row + 2, column]
+                nyquist = 1e-3 * NYQUIST / camera.pitch
+                for each in (axes, below):
+                    plain_axes(each)
+                    each.grid(color=LIGHT, lw=0.5)
+                    each.set_axisbelow(True)
+                    each.axvline(nyquist, color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+                below.axhline(0.0, color=GREY, lw=0.8)
+                for when, shots in targets.shots.items():
+                    _curve(axes, when, shots.edges[direction])
+                    _difference(below, when, shots.edges[direction])
+                    if direction in shots.bars:
+                        _bars(axes, when, shots.bars[direction], camera.pitch)
+                axes.set(xlim=(0.0, 2.0 * nyquist), ylim=(0.0, 1.03))
+                axes.set_title(f"{place}, {DIRECTION_NAMES[direction]}", loc="left")
+                if column == 0:
+                    axes.set_ylabel("MTF")
+                    below.set_ylabel("error [10$^{-3}$]")
+                if row == len(DIRECTIONS) - 1:
+                    below.set_xlabel("frequency [cycles/mm]")
+        for below in panels[1::2, 0]:
+            # about zero, and noise alone does not fill a panel
+            span = max(LEAST_SPAN, *(abs(limit) for limit in below.get_ylim()))
+            below.set_ylim(-span, span)
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.align_ylabels()
+        unique = dict(zip(labels, handles, strict=True))
+        figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=len(unique))
+        return to_svg(figure)
+
+
+def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
+    colour, frequency = COLOURS[when], 1e-3 * edge.frequency
+    axes.plot(frequency, edge.true, color=colour, lw=1.3, label=f"true, {when}")
+    found = edge.measured
+    if found is None:
+        return
+    axes.plot(
+        frequency[::EVERY], found.mtf[::EVERY], MARKS[when], color=colour, ms=3.2, mec="white", mew=0.4,
+        label=f"measured, {when}",
+    )  # fmt: skip
+
+
+def _difference(axes: Axes, when: str, edge: EdgeReading) -> None:
+    """Measured less true, thousandths."""
+    found = edge.measured
+    if found is None:
+        return
+    frequency, error, sigma = 1e-3 * edge.frequency, 1e3 * (found.mtf - edge.true), 1e3 * found.sigma
+    axes.fill_between(frequency, -BAND * sigma, BAND * sigma, color=COLOURS[when], alpha=0.18, lw=0.0)
+    axes.plot(frequency, error, color=COLOURS[when], lw=1.1)
+
+
+def _bars(axes: Axes, when: str, bars: BarReading, pitch: float) -> None:
+    if bars.measured is not None:
+        # bars of both states stand at one frequency
+        axes.plot(
+            1e-3 * NYQUIST / pitch, bars.measured.mtf, "s", color="none", mec=COLOURS[when], mew=1.3, ms=6.5,
+            label=f"bars, {when}",
+        )  # fmt: skip
+
+
+def _norm(target: str, image: np.ndarray) -> Normalize:
+    low, high = float(image.min()), max(float(image.max()), float(image.min()) + 1.0)
+    if target == "pinhole":
+        return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
+    return Normalize(low, high)
+
+
+def images_svg(name: str, camera: CameraTargets) -> str:
+    """Mean images, a row for each target, and before and after side by side for each place."""
+    columns = [(place, when) for place in camera.places for when in COLOURS]
+    names = [name for name in next(iter(camera.places.values())).before.frames if name in IMAGE_NAMES]
+    with look(f"targets-{name}"):
+        figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
+        grid = figure.subplots(len(names), len(columns), squeeze=False)
+        for column, (place, when) in enumerate(columns):
+            shots = camera.places[place].shots[when]
+            for row, target in enumerate(names):
+                axes = grid[row, column]
+                mean = np.asarray(shots.frames[target].mean(axis=0))
+                skip = (len(mean) - CROPS.get(target, len(mean))) // 2
+                shown = mean[skip : len(mean) - skip, skip : len(mean) - skip]
+                axes.imshow(shown, cmap="gray", interpolation="none", norm=_norm(target, shown))
+                axes.set_xticks([])
+                axes.set_yticks([])
+                if row == 0:
+                    axes.set_title(f"{place}, {when}")
+                if column == 0:
+                    axes.set_ylabel(IMAGE_NAMES[target])
+        return to_svg(figure)
+
+
+_RIM = np.exp(2j * np.pi * np.arange(181) / 180)
+
+
+def pupils_svg(quality: ImageQuality) -> str:
+    """A row for each camera, a column for each place on its line: nominal shadows filled, perturbed ones outlined."""
+    where = {place: quality.fields.index(field) for place, field in PLACES.items()}
+    with look("pupils"):
+        figure = new_figure(0.6 + 2.9 * len(quality.cameras))
+        panels = figure.subplots(len(quality.cameras), len(where), squeeze=False, sharex=True, sharey=True)
+        for row, (name, camera) in zip(panels, quality.cameras.items(), strict=True):
+            for axes, (place, k) in zip(row, where.items(), strict=True):
+                lost = camera.light_lost[0, k], camera.light_lost[-1, k]
+                text = " \N{RIGHTWARDS ARROW} ".join("?" if np.isnan(v) else f"{100.0 * v:.2f} %" for v in lost)
+                axes.set_title(f"{name}, {place}: {text}")
+                states = [pupils[k] for pupils in (camera.pupils[0], camera.pupils[-1]) if len(pupils) > k]
+                _draw(axes, states)
+            row[0].set_ylabel("along the track, X\N{PRIME}")
+        for axes in panels[-1]:
+            axes.set_xlabel("along the line, Y\N{PRIME}")
+        return to_svg(figure)
+
+
+def _draw(axes: Axes, states: list[PupilOutline]) -> None:
+    axes.set_aspect("equal")
+    plain_axes(axes)
+    for k, pupil in enumerate(states):
+        rim = np.stack([_RIM.real, _RIM.imag], axis=-1) @ pupil.axes.T
+        if k == 0:
+            axes.add_patch(Polygon(rim, fc=SKY, alpha=0.25, lw=0))
+            axes.plot(*rim.T, color=INK, lw=0.9)
+        for piece in pupil.pieces:
+            nominal = Polygon(piece, fc=INK, alpha=0.75, lw=0)
+            axes.add_patch(nominal if k == 0 else Polygon(piece, fill=False, ec=ORANGE, lw=1.1))
+    axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))

@@ -1,0 +1,1 @@
+"""The monitoring experiment: perturbed states, their truth, spot images, recovery."""

@@ -1,0 +1,155 @@
+"""What every estimator says about every elementary motion, against the true change: formula factors and crosstalk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor import model_fit, monitoring
+from analysis.monitor.model_fit import ObservabilityReport
+from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.recovery import ESTIMATORS
+from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.motions import ElementaryMotion, line_family, other_motions
+from twin.monitor.truth import truth_jacobian
+
+SEEN_WITHIN = 0.1
+"""Relative error up to which the words say that a change is seen."""
+
+PRINTED = {
+    ("paper_single", 0): "eq. (3)",
+    ("paper_single", 1): "eq. (2)",
+    ("paper_single", 2): "eq. (5)",
+    ("paper_single", 3): "eq. (7)",
+    ("paper_joint", 0): "Table 1, joint",
+    ("paper_joint", 1): "Table 1, joint",
+    ("paper_joint", 2): "Table 1, joint",
+    ("paper_joint", 3): "Table 1, joint",
+}
+
+
+@dataclass(frozen=True)
+class FormulaFactor:
+    """A printed formula's reading divided by what it should read, for the motion it was derived for.
+
+    Attributes:
+        formula: where it is printed; estimator, parameter: its names in the results.
+        motion: label of the motion.
+        by_model: reading / change in the paper's own model (thin lens: shift/f, turn, scale * f).
+        by_truth: reading / traced change of the real camera; differs from ``by_model`` by the camera's anamorphism and
+            distortion.
+    """
+
+    formula: str
+    estimator: str
+    parameter: str
+    motion: str
+    by_model: float
+    by_truth: float
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCrosstalk:
+    """First-order response of one camera's monitor to M elementary motions, per table unit (arcsec, um, ppm).
+
+    Attributes:
+        motions: the four of the paper's own family first.
+        spot_shift: (4, M) px, rows [left row, left column, right row, right column].
+        true: (4, M) true change in the units of PARAMETERS.
+        readings: estimator -> (4, M), what it says.
+        factors: of the printed formulas.
+        observability: what the four coordinates can and cannot separate.
+    """
+
+    motions: tuple[ElementaryMotion, ...]
+    spot_shift: np.ndarray
+    true: np.ndarray
+    readings: Mapping[str, np.ndarray]
+    factors: tuple[FormulaFactor, ...]
+    observability: ObservabilityReport
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for crosstalk.json."""
+        rows = []
+        for k, motion in enumerate(self.motions):
+            rows.append(
+                {
+                    "motion": motion.label,
+                    "body": motion.body,
+                    "per": motion.unit,
+                    "spot_shift_px": self.spot_shift[:, k].tolist(),
+                    "true": dict(zip(PARAMETERS, self.true[:, k].tolist(), strict=True)),
+                    **{e: dict(zip(PARAMETERS, r[:, k].tolist(), strict=True)) for e, r in self.readings.items()},
+                }
+            )
+        return {
+            "motions": rows,
+            "factors": [vars(factor) for factor in self.factors],
+            "observability": list(self.observability.statements),
+            "focal_length": list(self.focal_length_statements()),
+        }
+
+    def focal_length_statements(self) -> tuple[str, ...]:
+        """Which changes of focus, spacing and size the spots report as a change of the principal distance."""
+        out = []
+        for k, motion in enumerate(self.motions):
+            along_axis = motion.kind == "shift" and motion.axis == 2 and motion.body.count("/") == 2
+            if not (along_axis or motion.kind == "scale"):
+                continue
+            true, seen = self.true[3, k], self.readings["derived"][3, k]
+            false = self.readings["derived"][:3, k] - self.true[:3, k]
+            worst = int(np.argmax(np.abs(false)))
+            if abs(seen - true) < SEEN_WITHIN * abs(true):
+                verdict = "the spots see it"
+            elif abs(seen) < SEEN_WITHIN * abs(true):
+                verdict = "the spots do not see it"
+            else:
+                verdict = "the spots see it wrongly"
+            out.append(
+                f"{motion.label}: the principal distance changes by {true:+.3g} um per {motion.unit}, the spots read "
+                f"{seen:+.3g} um: {verdict}. Beside it they show {false[worst]:+.2g} arcsec of "
+                f"{PARAMETERS[worst].removesuffix('_arcsec')} that is not there."
+            )
+        return tuple(out)
+
+
+def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray]) -> dict[str, CameraCrosstalk]:
+    """Work out the table for every camera.
+
+    Args:
+        experiment: the instrument.
+        covariance: camera -> (4, 4) px^2 of the spot shifts of a measurement, which weighs them.
+    """
+    instrument = experiment.instrument
+    sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
+    every = [motion for motions in sets.values() for motion in motions]
+    all_spots = spot_jacobian(experiment.path, every)
+    all_truth = truth_jacobian(instrument, experiment.backend, every)
+    out = {}
+    for k, (name, motions) in enumerate(sets.items()):
+        own = slice(len(motions) * k, len(motions) * (k + 1))
+        spots = all_spots[2 * k : 2 * k + 2, :, own].reshape(4, -1)
+        truth = all_truth[name][:, own]
+        geometry = experiment.geometry(name)
+        gains = {e: monitoring.coefficients(e, geometry) for e in ESTIMATORS if e != "model"}
+        camera = experiment.calibration.cameras[name]
+        gains["model"] = camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian, rcond=1e-14)
+        size = np.array([motion.unit_size for motion in motions])
+        readings = {e: (PER_SI[:, None] * (gains[e] @ spots)) * size for e in ESTIMATORS}
+        true = PER_SI[:, None] * truth * size
+        f = geometry.focal_length_m
+        ideal = PER_SI * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]
+        factors = tuple(
+            FormulaFactor(
+                where, e, PARAMETERS[p], motions[p].label, readings[e][p, p] / ideal[p], readings[e][p, p] / true[p, p]
+            )
+            for (e, p), where in PRINTED.items()
+        )
+        labels = [f"{m.label} [{m.unit}]" for m in motions]
+        report = model_fit.observability(labels, spots, truth, size, covariance[name], family=(0, 1, 2, 3))
+        out[name] = CameraCrosstalk(motions, spots * size, true, readings, factors, report)
+    return out

@@ -1,0 +1,427 @@
+"""Image quality of an instrument's cameras in many perturbed states: wavefront error, defocus, MTF at Nyquist.
+
+All of it at fixed pixels of the line CCD, which look at whatever place of the scene the state brings there: the chief
+ray of the pixel is traced back to the scene, and the beam of that direction forward to the line. A field of +1 is the
+left end of the line (+Y'), -1 the right one.
+
+Wavefront errors are rms over the stop's area. The reference sphere stands about the pixel, which the chief ray meets,
+with the radius of the nominal exit pupil; piston and tilt are taken out. Best focus is where along the light the rms
+is least, with the exact phase sqrt(1 - u^2 - v^2) of a shift. The MTF is that of the traced pupil, polychromatic if
+the camera describes a band, times the pixel and all else that the band says of its line CCD. What prisms and other
+bodies of the instrument take of the beam (``scenes.models.shadow``) is missing in both, unless it is to be ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from optics.geometry import zernike
+from optics.geometry.aperture import Circle
+from optics.geometry.tree import State
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.numerics.threads import one_blas_thread
+from optics.raytrace.aim import AimError
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import BeamMissedError
+from optics.waves.imaging import ImagingRays, imaging_rays
+from optics.waves.pupil_edge import WORST_BEND
+from optics.waves.pupil_function import DEGREE, WORST_RESIDUAL
+from optics.waves.pupil_stack import PupilStack, products, to_terms
+from optics.waves.wavefront import eikonal, path_to_sphere
+from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.models.instrument_model import Instrument
+from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams, imaging_shadows
+from scenes.specs.camera import CameraSpec
+from scenes.specs.channel import BASE
+from scenes.specs.resolved import target_band
+from twin.sensors.line_ccd import band_factors
+
+FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
+"""Field points, as shares of half the line, left end first."""
+
+PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
+"""Fields of which results are named."""
+
+WAVELENGTH = 650e-9
+"""Of the waves in which wavefront errors are told, metres."""
+
+RINGS = 7
+"""Of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
+
+DARKEST = 0.99
+"""Share of the light that bodies may take: of less no image is told."""
+
+COLOURS = 5
+"""Gauss' wavelengths of a band. At one frequency inside of all cut-offs four are right to 1e-7; cut-offs inside the
+band need more, but there the MTF is next to nothing."""
+
+AT_ONCE = 40
+"""States traced in one launch, to bound memory: 40 take 60 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class PupilOutline:
+    """A pupil as the image sees it, in units of its mean radius; x along the line (Y'), y along the track (X').
+
+    Attributes:
+        axes: from the unit circle to its edge, (2, 2).
+        pieces: of the shadow in it, (K, V, 2).
+    """
+
+    axes: np.ndarray
+    pieces: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CameraQuality:
+    """One camera in S states at F fields. NaN where it is not known; ``reasons`` says why.
+
+    Attributes:
+        wfe: rms wavefront error, piston and tilt removed, (S, F), waves.
+        wfe_refocused: the same at each field's own best focus, (S, F), waves.
+        defocus: best focus minus line CCD along its normal, positive downstream (away from the optics), (S, F), metres.
+        mtf_along_line, mtf_along_track: at the Nyquist frequency, (S, F).
+        light_lost: share of the light that bodies in the beam take, (S, F).
+        nyquist: cycles/m.
+        wavelengths: first and last of the light of the MTF, metres.
+        reasons: of every state; empty if all is known.
+        bodies: each body in the beam -> share of the stop's area that it takes by itself, (S, F).
+        pupils: how the pupils and the shadows in them look, state by state and field by field.
+    """
+
+    wfe: np.ndarray
+    wfe_refocused: np.ndarray
+    defocus: np.ndarray
+    mtf_along_line: np.ndarray
+    mtf_along_track: np.ndarray
+    light_lost: np.ndarray
+    nyquist: float
+    wavelengths: tuple[float, float]
+    reasons: tuple[str, ...]
+    bodies: Mapping[str, np.ndarray]
+    pupils: tuple[tuple[PupilOutline, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageQuality:
+    """All cameras.
+
+    Attributes:
+        fields: shares of half the line, (F,).
+        wavelength: of the waves, metres.
+        cameras: by name.
+        obstruction: whether what stands in the beams is missing in the pupils.
+    """
+
+    fields: tuple[float, ...]
+    wavelength: float
+    cameras: Mapping[str, CameraQuality]
+    obstruction: bool = True
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is not known, and why."""
+        return tuple(
+            f"image quality of {name}: {reason}" for name, c in self.cameras.items() for reason in c.reasons if reason
+        )
+
+    def to_dicts(self) -> list[dict[str, Any]]:
+        """Contents of quality.json of every state; what is not known is null.
+
+        Of each camera mean and worst wavefront error over the fields, the mean of those at best focus, and defocus and
+        MTF at those of PLACES that are among the fields.
+        """
+        where = {place: self.fields.index(field) for place, field in PLACES.items() if field in self.fields}
+        states = range(len(next(iter(self.cameras.values())).reasons))
+        return [{"cameras": {name: _camera_dict(c, s, where) for name, c in self.cameras.items()}} for s in states]
+
+
+def _camera_dict(camera: CameraQuality, s: int, where: Mapping[str, int]) -> dict[str, Any]:
+    def at(values: np.ndarray, unit: float = 1.0) -> dict[str, float | None]:
+        return {place: _known(unit * values[s, k]) for place, k in where.items()}
+
+    out: dict[str, Any] = {
+        "wfe_rms_waves": _known(np.mean(camera.wfe[s])),
+        "wfe_rms_waves_focus_removed": _known(np.mean(camera.wfe_refocused[s])),
+        "wfe_worst_waves": _known(np.max(camera.wfe[s])),
+        "defocus_um": at(camera.defocus, 1e6),
+        "mtf_along_line": at(camera.mtf_along_line),
+        "mtf_along_track": at(camera.mtf_along_track),
+        "light_lost": at(camera.light_lost),
+        "obstructed_by": {name: at(share) for name, share in camera.bodies.items()},
+    }
+    return {**out, "reason": camera.reasons[s]} if camera.reasons[s] else out
+
+
+def _known(value: float | np.floating[Any]) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+@one_blas_thread()  # of small matrices: threads would only wait for each other
+def image_quality(
+    instrument: Instrument,
+    backend: Backend,
+    states: Sequence[State],
+    fields: Sequence[float] = FIELDS,
+    wavelength: float = WAVELENGTH,
+    obstruction: bool = True,
+) -> ImageQuality:
+    """Image quality of every camera in every state.
+
+    Args:
+        instrument: with its cameras.
+        backend: where to trace.
+        states: S states, traced together.
+        fields: shares of half the line, +1 at its left end (+Y'), from -1 to 1.
+        wavelength: of the waves in which wavefront errors are told, metres.
+        obstruction: whether the bodies in the beams count.
+
+    Returns:
+        Numbers of each state, which do not depend on the others but for rounding. A state whose beam is lost or cut has
+        NaN and the reason.
+
+    Raises:
+        ValueError: no field, or one outside of the line.
+    """
+    if not fields or not np.all(np.abs(fields) <= 1.0):
+        raise ValueError(f"fields from -1 to 1 expected, got {list(fields)}")
+    cameras = {}
+    for name in instrument.cameras:
+        shadows = imaging_shadows(instrument, name, backend) if obstruction else None
+        bench = _CameraBench(instrument, name, backend, tuple(fields), wavelength, shadows)
+        out = np.full((_COLUMNS, len(states), len(fields)), np.nan)
+        reasons = [""] * len(states)
+        for start in range(0, len(states), AT_ONCE):
+            bench.fill(list(states), np.arange(start, min(start + AT_ONCE, len(states))), out, reasons)
+        light = (float(np.min(bench.spectrum)), float(np.max(bench.spectrum)))
+        cameras[name] = CameraQuality(
+            wfe=out[0],
+            wfe_refocused=out[1],
+            defocus=out[2],
+            mtf_along_line=out[3],
+            mtf_along_track=out[4],
+            light_lost=out[5],
+            nyquist=bench.nyquist,
+            wavelengths=light,
+            reasons=tuple(reasons),
+            bodies=MappingProxyType(bench.bodies(len(states))),
+            pupils=tuple(bench.pupils.get(s, ()) for s in range(len(states))),
+        )
+    return ImageQuality(tuple(fields), wavelength, MappingProxyType(cameras), obstruction)
+
+
+def quality_dicts(
+    instrument: Instrument, backend: Backend, states: Sequence[State], obstruction: bool = True
+) -> list[dict[str, Any]]:
+    """Contents of quality.json for each of many states, traced together."""
+    return image_quality(instrument, backend, states, obstruction=obstruction).to_dicts() if states else []
+
+
+_COLUMNS = 6
+"""Arrays of ``CameraQuality``, in its order."""
+
+
+class _CameraBench:
+    """What of a camera does not change with its state."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        name: str,
+        backend: Backend,
+        fields: tuple[float, ...],
+        wavelength: float,
+        shadows: ImagingShadows | None,
+    ) -> None:
+        self.shadows = shadows
+        self.pupils: dict[int, tuple[PupilOutline, ...]] = {}
+        self._taken: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+        self.instrument, self.name, self.backend, self.wavelength = instrument, name, backend, wavelength
+        self.model = instrument.cameras[name]
+        spec: CameraSpec = self.model.spec
+        band = spec.bands[target_band(spec)] if spec.bands else None
+        line = spec.line if band is None else band
+        along = 0.5 * line.pixels * line.pitch * np.array(fields)
+        across = np.full(len(along), 0.0 if band is None else band.offset)
+        self.body = line_body(f"{BASE}/{name}")
+        self.points = np.stack([across, along, np.zeros_like(along)], axis=-1)
+        self.nyquist = 0.5 / line.pitch
+        self.frequency = self.nyquist * np.eye(2)
+        self.spectrum = (spec.wavelength, spec.wavelength) if band is None else band.spectrum
+        first, last = self.spectrum
+        node, self.weights = quadrature.gauss(COLOURS if last > first else 1)
+        self.colours = 0.5 * (first + last) + 0.5 * (last - first) * node
+        x, y = self.frequency.T
+        if band is None:
+            self.detector = np.sinc(line.pitch * x) * np.sinc(line.pitch * y)
+        else:
+            self.detector = np.prod(list(band_factors(band, x, y).values()), axis=0)
+        stop = instrument.assembly.elements[f"{name}/{spec.stop}"].aperture
+        assert isinstance(stop, Circle)
+        self.stop = stop
+        self.nodes = quadrature.disk(RINGS)
+        self.tilts = zernike.basis(3, self.nodes.x, self.nodes.y)
+        self.assembly = instrument.assembly
+
+    def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
+        """Work out some states; where the light of one is lost, both halves by themselves."""
+        try:
+            rays, size, shadows = self._trace([states[s] for s in which])
+        except (AimError, BeamMissedError) as error:
+            if len(which) == 1:
+                reasons[which[0]] = str(error)
+                return
+            half = len(which) // 2
+            self.fill(states, which[:half], out, reasons)
+            self.fill(states, which[half:], out, reasons)
+            return
+        values, dark, rough = self._numbers(rays, size, shadows, which)
+        count = len(self.points)
+        out[:, which] = values.reshape(len(values), len(which), count)
+        for k, s in enumerate(which):
+            own = slice(k * count, (k + 1) * count)
+            if np.any(dark[own]):
+                out[:, s] = np.nan
+                reasons[s] = f"an aperture beside the stop cuts {np.max(dark[own]):.1%} of the beam"
+            elif np.any(values[5, own] > DARKEST):
+                out[:5, s] = np.nan
+                reasons[s] = f"bodies in the beam take {np.max(values[5, own]):.1%} of it"
+            elif np.any(rough[own]):
+                reasons[s] = "no MTF: the wavefront or the pupil's edge is too rough for its polynomials"
+
+    def bodies(self, count: int) -> dict[str, np.ndarray]:
+        """Each body that was found in a beam -> share that it takes, (S, F); NaN where the light is lost."""
+        out: dict[str, np.ndarray] = {}
+        known = np.full((count, len(self.points)), np.nan)
+        for which, _ in self._taken:
+            known[which] = 0.0
+        for which, shares in self._taken:
+            for body, share in shares.items():
+                out.setdefault(body, known.copy())[which] = share.reshape(len(which), -1)
+        return dict(sorted(out.items()))
+
+    def _trace(self, states: list[State]) -> tuple[ImagingRays, np.ndarray, Shadows | None]:
+        """Beams to the line CCD, state by state and field by field, for each the CCD's size, (B,), and the shadows.
+
+        Raises:
+            AimError, BeamMissedError: the light of some state is lost.
+        """
+        assembly, name = self.assembly, self.name
+        placed = assembly.place(states)
+        to_stop, to_object = (
+            assemble(assembly, [f"{name}/{way}"], states, placed=placed) for way in ("image_to_stop", "image_to_object")
+        )
+        axis = self.instrument.camera_axes(name)[:, 1]
+        guess = self.instrument.toward_optics(placed, name)[:, None]
+        points = points_to_world(placed, self.body, self.points).real
+        places, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
+        every = np.repeat(np.arange(len(states)), len(self.points))
+        imaging, forward = (
+            assemble(assembly, [f"{name}/{way}"], states, placed=placed).take(every) for way in ("imaging", "to_stop")
+        )
+        launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
+        heading = -sight.reshape(-1, 3)
+        rays = imaging_rays(self.backend, imaging, forward, heading, launch, self.stop, self.nodes, first=axis)
+        if self.shadows is None:
+            return rays, imaging.size, None
+        beams = TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
+        return rays, imaging.size, self.shadows.cast(beams)
+
+    def _numbers(
+        self, rays: ImagingRays, size: np.ndarray, shadows: Shadows | None, which: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values (_COLUMNS, B), the share of each beam that is cut, and whether an MTF is not to be had."""
+        origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
+        radius = float(self.model.first_order.exit_pupil_distance[0])
+        error = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
+        mean = _Mean(self, None if shadows is None or not shadows.owners else shadows)
+        error = -mean.flat(error)
+        focus = mean.flat(np.abs(rays.direction[..., 2]))
+        defocus = mean(error * focus) / mean(focus**2)
+        rest = error - defocus[:, None] * focus
+        wfe, refocused = (np.sqrt(np.maximum(mean(e**2), 0.0)) / self.wavelength for e in (error, rest))
+        dark = np.mean(rays.amplitude == 0.0, axis=-1)
+        mtf = np.full((2, len(dark)), np.nan)
+        lost = np.zeros(len(dark))
+        pieces = None if shadows is None else shadows.pieces
+        lit = np.flatnonzero(dark == 0.0)
+        if len(lit):
+            # the image's first axis runs along the line, Y', the second along the track, X'
+            # per length of the nominal CCD, in which the pixels keep their pitch
+            v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
+            path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
+            taken = None if pieces is None else pieces[lit]
+            pupils = PupilStack.fit(u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, shadows=taken)
+            lost[lit] = 1.0 - pupils.light
+            smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))
+            good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - DARKEST))
+            if len(good):
+                smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
+                otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
+                mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
+            self._note(pupils, lit, which)
+        if shadows is not None:
+            self._taken.append((which, shadows.shares()))
+        values = np.stack([wfe, refocused, defocus, *mtf, lost])
+        return values, dark, np.isnan(mtf[0])
+
+    def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
+        """Keep how the pupils of states look of which all fields are lit."""
+        count = len(self.points)
+        size = np.sqrt(np.abs(np.linalg.det(pupils.axes)))[:, None, None]
+        axes = pupils.axes / size
+        pieces = np.zeros((len(axes), 0, 3, 2)) if pupils.shadow is None else pupils.shadow.pieces
+        pieces = np.einsum("bij,bkvj->bkvi", axes, pieces)
+        where = {int(b): k for k, b in enumerate(lit)}
+        for k, s in enumerate(which):
+            own = [where.get(b) for b in range(k * count, (k + 1) * count)]
+            self.pupils[int(s)] = tuple(PupilOutline(axes[b], pieces[b]) for b in own if b is not None)
+
+
+class _Mean:
+    """Mean over the free part of each stop, of values at the bench's nodes.
+
+    Values are continued into the shadows by their polynomials, and what they hold there is taken off.
+    """
+
+    def __init__(self, bench: _CameraBench, shadows: Shadows | None) -> None:
+        self._share, self._tilts = bench.nodes.share[None], bench.tilts[None]
+        self._added: np.ndarray | None = None
+        if shadows is None:
+            return
+        points, weight = shadows.points, shadows.weights
+        count = len(points)
+        all_weights = np.concatenate([np.broadcast_to(bench.nodes.weight, (count, bench.nodes.count)), -weight], axis=1)
+        self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
+        own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
+        self._tilts = np.concatenate([np.broadcast_to(bench.tilts, (count, *bench.tilts.shape)), own], axis=1)
+        self._to_terms = to_terms(bench.nodes, DEGREE)
+        self._added = products(points.real, points.imag, DEGREE)
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Mean (B,) of values as ``flat`` gives them."""
+        return np.asarray(np.sum(values * self._share, axis=-1))
+
+    def flat(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, N) less piston and tilt, (B, N + Q): also at nodes in the shadows."""
+        values = values - values[:, :1]
+        if self._added is not None:
+            terms = values @ self._to_terms.T
+            values = np.concatenate([values, np.squeeze(self._added @ terms[..., None], -1)], axis=1)
+        weighted = self._tilts * self._share[..., None]
+        turned = np.swapaxes(weighted, 1, 2)
+        level = np.linalg.solve(turned @ self._tilts, turned @ values[..., None])
+        return np.asarray(values - np.squeeze(self._tilts @ level, -1))
+
+
+_SOME = 1e-3
+"""Of a stop's area, in units of its radius: what is darker has no mean."""

@@ -1,0 +1,222 @@
+"""The monitoring experiment: perturb the instrument, render what its area CCDs record, and let the analysis recover
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+
+import numpy as np
+
+from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor.recovery import Recovery, recover
+from analysis.spots.spot_template import SpotTemplate
+from optics.geometry.tree import Motion, State
+from optics.numerics.backend import Backend
+from optics.numerics.threads import cores, one_blas_thread
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import TemperatureError, ThermalModel
+from scenes.specs.job import JobSpec, noll
+from scenes.specs.resolved import ResolvedJob
+from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_path import MonitorPath, SpotFocus
+from twin.monitor.motions import line_family
+from twin.monitor.truth import Truth, trace_truth, truth_jacobian
+from twin.sensors.area_detector import EmvaDetector, FixedPattern
+
+TEMPLATE_MARGIN = 40
+"""Pixels by which the calibrated spot shape is larger than the CCD, so that it can be shifted over it."""
+
+
+class MonitorExperiment:
+    """An instrument with its detectors and its nominal calibration; whatever is derived is worked out once, on demand.
+
+    Args:
+        resolved: the job with everything it names; its perturbation is not used here.
+        backend: where to trace.
+    """
+
+    def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
+        self.backend = backend
+        self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
+        self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
+        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
+        self.path = MonitorPath(self.instrument, backend)
+
+    @cached_property
+    def wide_photons(self) -> np.ndarray:
+        """Expected photons of the unperturbed instrument with the template's margin, (C, rows + 2m, columns + 2m).
+
+        In double precision: rounding to single makes noise that the template's factors would have to follow.
+        """
+        return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN, single=False)[0]
+
+    @cached_property
+    def thermal(self) -> ThermalModel:
+        """What temperatures do to the instrument."""
+        return ThermalModel(self.instrument)
+
+    def state(self, job: JobSpec, progress: Callable[[str], None] = lambda path: None) -> State:
+        """The perturbed state that a job describes.
+
+        Args:
+            job: its perturbation, checked by ``scenes.specs.job.check_nodes``.
+            progress: called with the path of each body whose thermo-elastic solution begins.
+
+        Raises:
+            InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
+        """
+        fields = job.fields()
+        try:
+            self.thermal.check(fields)
+            return self.thermal.state(fields, motions_of(job), progress)
+        except TemperatureError as error:
+            raise job.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
+
+    @property
+    def nominal_photons(self) -> np.ndarray:
+        """Expected photons per pixel and frame of the unperturbed instrument, (C, rows, columns)."""
+        m = TEMPLATE_MARGIN
+        return self.wide_photons[:, m:-m, m:-m]
+
+    @cached_property
+    def nominal_focus(self) -> SpotFocus:
+        """Sharpness of the unperturbed instrument's spots.
+
+        Raises:
+            BeamMissedError, AimError: they do not come to their CCDs.
+        """
+        focus = self.path.focus
+        self.nominal_truth  # noqa: B018 - the line's light, too, has to arrive
+        return focus
+
+    @cached_property
+    def nominal_truth(self) -> Truth:
+        """Principal distances and intersection angle of the unperturbed instrument."""
+        return trace_truth(self.instrument, self.backend, [{}])
+
+    @cached_property
+    def _truth_by_family(self) -> dict[str, np.ndarray]:
+        """Camera -> (4, 4): its true parameters per unit of the four motions of its own line family."""
+        names = list(self.instrument.cameras)
+        motions = [motion for name in names for motion in line_family(name)]
+        every = truth_jacobian(self.instrument, self.backend, motions)
+        return {name: every[name][:, 4 * k : 4 * k + 4] for k, name in enumerate(names)}
+
+    @cached_property
+    def cameras(self) -> dict[str, CameraCalibration]:
+        """What is calibrated of every camera without an image: geometry and Jacobians of the nominal instrument."""
+        families = {name: line_family(name) for name in self.instrument.cameras}
+        spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
+        cameras = {}
+        for k, (name, family) in enumerate(families.items()):
+            cameras[name] = CameraCalibration(
+                geometry=self.geometry(name),
+                look_rad=self.instrument.spec.cameras[name].look,
+                spot_jacobian=spots[2 * k : 2 * k + 2, :, 4 * k : 4 * k + 4].reshape(4, 4),
+                parameter_jacobian=self._truth_by_family[name],
+                motions=tuple(motion.label for motion in family),
+            )
+        return cameras
+
+    @cached_property
+    def calibration(self) -> MonitorCalibration:
+        """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
+        photons = self.wide_photons
+        with one_blas_thread():  # several threads of a small decomposition wait for each other
+            template = SpotTemplate.stack([self._template(image) for image in photons])
+        return MonitorCalibration(self.cameras, template, self.detector.noise_model(self.exposure))
+
+    def geometry(self, camera: str) -> MonitorGeometry:
+        """Calibrated numbers for the formulas: principal distance, plate scale across the line, distortion, L, pixel.
+
+        The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
+        """
+        by_x, by_y, *_ = self._truth_by_family[camera].T
+        return MonitorGeometry(
+            focal_length_m=self.nominal_truth.principal_distance[camera],
+            separation_m=self.instrument.separation[camera],
+            pixel_m=self.path.pitch,
+            field_alpha_rad=0.0,
+            field_beta_rad=self.instrument.spec.monitor.field,
+            focal_length_x_m=float(1.0 / abs(by_x[0])),
+            d_f_per_alpha_m=float(by_x[3] / by_x[0]),
+            d_gamma_per_beta=float(by_y[2] / by_y[1]),
+        )
+
+    def _template(self, image: np.ndarray) -> SpotTemplate:
+        """Calibrated shape of one spot; its centre is the energy centroid of the core (above 5% of the peak)."""
+        core = np.where(image > 0.05 * image.max(), image, 0.0)
+        row = float(core.sum(axis=1) @ np.arange(image.shape[0]) / core.sum())
+        column = float(core.sum(axis=0) @ np.arange(image.shape[1]) / core.sum())
+        return SpotTemplate.from_image(image, row, column, self.path.shape)
+
+    def pattern(self, seed: int) -> FixedPattern:
+        """PRNU and DSNU of all area CCDs; the same before and after."""
+        return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), _stream(seed, 0))
+
+    def frames_before(self, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> np.ndarray:
+        """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns)."""
+        photons = self.nominal_photons + stray
+        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 1))
+
+    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int = 0) -> np.ndarray:
+        """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
+
+        Args:
+            photons: expected photons per pixel and frame, (S, C, rows, columns).
+            frames: per state.
+            seed: as for ``frames_before``; state number first + s draws from a stream of its own, so that the frames of
+                a state do not depend on how a series is cut into pieces.
+            first: number of the first state.
+        """
+        pattern = self.pattern(seed)
+        out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
+
+        def expose(s: int) -> None:
+            stream = _stream(seed, 2, first + s)
+            out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, stream, threads=1)
+
+        if len(photons) == 1:
+            expose(0)
+            return out
+        # one thread per state: threads then wait for each other once per batch and not once per state
+        with ThreadPoolExecutor(min(cores(), 8)) as pool:
+            list(pool.map(expose, range(len(photons))))
+        return out
+
+    def measure(
+        self, states: Sequence[State], frames: int, seed: int, centroid: str = "ml", chunk: int = 40
+    ) -> Iterator[tuple[slice, Recovery]]:
+        """Render, expose and recover many states against one nominal measurement, piece by piece to bound memory.
+
+        Yields:
+            The slice of ``states`` and what their images say.
+        """
+        before = self.frames_before(frames, seed)
+        for piece, photons in self.path.iterate_photons(states, chunk=chunk):
+            after = self.frames_after(photons, frames, seed, piece.start)
+            with one_blas_thread():
+                recovered = recover(before, after, self.calibration, centroid, cores())
+            yield piece, recovered
+
+    def expected_frames(self, photons: np.ndarray) -> np.ndarray:
+        """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""
+        return self.detector.expected_dn(photons, self.exposure)
+
+
+def _stream(seed: int, *number: int) -> np.random.SeedSequence:
+    """One of the independent random streams of a seed."""
+    return np.random.SeedSequence(seed, spawn_key=number)
+
+
+def motions_of(job: JobSpec) -> State:
+    """The rigid motions, scales and figures that a job asks for; its temperatures come on top of them."""
+    return {
+        path: Motion(p.rotate, p.shift, p.pivot, p.scale, {noll(term): value for term, value in p.figure.items()})
+        for path, p in job.perturb.items()
+    }

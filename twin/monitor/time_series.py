@@ -1,0 +1,271 @@
+"""A course of temperatures: the state at each time, what the monitor records and what the analysis makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor.intersection_angle import IntersectionAngleChange
+from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
+from analysis.monitor.recovery import ESTIMATORS, Recovery, recover
+from analysis.spots.spot_positions import SpotError
+from analysis.units import ARCSEC
+from optics.geometry.tree import State
+from optics.numerics.threads import cores, one_blas_thread
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from optics.thermal.heat import Temperature
+from scenes.models.thermal_model import TemperatureError
+from scenes.specs.course import CourseSpec, moment
+from scenes.specs.job import JobSpec
+from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import InputError
+from twin.monitor.monitor_experiment import MonitorExperiment, motions_of
+from twin.monitor.truth import Truth, trace_truth
+
+CHUNK = 25
+"""States rendered at once, to bound memory; fewer when their frames are large."""
+LARGEST_FRAMES = 200_000_000
+"""Pixels of all frames that are exposed at once."""
+LARGEST_SERIES = 200_000_000
+"""Pixels of one image per time and channel, which are kept: about 1.2 GB."""
+
+
+@dataclass(frozen=True, eq=False)
+class CourseRun:
+    """What a course of T times gave.
+
+    Attributes:
+        times: (T,) seconds.
+        temperatures: node path -> its change of temperature at each time, perturbation included.
+        shown: number of the time that the rest of the run shows in full.
+        truth: camera -> (4, T) true d_alpha, d_beta, d_gamma (rad) and d_f (m).
+        angle: of the nominal state, radians, NaN unless there are two cameras; angle_change: (T,), radians.
+        parameters: camera -> estimator -> changes, arrays (T,), against one nominal measurement.
+        recovered_angle: estimator -> change of the intersection angle, arrays (T,); empty unless there are two cameras.
+        photons: expected photons per pixel and frame, float32 (T, C, rows, columns).
+        shown_photons: those of the time that is shown, as they were exposed, (C, rows, columns).
+        frames: the first frame of each time, uint16 (T, C, rows, columns).
+        warnings: what the user should know.
+    """
+
+    times: np.ndarray
+    temperatures: Mapping[str, tuple[Temperature, ...]]
+    shown: int
+    truth: Mapping[str, np.ndarray]
+    angle: float
+    angle_change: np.ndarray
+    parameters: Mapping[str, Mapping[str, CameraParameters]]
+    recovered_angle: Mapping[str, IntersectionAngleChange]
+    photons: np.ndarray
+    shown_photons: np.ndarray
+    frames: np.ndarray
+    warnings: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Contents of course.json: as truth.json and recovered.json, with a list over the times for each number."""
+        cameras: dict[str, Any] = {}
+        for name, estimators in self.parameters.items():
+            # adding 0.0 turns a negative zero into a plain one
+            values = {
+                k: (v + 0.0).tolist() for k, v in zip(PARAMETERS, self.truth[name] * PER_SI[:, None], strict=True)
+            }
+            cameras[name] = {"true": values, **{e: p.to_dict() for e, p in estimators.items()}}
+        out: dict[str, Any] = {
+            "times_s": self.times.tolist(),
+            "detail": self.shown,
+            "temperatures": {
+                path: {"change_K": [f.change for f in fields], "gradient_K_per_m": [list(f.gradient) for f in fields]}
+                for path, fields in self.temperatures.items()
+            },
+            "cameras": cameras,
+        }
+        if self.recovered_angle:
+            out["intersection_angle"] = {
+                "nominal_deg": float(np.degrees(self.angle)),
+                "true": {"change_arcsec": (self.angle_change / ARCSEC + 0.0).tolist()},
+                **{e: a.to_dict() for e, a in self.recovered_angle.items()},
+            }
+        return out
+
+
+def course_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
+    """The state at each time of a job's course.
+
+    Args:
+        experiment: the instrument.
+        job: with a course, checked by ``scenes.specs.job.check_nodes``.
+
+    Raises:
+        InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+    """
+    course = _course(job)
+    motions = motions_of(job)
+    out = []
+    for k, time in enumerate(course.times):
+        fields = job.fields(k)
+        try:
+            experiment.thermal.check(fields)
+        except TemperatureError as error:
+            own = error.origin in course.temperature
+            key = ("course", *course.key(error.origin, k)) if own else ("perturb", error.origin, "temperature")
+            raise job.error(f"{error} at {moment(time)}", key, allowed=error.allowed) from error
+        out.append(experiment.thermal.state(fields, motions))
+    return out
+
+
+def run_course(
+    experiment: MonitorExperiment,
+    resolved: ResolvedJob,
+    states: Sequence[State],
+    advance: Callable[[int], None] = lambda done: None,
+) -> CourseRun:
+    """Trace, render, expose and recover all times of a course against one nominal measurement.
+
+    Args:
+        experiment: the instrument.
+        resolved: a job with a course; its frames and seed are used.
+        states: of ``course_states``.
+        advance: called with the number of times that are done, first with 0.
+
+    Raises:
+        InputError: at some time light misses the mirrors or a spot cannot be measured, or there are too many pixels.
+    """
+    job, frames, seed = resolved.job, resolved.frames, resolved.job.render.seed
+    course = _course(job)
+    channels, shape = experiment.path.channels, experiment.path.shape
+    each = len(channels) * shape[0] * shape[1]
+    if len(states) * each > LARGEST_SERIES:
+        raise job.error(
+            "the images of all times do not fit into memory",
+            ("course", "times"),
+            found=f"{len(states)} times",
+            allowed=f"at most {LARGEST_SERIES // each} with area CCDs of {shape[0]} x {shape[1]} pixels",
+        )
+    advance(0)
+    before = experiment.frames_before(frames, seed)
+    photons = np.empty((len(states), len(channels), *shape), np.float32)
+    first = np.empty(photons.shape, np.uint16)
+    saturated = np.zeros(photons.shape[:2], bool)
+    share = np.empty(photons.shape[:2])
+    shown_photons = np.empty(photons.shape[1:])
+    truths: list[Truth] = []
+    recoveries: list[Recovery] = []
+    for piece in _pieces(len(states), max(1, min(CHUNK, LARGEST_FRAMES // (each * frames)))):
+        some = states[piece]
+        try:
+            truths.append(trace_truth(experiment.instrument, experiment.backend, some))
+            expected = experiment.path.expected_photons(some, chunk=CHUNK)
+        except (AimError, BeamMissedError) as error:
+            raise _lost(experiment, job, some, piece.start, error) from error
+        after = experiment.frames_after(expected, frames, seed, piece.start)
+        try:
+            with one_blas_thread():
+                recoveries.append(
+                    recover(before, after, experiment.calibration, job.analysis.centroid, threads=cores())
+                )
+        except SpotError as error:
+            k, spot = divmod(error.indices[0], len(channels))
+            reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
+            raise too_large(job, piece.start + k, reason) from error
+        photons[piece], first[piece] = expected, after[:, :, 0]
+        if piece.start <= course.shown < piece.stop:
+            shown_photons[:] = expected[course.shown - piece.start]
+        saturated[piece] = experiment.detector.saturated(after).pixels > 0
+        share[piece] = expected.sum(axis=(2, 3)) / experiment.nominal_photons.sum(axis=(1, 2))
+        advance(piece.stop)
+    names = list(experiment.instrument.cameras)
+    changes = {name: [t.cameras[name] for t in truths] for name in names}
+    return CourseRun(
+        times=np.array(course.times),
+        temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
+        shown=course.shown,
+        truth={
+            name: np.concatenate([np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f]) for c in every], axis=1)
+            for name, every in changes.items()
+        },
+        angle=truths[0].angle,
+        angle_change=np.concatenate([t.angle_change for t in truths]),
+        parameters={
+            name: {e: _joined([r.parameters[name][e] for r in recoveries]) for e in ESTIMATORS} for name in names
+        },
+        recovered_angle={e: _joined_angle([r.angle[e] for r in recoveries]) for e in recoveries[0].angle},
+        photons=photons,
+        shown_photons=shown_photons,
+        frames=first,
+        warnings=_warnings(experiment, course, saturated, share),
+    )
+
+
+def too_large(job: JobSpec, k: int, reason: str) -> InputError:
+    """What to say when the state at time number ``k`` cannot be rendered."""
+    course = _course(job)
+    return job.error(
+        f"the instrument at {moment(course.times[k])} of the course cannot be rendered: {reason}",
+        ("course", "temperature"),
+        found=f"temperatures of {', '.join(course.temperature)}",
+        allowed="temperatures and motions that keep the beams on the mirrors and the spots on their CCDs",
+    )
+
+
+def _course(job: JobSpec) -> CourseSpec:
+    if job.course is None:
+        raise ValueError("the job has no course")
+    return job.course
+
+
+def _pieces(count: int, size: int) -> Iterator[slice]:
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
+
+
+def _lost(
+    experiment: MonitorExperiment, job: JobSpec, states: Sequence[State], first: int, error: Exception
+) -> Exception:
+    """The error of the first of some states in which light is lost, found by trying each alone."""
+    for k, state in enumerate(states):
+        try:
+            trace_truth(experiment.instrument, experiment.backend, [state])
+            experiment.path.rays([state])
+        except (AimError, BeamMissedError) as reason:
+            return too_large(job, first + k, str(reason))
+    return error
+
+
+def _joined(parts: Sequence[CameraParameters]) -> CameraParameters:
+    return CameraParameters.from_vector(
+        np.concatenate([p.vector for p in parts]), np.concatenate([p.covariance for p in parts])
+    )
+
+
+def _joined_angle(parts: Sequence[IntersectionAngleChange]) -> IntersectionAngleChange:
+    return IntersectionAngleChange(
+        np.concatenate([p.change_rad for p in parts]), np.concatenate([p.sigma_rad for p in parts])
+    )
+
+
+MIN_LIGHT = 0.5
+"""Share of the nominal light on a CCD below which the user is warned."""
+
+
+def _warnings(
+    experiment: MonitorExperiment, course: CourseSpec, saturated: np.ndarray, share: np.ndarray
+) -> tuple[str, ...]:
+    out = []
+    for i, channel in enumerate(experiment.path.channels):
+        bad = np.flatnonzero(saturated[:, i])
+        if len(bad):
+            out.append(
+                f"course: saturated pixels in the spot {channel.key} at {len(bad)} times, first at "
+                f"{moment(course.times[bad[0]])}: centroids are biased; reduce the light"
+            )
+        worst = int(np.argmin(share[:, i]))
+        if share[worst, i] < MIN_LIGHT:
+            out.append(
+                f"course: {channel.key} at {moment(course.times[worst])}: only {100 * share[worst, i]:.0f}% of the "
+                "nominal light reaches the CCD"
+            )
+    return tuple(out)

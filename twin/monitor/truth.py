@@ -1,0 +1,127 @@
+"""The truth about a perturbed instrument, by exact chief rays in the base frame; no formula of the papers enters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.tree import PlacedBodies, State
+from optics.numerics.backend import Backend
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.line_of_sight import LineChange, chief_directions, line_change
+from optics.raytrace.system import assemble
+from scenes.models.camera_assembly import line_body
+from scenes.models.instrument_model import Instrument
+from scenes.specs.channel import BASE
+from twin.monitor.motions import ElementaryMotion
+
+LINE_POINTS = 41
+"""Points of the line CCD over which roll and principal distance are taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True changes of every camera for S states.
+
+    Attributes:
+        cameras: camera -> changes, arrays of shape (S,).
+        principal_distance: camera -> nominal principal distance, metres.
+        angle: angle between the two lines of sight in the nominal state, radians (NaN unless there are two cameras).
+        angle_change: its change, (S,), radians.
+    """
+
+    cameras: dict[str, LineChange]
+    principal_distance: dict[str, float]
+    angle: float
+    angle_change: np.ndarray
+
+
+def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
+    """Trace the lines of sight of all cameras in all states.
+
+    Raises:
+        AimError, BeamMissedError: a perturbation moves the image off the mirrors.
+    """
+    return truth_of_sight(instrument, trace_sight(instrument, backend, [{}, *states]))
+
+
+def line_points(instrument: Instrument, camera: str) -> np.ndarray:
+    """Where along camera Y the points of the nominal line CCD lie, (LINE_POINTS,), metres."""
+    line = instrument.cameras[camera].spec.line
+    half = 0.5 * line.pixels * line.pitch
+    return np.linspace(-half, half, LINE_POINTS)
+
+
+def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
+    """The points of the line CCD in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
+    position = line_points(instrument, camera)
+    line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
+    return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)
+
+
+def trace_sight(instrument: Instrument, backend: Backend, states: Sequence[State]) -> np.ndarray:
+    """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
+
+    Raises:
+        AimError, BeamMissedError: a perturbation moves the image off the mirrors.
+    """
+    assembly = instrument.assembly
+    placed = assembly.place(states)
+    names = list(instrument.cameras)
+    points = [line_in_world(instrument, name, placed) for name in names]
+    guesses = [instrument.toward_optics(placed, name) for name in names]
+    sight = chief_directions(
+        backend,
+        assemble(assembly, [f"{name}/image_to_stop" for name in names], states, placed=placed),
+        assemble(assembly, [f"{name}/image_to_object" for name in names], states, placed=placed),
+        np.concatenate(points),
+        np.concatenate(guesses)[:, None],
+        np.array([0.0, 1.0, 0.0]),
+    )
+    return sight.reshape(len(names), len(states), LINE_POINTS, 3)
+
+
+def truth_of_sight(instrument: Instrument, sight: np.ndarray, axes: Mapping[str, np.ndarray] | None = None) -> Truth:
+    """What directions of sight (cameras, 1 + S, LINE_POINTS, 3) say of S states; entry 0 is the nominal one.
+
+    ``axes``: ``instrument.camera_axes`` of every camera, where they are known already.
+    """
+    names = list(instrument.cameras)
+    cameras: dict[str, LineChange] = {}
+    principal: dict[str, float] = {}
+    for i, name in enumerate(names):
+        own = instrument.camera_axes(name) if axes is None else axes[name]
+        change = line_change(sight[i], line_points(instrument, name), own)
+        cameras[name] = change
+        principal[name] = change.nominal_distance
+    lines = sight[:, :, LINE_POINTS // 2]
+    if len(names) == 2:
+        angle = np.arctan2(np.linalg.norm(np.cross(lines[0], lines[1]), axis=-1), np.sum(lines[0] * lines[1], axis=-1))
+    else:
+        angle = np.full(sight.shape[1], np.nan)
+    return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0])
+
+
+DIFFERENCE = 1e-6
+"""Half step of the central differences (rad, m or relative): truncation and rounding are both below 1e-8 of the
+result."""
+
+
+def truth_jacobian(
+    instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion]
+) -> dict[str, np.ndarray]:
+    """Derivative of the true parameters of every camera by elementary motions, by central differences of the exact
+    trace.
+
+    Returns:
+        Camera -> (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
+    """
+    states = [m.state(DIFFERENCE) for m in motions] + [m.state(-DIFFERENCE) for m in motions]
+    truth = trace_truth(instrument, backend, states)
+    out = {}
+    for name, change in truth.cameras.items():
+        rows = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f])
+        out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * DIFFERENCE)
+    return out

@@ -1,0 +1,479 @@
+"""The lines whose angles are tested, and one moment of a pass as it truly is and as it is measured.
+
+The measurement has the errors that the paper discusses: of the orbit at the station, and of the ground points from
+matching and aerial triangulation. Beside the coordinates the analysis gets what the laboratory measured of each line
+before launch, nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.orbit.planes import Station, Strip
+from optics.geometry.pose import about_axis, rotation_matrix
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import TemperatureError, ThermalModel
+from scenes.specs.job import JobSpec, perturbation_issues
+from scenes.yaml.errors import InputError
+from twin.monitor.monitor_experiment import motions_of
+from twin.monitor.truth import trace_truth
+from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.flight.light_effects import (
+    NO_EFFECTS,
+    SPEED_OF_LIGHT,
+    LightEffects,
+    aberrated,
+    turned_with_earth,
+    unrefracted,
+)
+from twin.orbit.flight.line_camera import (
+    LineCamera,
+    along_track_angle,
+    dihedral_angle,
+    line_cameras,
+    line_normal,
+    look_angle,
+    traced_line_cameras,
+)
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.run.result import BenchError
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_angle import OrbitAngleSpec
+    from scenes.specs.orbit_setup import AngleSetup
+
+
+@dataclass(frozen=True, eq=False)
+class AngleCamera:
+    """Lines on their common base.
+
+    Attributes:
+        laboratory: line -> what was measured before launch, which the analysis knows.
+        cameras: line -> what it is in orbit.
+        trace: angle -> how it has changed by `twin.monitor.truth.trace_truth`, radians; only for the two cameras of a
+            pair.
+    """
+
+    laboratory: Mapping[str, LineCamera]
+    cameras: Mapping[str, LineCamera]
+    trace: Mapping[str, float]
+
+
+def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
+    """The lines of a payload turned as the test says, or those of an instrument traced without and with its changes.
+
+    Args:
+        setup: the test with its camera.
+        backend: where to trace an instrument; a payload needs none.
+
+    Raises:
+        InputError: a change of what the instrument does not have, or a temperature that cannot be.
+        BenchError: the changes move the image off the mirrors.
+    """
+    spec = setup.test
+    if setup.camera is not None:
+        laboratory = line_cameras(setup.camera)
+        turns = {name: rotation_matrix(change.rotate).T for name, change in spec.changes.items()}
+        turned = {
+            name: replace(camera, directions=camera.directions @ turns[name]) if name in turns else camera
+            for name, camera in laboratory.items()
+        }
+        return AngleCamera(FrozenMap(laboratory), FrozenMap(turned), FrozenMap())
+    if setup.instrument is None or backend is None:
+        raise ValueError("an instrument's lines need a backend to be traced")
+    instrument = build_instrument(setup.instrument, setup.cameras, backend)
+    state = changed_state(spec, instrument)
+    laboratory = traced_line_cameras(instrument, backend)
+    try:
+        cameras = traced_line_cameras(instrument, backend, state)
+        change = float(trace_truth(instrument, backend, [state]).angle_change[0])
+    except (AimError, BeamMissedError) as error:
+        raise BenchError(str(error), ("changes",), "smaller changes, which leave the image on the mirrors") from error
+    trace = {name: change for name, pair in setup.angles.items() if len(cameras) == 2 and set(pair) == set(cameras)}
+    return AngleCamera(FrozenMap(laboratory), FrozenMap(cameras), FrozenMap(trace))
+
+
+def changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
+    """The state that a test's changes put an instrument into.
+
+    Raises:
+        InputError: a node that does not exist or does not allow what is done to it, or a temperature that cannot be.
+    """
+    issues = [
+        issue
+        for path, what in spec.changes.items()
+        for issue in perturbation_issues(spec, instrument.nodes, path, what, ("changes", path))
+    ]
+    if issues:
+        raise InputError(*issues)
+    job = JobSpec.model_construct(instrument=spec.camera, perturb=spec.changes)
+    thermal = ThermalModel(instrument)
+    try:
+        thermal.check(job.fields())
+        return thermal.state(job.fields(), motions_of(job))
+    except TemperatureError as error:
+        raise spec.error(str(error), ("changes", error.origin, "temperature"), allowed=error.allowed) from error
+
+
+_LINE_TIME = 1e-3
+"""Seconds; of an image of one line only its middle is used."""
+_LEAST_SIGMA = 1e-3
+"""Metres. Points without errors are given this sigma, for an adjustment needs weights."""
+_LEAST_CONVERGENCE = np.radians(1.0)
+"""Rays that meet at a smaller angle give no heights: one arcsecond would be half a kilometre and more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What the analysis gets. Coordinates in one Cartesian frame, metres.
+
+    Attributes:
+        station: measured, with its covariance.
+        strips: line -> measured ground points with their covariance.
+        tangent: line -> laboratory's tangents of the points' directions from the line's centre, across the line and
+            along it, (n, 2); X forward, Y to the right.
+        along: line -> tangent of the angle of each point from the line's centre along the line, (n,).
+        look: line -> laboratory's angle of the line's centre from the body's Z about its Y, radians.
+        offset: line -> laboratory's projection centre of each point, in the axes of its tangents, (n, 3), metres.
+        bow: line -> what a direction needs, in the axes of its tangents, to lie in one plane with the line's centre and
+            its middle direction, (n, 3): the image of a mirror camera's line is bent.
+    """
+
+    station: Station
+    strips: Mapping[str, Strip]
+    tangent: Mapping[str, np.ndarray]
+    along: Mapping[str, np.ndarray]
+    look: Mapping[str, float]
+    offset: Mapping[str, np.ndarray]
+    bow: Mapping[str, np.ndarray]
+
+    def in_frame(self, axes: np.ndarray, origin: np.ndarray) -> Measurement:
+        """The same in another frame; axes: its axes as rows in the present one, (3, 3), origin: (3,)."""
+        station = Station((self.station.position - origin) @ axes.T, axes @ self.station.covariance @ axes.T)
+        strips = {
+            name: Strip((strip.points - origin) @ axes.T, axes @ strip.covariance @ axes.T)
+            for name, strip in self.strips.items()
+        }
+        return replace(self, station=station, strips=strips)
+
+
+@dataclass(frozen=True, eq=False)
+class AnglePass:
+    """The truth at the moment of exposure; made by `fly`. All coordinates in the ITRS, metres.
+
+    Attributes:
+        spec: the test.
+        earth: its rotation and ellipsoid.
+        trajectory: true orbit and attitude.
+        laboratory: line -> camera as it was measured before launch.
+        cameras: line -> camera as it is.
+        pairs: angle -> the two lines that it lies between.
+        trace: angle -> its change by `twin.monitor.truth.trace_truth`, radians; empty where no trace of two cameras
+            tells it.
+        pixel: line -> places of its points, (n,).
+        height: line -> heights of its points above the ellipsoid, (n,).
+    """
+
+    spec: OrbitAngleSpec
+    earth: Earth
+    trajectory: Trajectory
+    laboratory: Mapping[str, LineCamera]
+    cameras: Mapping[str, LineCamera]
+    pairs: Mapping[str, tuple[str, str]]
+    trace: Mapping[str, float]
+    pixel: Mapping[str, np.ndarray]
+    height: Mapping[str, np.ndarray]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Those that angles are measured of, in the order of the camera's file."""
+        return tuple(self.pixel)
+
+    @property
+    def reference(self) -> str:
+        """The line whose look is zero in a resection: the second of the first angle."""
+        return next(iter(self.pairs.values()))[1]
+
+    @property
+    def station(self) -> np.ndarray:
+        """(3,)."""
+        return self.trajectory.position(self.spec.time)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Against the stars, (3,), m/s."""
+        return self.trajectory.inertial_velocity(self.spec.time)
+
+    @property
+    def effects(self) -> LightEffects:
+        """Those of the file."""
+        e = self.spec.effects
+        return LightEffects(e.light_time, e.aberration, e.refraction, e.wavelength)
+
+    @property
+    def look(self) -> dict[str, float]:
+        """True angles between the lines of sight of the lines' centres, radians."""
+        return {name: look_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def laboratory_look(self) -> dict[str, float]:
+        """The same before launch."""
+        return {name: look_angle(self.laboratory[a], self.laboratory[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def along_track(self) -> dict[str, float]:
+        """Their signed part along the track, positive where the first line looks ahead of the second, radians."""
+        return {name: along_track_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def dihedral(self) -> dict[str, float]:
+        """True angles between the planes of the lines where the points are, radians."""
+        return {
+            name: dihedral_angle(self.cameras[a], self.cameras[b], (self.pixel[a], self.pixel[b]))
+            for name, (a, b) in self.pairs.items()
+        }
+
+    @property
+    def middle_point(self) -> np.ndarray:
+        """What the reference line's centre sees, (3,); origin of the local level frame."""
+        middle = np.array([0.5 * (self.cameras[self.reference].pixels - 1)])
+        return self._sensor(self.reference, NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
+
+    @property
+    def local(self) -> np.ndarray:
+        """Axes of the local level frame as rows: east, north, up at `middle_point`, (3, 3)."""
+        lon, lat, _ = self.earth.geodetic(self.middle_point)
+        return east_north_up(lon, lat)
+
+    @property
+    def orbital(self) -> np.ndarray:
+        """Axes of the orbital frame as rows: forward, right, down, (3, 3)."""
+        return np.asarray(self.trajectory.orbital_to_itrs(self.spec.time).T)
+
+    @property
+    def line_axes(self) -> np.ndarray:
+        """Axes of the reference line as rows: normal of its plane, along the line, its middle's look, (3, 3)."""
+        camera = self.cameras[self.reference]
+        x = line_normal(camera)
+        z = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
+        z = z - (z @ x) * x
+        z = z / np.linalg.norm(z)
+        return np.stack([x, np.cross(z, x), z]) @ self.trajectory.body_to_itrs(self.spec.time).T
+
+    def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
+        """Line -> true ground points, (n, 3), when these effects act on the light.
+
+        Raises:
+            BenchError: a look misses the Earth, or the time is too near the end of the orbit.
+        """
+        points = {
+            name: self._sensor(name, effects).ground(np.zeros(1), self.pixel[name], self.height[name])
+            for name in self.lines
+        }
+        if not all(np.all(np.isfinite(p)) for p in points.values()):
+            raise BenchError("a look misses the Earth", ("attitude",), "an attitude in which all lines see the ground")
+        return points
+
+    def measure(
+        self,
+        points: Mapping[str, np.ndarray],
+        seed: np.random.SeedSequence | None,
+        corrected: LightEffects = NO_EFFECTS,
+        datum: tuple[float, float, float] | None = None,
+    ) -> Measurement:
+        """Station and points as they are measured.
+
+        Args:
+            points: line -> true points, (n, 3).
+            seed: of the errors; None for none but the datum's.
+            corrected: effects that are taken out of the points.
+            datum: shift of all points, east, north, up, metres; None for the file's.
+        """
+        errors, lines = self.spec.errors, self.lines
+        noise = np.zeros((1 + sum(len(points[name]) for name in lines), 3))
+        if seed is not None:
+            noise = np.random.default_rng(seed).standard_normal(noise.shape)
+        place = self.station + errors.station * noise[0]
+        shift = np.array(errors.datum if datum is None else datum) @ self.local
+        found = np.concatenate([points[name] for name in lines]) + shift + errors.points * noise[1:]
+        if corrected.light_time or corrected.aberration or corrected.refraction:
+            found = without_effects(found, place, self.velocity, self.earth, corrected)
+        sigma = max(errors.points, _LEAST_SIGMA)
+        strips = {name: Strip.of(p, sigma) for name, p in zip(lines, np.split(found, len(lines)), strict=True)}
+        inside = {name: interior(self.laboratory[name], self.pixel[name]) for name in lines}
+        return Measurement(
+            Station.of(place, errors.station),
+            strips,
+            **{key: {name: one[key] for name, one in inside.items()} for key in INTERIOR},
+        )
+
+    def height_per_arcsec(self) -> dict[str, float | None]:
+        """How far a wrong angle of one arcsecond moves heights that are intersected from its two lines, metres.
+
+        The point that the reference line's centre sees (or that of the second line, where the reference is not one of
+        them) is looked up in the other line's image, that line is then turned by 1 arcsec about the body's Y, and the
+        two rays are intersected; None where the orbit is too short for the other line to see the point, and for lines
+        so nearly parallel that they make no heights. No effects on the light.
+        """
+        out: dict[str, float | None] = {}
+        look = self.look
+        for angle, (a, b) in self.pairs.items():
+            out[angle] = None
+            if look[angle] < _LEAST_CONVERGENCE:
+                continue
+            base, other = (a, b) if a == self.reference else (b, a)
+            middle = np.array([0.5 * (self.cameras[base].pixels - 1)])
+            point = self._sensor(base, NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
+            first = self._ray(base, point, 0.0)
+            rays = [self._ray(other, point, turn) for turn in (0.0, np.radians(1.0 / 3600.0))]
+            if first is None or any(ray is None for ray in rays):
+                continue
+            heights = [self.earth.geodetic(_nearest(first, ray))[2] for ray in rays if ray is not None]
+            out[angle] = float(abs(heights[1] - heights[0]))
+        return out
+
+    def _ray(self, name: str, point: np.ndarray, turn: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Projection centre and look of the pixel that sees a point, the line turned afterwards; None if none does."""
+        first, last = self.trajectory.first, self.trajectory.last
+        lines = int((last - first) / _LINE_TIME) - 1
+        sensor = Sensor(
+            self.cameras[name], self.trajectory, self.earth, _LINE_TIME, first + _LINE_TIME, lines, NO_EFFECTS
+        )
+        line, pixel = sensor.image(point[None])
+        if not np.isfinite(line[0]):
+            return None
+        seconds = sensor.time(line)[0]
+        body = about_axis(1, turn) @ self.cameras[name].look(pixel)[0]
+        axes = self.trajectory.body_to_itrs(seconds)
+        return self.trajectory.position(seconds) + axes @ self.cameras[name].origin(pixel)[0], axes @ body
+
+    def _sensor(self, name: str, effects: LightEffects) -> Sensor:
+        try:
+            return Sensor(self.cameras[name], self.trajectory, self.earth, _LINE_TIME, self.spec.time, 1, effects)
+        except ValueError as error:
+            raise BenchError(str(error), ("time",), "a time inside the orbit, or a longer orbit") from error
+
+
+def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) -> AnglePass:
+    """Put the satellite into its orbit and draw the terrain.
+
+    Args:
+        setup: the test.
+        camera: its lines, by `angle_camera`.
+        seed: of the terrain.
+
+    Raises:
+        BenchError: there is no such orbit.
+    """
+    spec = setup.test
+    earth = Earth.from_spec(spec.earth)
+    try:
+        orbit = propagate(spec.orbit, earth)
+    except ValueError as error:
+        raise BenchError(str(error), ("orbit",), "an orbit that exists and stays above the ground") from error
+    used = [name for name in setup.pixels if any(name in pair for pair in setup.angles.values())]
+    share = (np.linspace(spec.strips.first, spec.strips.last, spec.strips.points) + 0.5) / setup.usual_pixels
+    pixel = {name: share * setup.pixels[name] - 0.5 for name in used}
+    above = float(earth.geodetic(orbit.itrs(spec.time)[0])[2]) - spec.terrain.height
+    height = {
+        name: _terrain(spec, above * _spread(camera.laboratory[name], pixel[name]), np.random.default_rng(stream))
+        for name, stream in zip(used, seed.spawn(len(used)), strict=True)
+    }
+    trajectory = Trajectory(orbit, Attitude.from_spec(spec.attitude))
+    return AnglePass(
+        spec,
+        earth,
+        trajectory,
+        camera.laboratory,
+        camera.cameras,
+        FrozenMap(setup.angles),
+        camera.trace,
+        FrozenMap(pixel),
+        FrozenMap(height),
+    )
+
+
+INTERIOR = ("tangent", "along", "look", "offset", "bow")
+
+
+def interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
+    """What the laboratory knows of a line's pixels (N,): the fields `INTERIOR` of a `Measurement`.
+
+    Tangents count across (forward) and along (to the right) in the body's axes pitched to the line's centre; the angle
+    within the line is positive to the right.
+    """
+    centre = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
+    seen = camera.look(pixel)
+    look = float(np.arctan2(centre[0], centre[2]))
+    pitch = about_axis(1, look)
+    pitched = seen @ pitch
+    turn = np.linalg.norm(np.cross(centre, seen), axis=-1) / (seen @ centre)
+    normal = line_normal(camera, pixel)
+    normal = normal - (normal @ centre) * centre
+    normal = normal / np.linalg.norm(normal)
+    return {
+        "tangent": pitched[:, :2] / pitched[:, 2:],
+        "along": np.copysign(turn, seen[:, 1] - centre[1]),
+        "look": look,
+        "offset": camera.origin(pixel) @ pitch,
+        "bow": -np.outer(seen @ normal, normal @ pitch),
+    }
+
+
+def without_effects(
+    points: np.ndarray, station: np.ndarray, velocity: np.ndarray, earth: Earth, effects: LightEffects
+) -> np.ndarray:
+    """Where ground points (N, 3) would lie on the lines of sight that see them, if nothing happened to the light.
+
+    Args:
+        points: ITRS, metres.
+        station: (3,), metres.
+        velocity: of the satellite against the stars in axes of the ITRS, (3,), m/s.
+        earth: the ellipsoid.
+        effects: to take out.
+
+    Returns:
+        (N, 3), at the distances of the points.
+    """
+    source = points
+    way = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT * effects.light_time
+    place = turned_with_earth(np.broadcast_to(station, source.shape), way)
+    if effects.refraction:
+        source = unrefracted(source, place, earth, effects.wavelength)
+    arm = turned_with_earth(source - place, -way)
+    if effects.aberration:
+        arm = aberrated(arm / np.linalg.norm(arm, axis=-1, keepdims=True), velocity)
+        arm = arm * np.linalg.norm(points - station, axis=-1, keepdims=True)
+    return np.asarray(station + arm)
+
+
+def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
+    """Places on flat ground along the strip, (N,), in heights of the satellite."""
+    look = camera.look(pixel)
+    return np.asarray(look[:, 1] / look[:, 2])
+
+
+def _terrain(spec: OrbitAngleSpec, place: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Heights (N,) at places along a strip, metres: a normal process with a Gaussian correlation."""
+    away = (place[:, None] - place) / spec.terrain.length
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * away**2))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(spec.terrain.height + spec.terrain.relief * (root @ random.standard_normal(len(place))))
+
+
+def _nearest(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The point nearest to two rays, (3,)."""
+    weights = [np.eye(3) - np.outer(d, d) for _, d in (a, b)]
+    return np.linalg.solve(weights[0] + weights[1], weights[0] @ a[0] + weights[1] @ b[0])

@@ -1,0 +1,384 @@
+"""The intersection angle test's procedure: estimates by planes and by resection, in other frames, over many passes,
+with each effect on the light. Truth enters only where an estimate is compared with it.
+
+Planes go through one station. The lines of a satellite have projection centres of their own, metres apart, and a mirror
+camera's line is bent. The resection takes both as the laboratory knows them; its attitude, good to an arcsecond, then
+moves the points to where they would lie for one common centre (nanoradians of the angles), and for the angles between
+lines of sight onto straight lines.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import chi2
+
+from analysis.orbit.angles import (
+    AlongTrackAngles,
+    AngleError,
+    PlaneAngles,
+    along_track_angles,
+    angles_between,
+    line_frame,
+    look_angle,
+)
+from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneError, PlaneFit, Strip, fit_plane
+from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
+from analysis.orbit.sensitivity import Sensitivity, sensitivity
+from analysis.units import ARCSEC
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.orbit_angle import PAPER_ANGLES
+from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.run.result import BenchError
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.specs.orbit_setup import AngleSetup
+
+EFFECTS = ("light_time", "aberration", "refraction")
+BEND = 0.01 * ARCSEC
+"""How far the ends of a line may have bent since the laboratory, one sigma. A micrometre's shift of a mirror bends the
+line of `gf7` by 1e-5 arcsec, and a turn of its focal plane by 2 arcsec about the rear node by 1e-3 arcsec."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Angles from one measurement, in the order of the test's file.
+
+    Attributes:
+        planes: method -> planes of the lines.
+        angles: method -> their dihedral angles.
+        look: angles between the lines of sight of the lines' centres, from tls planes and places on the line, radians.
+        along: their signed part along the track.
+        resection: the second method.
+    """
+
+    planes: Mapping[Method, tuple[PlaneFit, ...]]
+    angles: Mapping[Method, PlaneAngles]
+    look: np.ndarray
+    along: AlongTrackAngles
+    resection: Resection
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRow:
+    """One method in one frame.
+
+    Attributes:
+        frame: its name.
+        method: of the planes.
+        values: the angles, radians; NaN where the method found a plane singular.
+        sigma: that it claims, radians.
+        steepest: smallest size of the z component of the three unit normals; 0 for a vertical plane.
+        warned: the fit itself says that it is biased.
+    """
+
+    frame: str
+    method: Method
+    values: np.ndarray
+    sigma: np.ndarray
+    steepest: float
+    warned: bool
+
+
+@dataclass(frozen=True, eq=False)
+class EffectRow:
+    """What an effect on the light, or a common shift of the points, does to the angles of tls planes, radians.
+
+    Attributes:
+        what: name.
+        bias: angles minus the truth without correction.
+        left: the same after the analysis has taken it out; NaN where it cannot.
+    """
+
+    what: str
+    bias: np.ndarray
+    left: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Repeated passes with errors drawn anew, of one estimator of m angles.
+
+    Attributes:
+        values: (passes, m), radians.
+        covariance: that the estimator claims, mean over the passes, (m, m), rad^2.
+        truth: what it estimates, (m,), radians.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    truth: np.ndarray
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Claimed, (m,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of the values, (m,)."""
+        return np.asarray(np.std(self.values, axis=0, ddof=1))
+
+    @property
+    def bias(self) -> np.ndarray:
+        """Mean minus truth, (m,)."""
+        return np.asarray(np.mean(self.values, axis=0) - self.truth)
+
+    @property
+    def tail(self) -> np.ndarray:
+        """Chance that a right sigma shows a spread as far off as this one, to either side, (m,)."""
+        free = len(self.values) - 1
+        below = chi2.cdf(free * (self.spread / self.sigma) ** 2, free)
+        return np.asarray(2.0 * np.minimum(below, 1.0 - below))
+
+
+@dataclass(frozen=True, eq=False)
+class AngleRun:
+    """A finished test.
+
+    Attributes:
+        flight: the truth.
+        measurement: of the pass that is shown.
+        estimate: from it.
+        frames: all methods in all frames.
+        effects: each alone and all together, without errors.
+        planes, resection, along: scatter of the dihedral angles (tls), of the resection's, and of the planes' angles
+            along the track.
+        difference_sigma: standard deviation of planes minus resection over the passes, (m,), radians.
+        table: sensitivity of tls planes in the Earth-fixed frame.
+        height: angle -> height error of one arcsecond, metres; None where the orbit is too short.
+    """
+
+    flight: AnglePass
+    measurement: Measurement
+    estimate: Estimate
+    frames: tuple[FrameRow, ...]
+    effects: tuple[EffectRow, ...]
+    planes: Scatter
+    resection: Scatter
+    along: Scatter
+    difference_sigma: np.ndarray
+    table: tuple[Sensitivity, ...]
+    height: Mapping[str, float | None]
+
+    @property
+    def of_paper(self) -> bool:
+        """Whether alpha and beta are the paper's, so that its sentences and numbers can be held against them."""
+        return all(self.flight.pairs.get(name) == pair for name, pair in PAPER_ANGLES.items())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the angles."""
+        return tuple(self.flight.pairs)
+
+    @property
+    def resected(self) -> np.ndarray:
+        """The resection's angles, (m,), radians; signed like those along the track."""
+        return self.estimate.resection.angles(tuple(self.flight.pairs.values()))
+
+    @property
+    def resected_sigma(self) -> np.ndarray:
+        """Their sigma, (m,), radians."""
+        return np.sqrt(np.diag(self.estimate.resection.angle_covariance(tuple(self.flight.pairs.values()))))
+
+    @property
+    def narrow(self) -> np.ndarray:
+        """Where lines are so nearly parallel that a turn about their looks counts in the dihedral angle, (m,)."""
+        return narrow(self.flight)
+
+    @property
+    def difference(self) -> np.ndarray:
+        """Planes (tls) minus resection, (m,), radians: dihedral angles, but along the track where they are `narrow`."""
+        dihedral = self.estimate.angles["tls"].values - np.abs(self.resected)
+        return np.where(self.narrow, self.estimate.along.values - self.resected, dihedral)
+
+    @property
+    def change(self) -> np.ndarray:
+        """Look angles from the planes minus the laboratory's, (m,), radians."""
+        return self.estimate.look - values_of(self.flight.laboratory_look)
+
+
+def narrow(flight: AnglePass) -> np.ndarray:
+    """Angles below 5 deg in the laboratory, (m,)."""
+    return values_of(flight.laboratory_look) < np.radians(5.0)
+
+
+def values_of(angles: Mapping[str, float]) -> np.ndarray:
+    """The numbers of a mapping by angle, (m,)."""
+    return np.array(list(angles.values()))
+
+
+@one_blas_thread()  # of small matrices: threads would only wait for each other
+def run_passes(
+    setup: AngleSetup, seed: int, advance: Callable[[str, int, int], None], backend: Backend | None = None
+) -> AngleRun:
+    """Fly, measure and estimate.
+
+    Args:
+        setup: the test and its camera.
+        seed: of all random numbers.
+        advance: told of the progress.
+        backend: where to trace an instrument; a payload needs none.
+
+    Raises:
+        InputError: an instrument's changes are not possible.
+        BenchError: the test cannot be carried out as its file says.
+    """
+    terrain, shown, repeats = np.random.SeedSequence(seed).spawn(3)
+    flight = fly(setup, angle_camera(setup, backend), terrain)
+    pairs = tuple(flight.pairs.values())
+    count = setup.test.passes
+    try:
+        ground = flight.ground(flight.effects)
+        removed = flight.effects if setup.test.effects.corrected else NO_EFFECTS
+        measurement = flight.measure(ground, shown, removed)
+        estimate = estimated(measurement, flight)
+        planes, alongs, sections = [], [], []
+        for k, stream in enumerate(repeats.spawn(count)):
+            once = flight.measure(ground, stream, removed)
+            section = resected(once, flight)
+            planes.append(tls_angles(centred(once, section), flight))
+            alongs.append(sighted(once, section, flight)[1])
+            sections.append(section)
+            advance("passes", k + 1, count)
+        first = Scatter(
+            np.array([p.values for p in planes]),
+            np.mean([p.covariance for p in planes], axis=0),
+            values_of(flight.dihedral),
+        )
+        along = values_of(flight.along_track)
+        second = Scatter(
+            np.array([r.angles(pairs) for r in sections]),
+            np.mean([r.angle_covariance(pairs) for r in sections], axis=0),
+            along,
+        )
+        third = Scatter(np.array([a.values for a in alongs]), np.mean([a.covariance for a in alongs], axis=0), along)
+        common = centred(measurement, estimate.resection)
+        return AngleRun(
+            flight,
+            measurement,
+            estimate,
+            frame_rows(flight, common),
+            effect_rows(flight),
+            first,
+            second,
+            third,
+            np.std(
+                np.where(narrow(flight), third.values - second.values, first.values - np.abs(second.values)), 0, ddof=1
+            ),
+            sensitivity(measurement.station, common.strips, flight.pairs),
+            flight.height_per_arcsec(),
+        )
+    except (PlaneError, AngleError, ResectionError) as error:
+        raise BenchError(str(error), ("strips",), "a longer strip, more points, or smaller errors") from error
+
+
+def resected(measurement: Measurement, flight: AnglePass) -> Resection:
+    """Space resection. Raises ResectionError."""
+    m = measurement
+    lines = {
+        name: ObservedLine.of(strip, m.tangent[name], look=m.look[name], offset=m.offset[name])
+        for name, strip in m.strips.items()
+    }
+    return resect(m.station, lines, reference=flight.reference)
+
+
+def centred(measurement: Measurement, section: Resection) -> Measurement:
+    """The measurement as it would be with all projection centres at the station."""
+    strips = dict(measurement.strips)
+    for name, offset in measurement.offset.items():
+        if np.any(offset):
+            strips[name] = Strip(strips[name].points - offset @ section.axes(name).T, strips[name].covariance)
+    return replace(
+        measurement, strips=strips, offset={name: np.zeros_like(v) for name, v in measurement.offset.items()}
+    )
+
+
+def tls_angles(common: Measurement, flight: AnglePass) -> PlaneAngles:
+    """Angles between the planes by total least squares; of a measurement that is `centred`."""
+    return angles_between([fit_plane(common.station, strip) for strip in common.strips.values()], _index(flight))
+
+
+def sighted(measurement: Measurement, section: Resection, flight: AnglePass) -> tuple[np.ndarray, AlongTrackAngles]:
+    """Angles between the lines of sight of the lines' centres, (m,), radians, and their part along the track."""
+    common, frames = centred(measurement, section), []
+    for name, strip in common.strips.items():
+        distance = np.linalg.norm(strip.points - common.station.position, axis=1)[:, None]
+        straight = Strip(strip.points + distance * measurement.bow[name] @ section.axes(name).T, strip.covariance)
+        frames.append(line_frame(fit_plane(common.station, straight), measurement.along[name], BEND))
+    index = _index(flight)
+    look = np.array([float(look_angle(frames[a].central, frames[b].central)) for a, b in index])
+    return look, along_track_angles(frames, index)
+
+
+def _index(flight: AnglePass) -> list[tuple[int, int]]:
+    return [(flight.lines.index(a), flight.lines.index(b)) for a, b in flight.pairs.values()]
+
+
+def estimated(measurement: Measurement, flight: AnglePass) -> Estimate:
+    """All methods. Raises PlaneError, AngleError, ResectionError."""
+    section = resected(measurement, flight)
+    common = centred(measurement, section)
+    planes: dict[Method, tuple[PlaneFit, ...]] = {}
+    with warnings.catch_warnings():
+        # the report says it, for each frame
+        warnings.simplefilter("ignore", NearVerticalWarning)
+        for method in METHODS:
+            planes[method] = tuple(fit_plane(common.station, strip, method) for strip in common.strips.values())
+    angles = {method: angles_between(fits, _index(flight)) for method, fits in planes.items()}
+    return Estimate(planes, angles, *sighted(measurement, section, flight), section)
+
+
+def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
+    """Every method in every frame; of a measurement that is `centred`."""
+    places = {
+        "Earth-fixed": (np.eye(3), np.zeros(3)),
+        "local level": (flight.local, flight.middle_point),
+        "orbital": (flight.orbital, flight.station),
+        f"{flight.reference} line": (flight.line_axes, flight.station),
+    }
+    count = len(flight.pairs)
+    rows = []
+    for frame, (axes, origin) in places.items():
+        moved = common.in_frame(axes, origin)
+        for method in METHODS:
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always", NearVerticalWarning)
+                try:
+                    fits = [fit_plane(moved.station, strip, method) for strip in moved.strips.values()]
+                    angles = angles_between(fits, _index(flight))
+                    values, sigma = angles.values, angles.sigma
+                    steepest = min(abs(float(fit.normal[2])) for fit in fits)
+                except PlaneError:
+                    values, sigma, steepest = np.full(count, np.nan), np.full(count, np.nan), 0.0
+            warned = any(issubclass(w.category, NearVerticalWarning) for w in said)
+            rows.append(FrameRow(frame, method, values, sigma, steepest, warned))
+    return tuple(rows)
+
+
+def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
+    """Each effect alone and all three, on the true points; and the datum's shift, if there is one."""
+    truth = values_of(flight.dihedral)
+    none = (0.0, 0.0, 0.0)
+
+    def off(effects: LightEffects, removed: LightEffects) -> np.ndarray:
+        return _off_truth(flight, flight.measure(flight.ground(effects), None, removed, none), truth)
+
+    wavelength = flight.spec.effects.wavelength
+    cases = {name: replace(NO_EFFECTS, wavelength=wavelength, **{name: True}) for name in EFFECTS}
+    cases["all"] = LightEffects(wavelength=wavelength)
+    rows = [EffectRow(name, off(effects, NO_EFFECTS), off(effects, effects)) for name, effects in cases.items()]
+    if any(flight.spec.errors.datum):
+        shifted = _off_truth(flight, flight.measure(flight.ground(NO_EFFECTS), None), truth)
+        rows.append(EffectRow("datum", shifted, np.full(len(truth), np.nan)))
+    return tuple(rows)
+
+
+def _off_truth(flight: AnglePass, measured: Measurement, truth: np.ndarray) -> np.ndarray:
+    return np.asarray(tls_angles(centred(measured, resected(measured, flight)), flight).values - truth)

@@ -1,0 +1,272 @@
+"""Figures of an in-orbit calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from analysis.orbit.three_line_model import BIAS, misclosure
+from analysis.units import ARCSEC
+from scenes.specs.orbit_angle import LINES
+from twin.orbit.calibration.calibration_run import CalibrationRun
+from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors
+from twin.orbit.calibration.campaign import true_bias
+from twin.orbit.calibration.influences import INNER
+from twin.orbit.calibration.schemes import RMS, values_of
+from twin.run.svg import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    look,
+    new_figure,
+    plain_axes,
+    to_svg,
+)
+
+
+def drift_drawn(run: CalibrationRun, found: Monitoring) -> str:
+    """The figure as SVG."""
+    with look("calibration-monitor-heights"):
+        return to_svg(_figure(run, found))
+
+
+def expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:
+    """Height RMS (n,) for drifts of these sizes without a monitor that many campaigns would have, metres.
+
+    All fields adjusted at once, each with one drift; the outer lines' d_alpha and the mean of it taken out.
+    """
+    spec = run.campaign.spec
+    square = sum(one.angles[0] ** 2 for name, one in spec.drift.items() if name != "nadir")
+    metres = found.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
+    return np.asarray(np.hypot(found.at(0.0).without.together.height, factor * metres))
+
+
+def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
+    figure = new_figure(4.3)
+    left, right = figure.subplots(1, 2)
+    angle = found.angle / ARCSEC or 1.0
+    size = np.array([s.factor for s in found.sizes])
+    fine = np.linspace(0.0, size[-1], 101)
+    left.plot(fine * angle, expected_height(run, found, fine), "--", color=GREY, lw=1.0, label="mean of many campaigns")
+    cases = {"without monitor": (VERMILION, "o"), "with monitor": (BLUE, "s")}
+    told = [s.told for s in found.sizes if s.told is not None]
+    for (label, (colour, marker)), rows in zip(cases.items(), ([s.without for s in found.sizes], told), strict=True):
+        if rows:
+            height = [row.together.height for row in rows]
+            left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
+    unit = "σ of d_α of an outer line, arcsec" if found.angle else "size of the drift against the file's"
+    left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points, m")
+    names = list(found.sizes[0].without.schemes)
+    here = found.at(1.0)
+    bars: list[tuple[str, str, list[PooledErrors]]] = [
+        ("no drift", GREY, list(found.at(0.0).without.schemes.values())),
+        ("without monitor", VERMILION, list(here.without.schemes.values())),
+    ]
+    if here.told is not None:
+        bars.append(("with monitor", BLUE, list(here.told.schemes.values())))
+    place, width = np.arange(len(names)), 0.8 / len(bars)
+    for k, (label, colour, values) in enumerate(bars):
+        at = place + (k - 0.5 * (len(bars) - 1)) * width
+        right.bar(at, [v.height for v in values], 0.92 * width, color=colour, label=label)
+    title = "Without ground control, the file's drift"
+    right.set(title=title, xticks=place, xlabel="scheme", ylabel="height RMS at check points, m")
+    right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
+    for axes in (left, right):
+        axes.set_ylim(0.0, None)
+        axes.grid(color=LIGHT, lw=0.5)
+        axes.set_axisbelow(True)
+        plain_axes(axes)
+        axes.tick_params(colors=INK)
+    handles, labels = left.get_legend_handles_labels()
+    more, other = right.get_legend_handles_labels()
+    figure.legend([*handles, more[0]], [*labels, other[0]], loc="outside lower center", ncols=4)
+    return figure
+
+
+COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GREY)
+MARKERS = "osD^vP"
+
+
+def drawn(name: str, run: CalibrationRun) -> str:
+    """One figure of `FIGURES` as SVG."""
+    with look(f"calibration-{name}"):
+        return to_svg(FIGURES[name](run))
+
+
+def schemes_figure(run: CalibrationRun) -> Figure:
+    """RMS of every field over the schemes, plan and height."""
+    figure = new_figure(4.3)
+    panels = figure.subplots(1, 2)
+    names, limits = list(run.schemes), run.campaign.spec.limits
+    place = np.arange(len(names))
+    labels = [f"{k}\n{_count(len(s))}" for k, s in zip(names, run.campaign.spec.schemes, strict=False)]
+    labels.append(f"{names[-1]}\neach its own")
+    for axes, what, title, limit in zip(panels, RMS, ("plan", "height"), (limits.plan, limits.height), strict=True):
+        table = np.array([values_of(errors, what) for errors in run.schemes.values()])
+        for k, field in enumerate(run.before):
+            style = MARKERS[k // len(COLOURS) % len(MARKERS)]
+            colour = COLOURS[k % len(COLOURS)]
+            axes.plot(place, table[:, k], f"{style}-", color=colour, lw=0.9, ms=4, label=field)
+        axes.plot(place, table.mean(axis=1), "-", color=INK, lw=2.2, label="mean of the fields")
+        before = values_of(run.before, what)
+        low, high = before.min(), before.max()
+        axes.set_ylim(0.0, 1.35 * table.max())
+        said = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
+        axes.set(title=f"RMS in {title}, m", xticks=place, xlabel="scheme")
+        axes.text(0.5, 0.97, said, transform=axes.transAxes, ha="center", va="top", color=GREY, fontsize=8.5)
+        if limit < 1.35 * table.max():
+            axes.axhline(limit, color=GREY, lw=0.9, ls="--")
+        axes.set_xticklabels(labels)
+        _finish(axes)
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4)
+    return figure
+
+
+def latitude_figure(run: CalibrationRun) -> Figure:
+    """Bias of every field with sigma, truth, and the fit."""
+    figure = new_figure(3.9)
+    spec, passes = run.campaign.spec, run.campaign.passes
+    latitude = np.array([p.latitude for p in passes])
+    reach = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
+    truth = true_bias(spec, reach)
+    for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
+        value = np.array([run.together.value(f"{p.name} {axis}") for p in passes]) / ARCSEC
+        sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / ARCSEC
+        true = np.array([p.bias[k] for p in passes]) / ARCSEC
+        axes.plot(np.degrees(reach), truth[:, k] / ARCSEC, color=GREY, lw=1.0, ls="--", label="truth, no season")
+        for fit in run.latitude[k : k + 1]:
+            axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=VERMILION, lw=1.3, label="fit")
+        axes.plot(np.degrees(latitude), true, "x", color=INK, ms=6, label="truth of the field", zorder=4)
+        axes.errorbar(
+            np.degrees(latitude), value, sigma, fmt="o", color=BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
+        )
+        axes.set(title=f"{axis}, arcsec", xlabel="latitude, deg")
+        _finish(axes)
+        handles = axes.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def correlation_figure(run: CalibrationRun) -> Figure:
+    """Matrix of the simultaneous adjustment."""
+    found = run.together
+    sigma = found.sigma
+    free = [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
+    names = [found.names[k] for k in free]
+    figure = new_figure(min(9.2, 2.6 + 0.14 * len(names)))
+    axes = figure.subplots()
+    shown = axes.imshow(found.correlation[np.ix_(free, free)], vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    size = 6.5 if len(names) > 40 else 8.0
+    axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
+    axes.set_yticks(np.arange(len(names)), names, fontsize=size)
+    # lines between the interior and the fields
+    groups = ["interior" if name in INNER else name.split()[0] for name in names]
+    for k in range(1, len(groups)):
+        if groups[k] != groups[k - 1]:
+            axes.axhline(k - 0.5, color=INK, lw=0.6)
+            axes.axvline(k - 0.5, color=INK, lw=0.6)
+    figure.colorbar(shown, ax=axes, shrink=0.6, label="correlation")
+    return figure
+
+
+def residual_figure(run: CalibrationRun) -> Figure:
+    """Residuals of one field's control points in the images of the three lines, in pixels."""
+    one = run.campaign.passes[0]
+    found = run.together
+    offset = [found.value(n) if n in found.names else 0.0 for n in _offsets(one.name)]
+    figure = new_figure(3.9)
+    panels = figure.subplots(1, 3, sharex=True)
+    for axes, line in zip(panels, LINES, strict=True):
+        rays, pitch = one.control.rays[line], one.data.pitch[line]
+        left = misclosure(
+            found.cameras[line],
+            rays,
+            found.ground[one.name][rays.point],
+            found.bias(one.name),
+            one.control.axes @ np.array(offset),
+        )
+        left = left / pitch
+        images = one.control_images[line]
+        arrows = axes.quiver(
+            images.pixel, images.line / 1e3, left[:, 1], left[:, 0], color=BLUE, width=0.004, scale=14.0, zorder=3
+        )
+        axes.plot(images.pixel, images.line / 1e3, ".", color=GREY, ms=2)
+        axes.quiverkey(arrows, 0.86, 1.04, 1.0, "1 px", labelpos="E", coordinates="axes")
+        rms = np.sqrt(np.mean(left**2, axis=0))
+        axes.set_title(f"{line}: x {rms[0]:.2f} px, y {rms[1]:.2f} px", loc="left")
+        axes.set(xlabel="pixel")
+        axes.margins(0.12)
+        _finish(axes)
+    panels[0].set_ylabel("image line, thousands")
+    return figure
+
+
+def check_figure(run: CalibrationRun) -> Figure:
+    """Errors at one field's check points before calibration and with its own parameters; arrows plan, colour height."""
+    one = run.campaign.passes[0]
+    _, lat, _ = (float(v) for v in one.data.earth.geodetic(one.check_ground.mean(axis=0)))
+    lon, latitude, _ = one.data.earth.geodetic(one.check_ground)
+    east = (lon - lon.mean()) * 6.378e3 * np.cos(lat)
+    north = (latitude - latitude.mean()) * 6.357e3
+    figure = new_figure(5.2)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    cases = (
+        ("laboratory's camera", run.before[one.name]),
+        ("its own parameters", list(run.schemes.values())[-1][one.name]),
+    )
+    for axes, (title, errors) in zip(panels, cases, strict=True):
+        size = float(f"{np.sqrt(np.nanmean(np.sum(errors.error[:, :2] ** 2, axis=1))):.1g}")
+        tall = errors.error[:, 2]
+        middle = float(np.median(tall))
+        reach = float(np.abs(tall - middle).max())
+        arrows = axes.quiver(
+            east,
+            north,
+            errors.error[:, 0],
+            errors.error[:, 1],
+            tall,
+            cmap="viridis",
+            clim=(middle - reach, middle + reach),
+            width=0.004,
+            scale=16.0 * size,
+        )
+        axes.quiverkey(arrows, 0.8, 0.04, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
+        axes.set_title(f"{title}: plan {errors.plan_rms:.2f} m, height {errors.height_rms:.2f} m")
+        axes.set(xlabel="east, km")
+        axes.set_aspect("equal")
+        axes.margins(0.14)
+        figure.colorbar(arrows, ax=axes, shrink=0.75, label="height error, m", location="bottom")
+        _finish(axes)
+    panels[0].set_ylabel("north, km")
+    return figure
+
+
+FIGURES = {
+    "schemes-of-fields": schemes_figure,
+    "bias-latitude": latitude_figure,
+    "correlation-matrix": correlation_figure,
+    "residuals": residual_figure,
+    "check-points": check_figure,
+}
+
+
+def _offsets(name: str) -> list[str]:
+    return [f"{name} offset {axis}" for axis in ("along", "across", "down")]
+
+
+def _count(fields: int) -> str:
+    return "1 field" if fields == 1 else f"{fields} fields"
+
+
+def _finish(axes: Axes) -> None:
+    axes.grid(color=LIGHT, lw=0.5)
+    axes.set_axisbelow(True)
+    plain_axes(axes)

@@ -1,0 +1,135 @@
+"""What an in-orbit calibration gives: calibration.json, the main table, the report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.calibration_json import meets, to_dict, unit
+from twin.orbit.calibration.calibration_run import CalibrationRun, run_calibration_passes
+from twin.orbit.calibration.calibration_sections import bought, gained, said, scheme_names, sections
+from twin.orbit.calibration.influences import SURPRISE
+from twin.orbit.calibration.observations import any_effect, light_effects
+from twin.orbit.calibration.schemes import values_of
+from twin.run.artefact import Cell, Table
+from twin.run.result import Advance, LabResult
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_setup import CalibrationSetup
+
+
+def run_calibration(setup: CalibrationSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
+    """Simulate the passes and put the result together; nothing is traced, so that the backend is not used."""
+    return calibration_result(run_calibration_passes(setup, seed, advance), setup, seed)
+
+
+def calibration_result(run: CalibrationRun, setup: CalibrationSetup, seed: int) -> LabResult:
+    """Numbers, table and report of a calibration."""
+    plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
+    limits = setup.test.limits
+    good = [k for k, errors in run.schemes.items() if meets(errors, limits.plan, limits.height)]
+    verdict = f"schemes {', '.join(good)}" if good else "no scheme"
+    lead = (
+        f"Before calibration {plan:.0f} m in plan and {height:.0f} m in height, mean of the fields' RMS. "
+        + said(run.finding),
+        f"{limits.plan:g} m in plan and {limits.height:g} m in height, assumed for 1:50 000, are met in every field by "
+        f"{verdict}.",
+        *(() if run.monitoring is None else (bought(run.monitoring),)),
+        *(() if run.strips is None else (gained(run.schemes, run.strips),)),
+    )
+    return LabResult(
+        "calibration",
+        "Calibration in orbit over test fields",
+        lead,
+        _facts(setup),
+        to_dict(run, seed),
+        _summary(run),
+        sections(run),
+        warnings=_warnings(run),
+    )
+
+
+def _summary(run: CalibrationRun) -> Table:
+    limits = run.campaign.spec.limits
+    rows: list[tuple[Cell, ...]] = []
+    for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
+        plan, height = (values_of(errors, what) for what in ("plan_rms", "height_rms"))
+        numbers = (plan.mean(), plan.std(), plan.max(), height.mean(), height.std(), height.max())
+        said_so = "yes" if meets(errors, limits.plan, limits.height) else "no"
+        rows.append((name, *(float(v) for v in numbers), said_so))
+    return Table(
+        "schemes",
+        "Schemes of parameters, tested on all fields without ground control",
+        "RMS at check points, metres: mean, standard deviation and largest of the fields.",
+        ("parameters", "plan, m", "spread", "largest", "height, m", "spread", "largest", "1:50 000"),
+        rows,
+        (None, 2, 2, 2, 2, 2, 2, None),
+    )
+
+
+def _facts(setup: CalibrationSetup) -> tuple[tuple[str, str], ...]:
+    test, camera, errors = setup.test, setup.camera, setup.test.errors
+    changes = "; ".join(
+        f"{name} f {format_quantity(c.focal_length, LENGTH)}, "
+        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
+        for name, c in test.changes.items()
+    )
+    bias = ", ".join(format_quantity(v, ANGLE) for v in errors.star_tracker.bias)
+    noise = f"image {errors.image:g} px, control {format_quantity(errors.control, LENGTH)}"
+    return (
+        ("Camera", f"{camera.name}, {camera.description}"),
+        ("Changed since the laboratory", changes or "nothing"),
+        ("Bias of the star trackers", f"[{bias}]"),
+        ("Passes", f"descending, {test.altitude / 1e3:g} km, one over each of {len(test.fields)} fields"),
+        ("Points", _points(setup)),
+        ("Errors, σ of a coordinate", noise if errors.switched_on else "none but biases"),
+        ("Image points", "drawn, not matched in images" if test.images is None else "matched in rendered images"),
+        ("Effects on the light", _light(setup)),
+        ("Description", test.description),
+    )
+
+
+def _points(setup: CalibrationSetup) -> str:
+    points, images = setup.test.points, setup.test.images
+    if images is None:
+        assert points is not None
+        return f"{points.control} control and {points.check} check points in each field"
+    some = images.points
+    return (
+        f"{some.control} control, {some.check} check and {some.tie} tie points sought in each of "
+        f"{len(images.patches)} patches of {images.lines} x {images.pixels} pixels in each field"
+    )
+
+
+def _light(setup: CalibrationSetup) -> str:
+    effects = setup.test.effects
+    if not any_effect(light_effects(effects)):
+        return "none"
+    on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
+    return f"{', '.join(on)}; {'taken out of' if effects.corrected else 'left in'} the image points"
+
+
+def _warnings(run: CalibrationRun) -> tuple[str, ...]:
+    found, spec, said = run.together, run.campaign.spec, []
+    if spec.errors.switched_on and found.p_value < 1e-3:
+        said.append(
+            f"the adjustment does not fit: a chi-square as large has a chance of {found.p_value:.1g}; biases may "
+            f"drift during a pass{', and the cameras drift from field to field' * bool(spec.drift)}"
+        )
+    if run.surprises:
+        first = run.surprises[0]
+        scale, shown = (ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "um")
+        if "offset" in first.name:
+            scale, shown = 1.0, "m"
+        others = len(run.surprises) - 1
+        more = f", and {others} other{'s' * (others > 1)} beyond {SURPRISE:g}" if others else ""
+        said.append(
+            f"{first.name} has changed by {first.change / scale:.3g} {shown}, {first.ratio:.1f} times what is "
+            f"expected (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
+            "the times, for the fit need not show such an error"
+        )
+    if any_effect(run.campaign.effects) and not spec.effects.corrected:
+        said.append("light time, aberration and refraction are left in the image points and go into the parameters")
+    return tuple(said)

@@ -1,0 +1,201 @@
+"""Calibration over fields by simultaneous adjustment, and each field by itself as in paper 003; all that is computed
+from the measurements of a campaign. Truth enters only where an estimate is compared with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.orbit.adjustment import Adjustment
+from analysis.orbit.calibration_parameters import RATE
+from analysis.orbit.forward_intersection import CheckErrors
+from analysis.orbit.null_space import RankError
+from analysis.orbit.stepwise import Stepwise, stepwise
+from analysis.orbit.third_difference import ThirdDifference, third_difference
+from analysis.orbit.three_line_model import BIAS, INTERIOR
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import one_blas_thread
+from twin.orbit.calibration.camera_drift import Monitoring, monitored
+from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.influences import (
+    OFFSET,
+    DatumRow,
+    LightRow,
+    Surprise,
+    datum_rows,
+    light_rows,
+    simultaneous,
+    surprises,
+)
+from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
+from twin.orbit.calibration.schemes import (
+    GAUGE,
+    Finding,
+    Repeats,
+    calibrated_alone,
+    repeated,
+    schemes_tested,
+    tested_before,
+)
+from twin.orbit.calibration.screening import screened
+from twin.orbit.calibration.strip import Strips, strips_adjusted
+from twin.run.result import Advance, BenchError
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_setup import CalibrationSetup
+
+STEPWISE_TOLERANCE = 1e-3
+"""Of the sigmas; the last step of a round of the stepwise solution."""
+
+
+@dataclass(frozen=True, eq=False)
+class FieldResult:
+    """A field calibrated by itself, with paper 003's twelve unknowns.
+
+    Attributes:
+        adjustment: simultaneous.
+        orbit: third differences of the measured positions, ITRS.
+        attitude: third differences of the measured attitude against the orbital frame, roll, pitch, yaw.
+    """
+
+    adjustment: Adjustment
+    orbit: ThirdDifference
+    attitude: ThirdDifference
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """All that was computed.
+
+    Attributes:
+        campaign: truth and measurements.
+        together: simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it,
+            the drift of the biases during the passes.
+        truth: (P,) true values of its unknowns.
+        fields: name -> that field by itself.
+        paper_way: the first scheme's first field by the paper's stepwise solution.
+        before: field -> errors with the laboratory's camera.
+        schemes: scheme, "1" on -> field -> errors; the last lets each field use its own parameters.
+        finding: of the paper, judged; None for a single scheme of averaged parameters.
+        latitude: the biases against latitude, roll, pitch, yaw; empty for too few fields.
+        light: what effects on the light do where they are left in.
+        datum: what a wrong datum does.
+        surprises: estimates beyond what is expected of them.
+        repeats: campaigns repeated with everything drawn anew; None for none.
+        monitoring: what a monitor of drifting cameras buys; None for cameras that keep.
+        strips: passes adjusted on tie points; None for none.
+    """
+
+    campaign: Campaign
+    together: Adjustment
+    truth: np.ndarray
+    fields: Mapping[str, FieldResult]
+    paper_way: Stepwise
+    before: Mapping[str, CheckErrors]
+    schemes: Mapping[str, Mapping[str, CheckErrors]]
+    finding: Finding | None
+    latitude: tuple[LatitudeFit, ...]
+    light: tuple[LightRow, ...]
+    datum: tuple[DatumRow, ...]
+    surprises: tuple[Surprise, ...]
+    repeats: Repeats | None
+    monitoring: Monitoring | None
+    strips: Strips | None
+
+
+@one_blas_thread()  # of small matrices: threads would only wait for each other
+def run_calibration_passes(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun:
+    """Fly, calibrate, test.
+
+    Raises:
+        BenchError: the orbit, the points or the adjustment do not allow it.
+    """
+    try:
+        return _run(setup, np.random.SeedSequence(seed), advance)
+    except RankError as error:
+        remedy = "a field with width and length, and more points"
+        raise BenchError(str(error), ("points",), remedy) from error
+    except ValueError as error:  # a CalibrationError, or too few readings for third differences
+        raise BenchError(str(error), ("errors",), "errors that an adjustment can take, and more points") from error
+
+
+def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> CalibrationRun:
+    parts = 6 + len(setup.test.fields)
+    advance("calibration", 0, parts)
+    shown, others = seed.spawn(2)
+    campaign = fly_fields(setup, shown, advance)
+    if campaign.images is not None:
+        campaign = screened(campaign)
+    advance("calibration", 1, parts)
+    latitude = latitude_fits(campaign, simultaneous(campaign))
+    rates = rate_priors(campaign, latitude)
+    together = simultaneous(campaign, rates, rate=bool(rates))
+    advance("calibration", 2, parts)
+    fields = {}
+    for k, one in enumerate(campaign.passes):
+        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *_third_differences(campaign, one))
+        advance("calibration", 3 + k, parts)
+    first = campaign.spec.schemes[0][0]
+    control = next(p.control for p in campaign.passes if p.name == first)
+    paper_way = stepwise([control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=STEPWISE_TOLERANCE)
+    alone = {name: result.adjustment for name, result in fields.items()}
+    schemes = schemes_tested(campaign, alone)
+    advance("calibration", parts - 3, parts)
+    light = light_rows(campaign, together.sigma)
+    advance("calibration", parts - 1, parts)
+    datum = datum_rows(campaign)
+    advance("calibration", parts, parts)
+    return CalibrationRun(
+        campaign,
+        together,
+        true_values(campaign, together.names),
+        FrozenMap(fields),
+        paper_way,
+        tested_before(campaign),
+        schemes,
+        Finding.of(schemes),
+        latitude,
+        light,
+        datum,
+        surprises(campaign, together),
+        repeated(setup, others, advance),
+        monitored(setup, shown, advance),
+        strips_adjusted(campaign, advance),
+    )
+
+
+def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
+    """True values of unknowns (P,) by name, metres and radians; of biases and offsets, those at the field's middle, of
+    rates the mean of the fields.
+    """
+    known = {
+        f"{line} {name}": value
+        for line, camera in campaign.truth.items()
+        for name, value in zip(INTERIOR, camera.interior, strict=True)
+    }
+    for one in campaign.passes:
+        known |= {f"{one.name} {name}": v for name, v in zip(BIAS, one.bias, strict=True)}
+        known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.offset, strict=True)}
+    rates = [(one.bias_at(1.0) - one.bias_at(-1.0)) / 2.0 for one in campaign.passes]
+    known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
+    return np.array([known[name] for name in names])
+
+
+def _third_differences(campaign: Campaign, one: FieldPass) -> tuple[ThirdDifference, ThirdDifference]:
+    errors, measured = campaign.spec.errors, one.measured
+    fixes = _readings(measured.first, measured.last, errors.gps.interval)
+    looks = _readings(measured.first, measured.last, errors.star_tracker.interval)
+    turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
+    # small angles: the skew part of the rotation
+    skew = 0.5 * (turned - np.swapaxes(turned, 1, 2))
+    angles = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
+    return third_difference(fixes, measured.position(fixes)), third_difference(looks, angles)
+
+
+def _readings(first: float, last: float, interval: float) -> np.ndarray:
+    """Times of the readings inside the span, seconds; five at least, or the analysis says so."""
+    return interval * np.arange(np.ceil(first / interval), np.floor(last / interval) + 1.0)

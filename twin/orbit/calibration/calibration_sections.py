@@ -1,0 +1,471 @@
+"""What a report says of an in-orbit calibration, of strips, and of a camera that drifts under a monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from analysis.orbit.calibration_parameters import RATE
+from analysis.orbit.forward_intersection import CheckErrors
+from analysis.units import ARCSEC
+from scenes.specs.orbit_angle import LINES
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.calibration_figures import drawn, drift_drawn
+from twin.orbit.calibration.calibration_json import meets, unit
+from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
+from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
+from twin.orbit.calibration.field_sections import (
+    biases_section,
+    datum_section,
+    fields_section,
+    images_section,
+    light_section,
+)
+from twin.orbit.calibration.influences import INNER, OFFSET
+from twin.orbit.calibration.schemes import RMS, STATEMENTS, Finding, Repeats, values_of
+from twin.orbit.calibration.strip import Strips
+from twin.run.artefact import Artefact, Cell, SvgFigure, Table
+from twin.run.result import Section
+
+
+def bought(found: Monitoring) -> str:
+    """What the monitor buys, in one sentence, from the scheme with most averaged parameters."""
+    none, here = found.at(0.0), found.at(1.0)
+    scheme = list(none.without.schemes)[-2]
+    still, blind = none.without.schemes[scheme].height, here.without.schemes[scheme].height
+    text = (
+        f"With cameras that drift by {found.angle / ARCSEC:.2g}″ (d_alpha, 1σ) from field to field, heights without "
+        f"ground control (scheme {scheme}) are wrong by {blind:.2f} m RMS, {still:.2f} m without drift"
+    )
+    if here.told is None:
+        return f"{text}."
+    return f"{text}; with the on-board monitor's readings, {here.told.schemes[scheme].height:.2f} m."
+
+
+def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
+    """Errors by size of the drift and by scheme."""
+    spec = run.campaign.spec
+    drifts = "; ".join(
+        f"{name} {_angles(one.angles)}, d_f {format_quantity(one.focal_length, LENGTH)}"
+        for name, one in spec.drift.items()
+    )
+    text = [
+        f"Each line camera differs in every field from its reference state, 1σ of d_alpha, d_beta, d_gamma: {drifts}. "
+        f"1″ of d_alpha of the forward line is {abs(found.metres):.2f} m of height; d_beta moves points across the "
+        "track, and d_gamma and d_f act at the ends of the lines.",
+        "Each row has the same points and the same noise. Adjusted as if nothing drifted, one interior orientation has "
+        "to do for all fields: heights get worse with the drift. The fit sees it only when it is larger than the "
+        "noise. Schemes without ground control use the mean of the parameters of their fields. Only a field that is "
+        "calibrated in the same pass (the last scheme) does not feel the drift, for its own points tell it.",
+    ]
+    if spec.monitor is not None:
+        text.append(
+            f"The monitor reads each camera in each pass with {_angles(spec.monitor.angles)} and d_f "
+            f"{format_quantity(spec.monitor.focal_length, LENGTH)}, 1σ. Where a field is calibrated, its readings are "
+            "observations of the drift, so that the interior orientation is that of the reference state; where a field "
+            "is tested, the reference cameras are drifted by its own readings. What a reading has in common in all "
+            "passes, the interior orientation takes up. Biases of the attitude, which act in plan, a monitor of the "
+            "cameras does not read."
+        )
+    artefacts: list[Artefact] = [
+        SvgFigure(
+            "monitor-heights",
+            "Height errors and the drift of the cameras",
+            "Left: one campaign, its drift drawn once and scaled; the dashed line is what many campaigns would have "
+            "on average. Right: RMS over all fields.",
+            drift_drawn(run, found),
+        ),
+        _by_size(found),
+        _by_scheme(found),
+    ]
+    return Section("Cameras that drift, and the on-board monitor", tuple(text), tuple(artefacts))
+
+
+def _by_size(found: Monitoring) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for size in found.sizes:
+        rows.append((size.factor, size.factor * found.angle / ARCSEC, *_cells(size.without), *_cells(size.told)))
+    return Table(
+        "monitor-sizes",
+        "All fields adjusted at once",
+        "RMS at check points of all fields, metres, each field with its own bias; chance of the fit, with the noise of "
+        "the readings of attitude and orbit counted as independent (which makes it too near to 1).",
+        ("drift × file's", "σ d_alpha, arcsec", "plan", "height", "chance", "plan, told", "height, told", "chance"),
+        rows,
+        (1, 2, 2, 2, 3, 2, 2, 3),
+    )
+
+
+def _by_scheme(found: Monitoring) -> Table:
+    none, here = found.at(0.0).without, found.at(1.0)
+    rows: list[tuple[Cell, ...]] = []
+    for scheme, still in none.schemes.items():
+        blind = here.without.schemes[scheme]
+        told = None if here.told is None else here.told.schemes[scheme]
+        rows.append(
+            (
+                scheme,
+                still.plan,
+                blind.plan,
+                None if told is None else told.plan,
+                still.height,
+                blind.height,
+                None if told is None else told.height,
+            )
+        )
+    return Table(
+        "monitor-schemes",
+        "Schemes without ground control, with the file's drift",
+        "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
+        (
+            "scheme",
+            "plan, no drift",
+            "plan, no monitor",
+            "plan, monitor",
+            "height, no drift",
+            "height, no monitor",
+            "height, monitor",
+        ),
+        rows,
+        (None, 2, 2, 2, 2, 2, 2),
+    )
+
+
+def _cells(one: Treatment | None) -> tuple[Cell, ...]:
+    return (None, None, None) if one is None else (one.together.plan, one.together.height, one.p_value)
+
+
+def _angles(values: tuple[float, float, float]) -> str:
+    return ", ".join(format_quantity(v, ANGLE) for v in values)
+
+
+def gained(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -> str:
+    """What the adjustment gains, in one sentence, from the scheme with most averaged parameters."""
+    scheme = list(found.schemes)[-2]
+    old, new = (PooledErrors.of(e[scheme].values()) for e in (before, found.schemes))
+    return (
+        f"Calibrating with {min(found.ties.values())} tie points of each pass or more, and adjusting each pass on "
+        f"them, takes the height RMS of scheme {scheme} from {old.height:.2f} m to {new.height:.2f} m and the plan RMS "
+        f"from {old.plan:.2f} m to {new.plan:.2f} m."
+    )
+
+
+def strips_section(run: CalibrationRun, found: Strips) -> Section:
+    """Errors before and after, and what tie points cannot tell."""
+    rows: list[tuple[Cell, ...]] = []
+    for scheme, fields in found.schemes.items():
+        old, new = (PooledErrors.of(e.values()) for e in (run.schemes[scheme], fields))
+        rows.append((scheme, old.plan, new.plan, old.height, new.height))
+    table = Table(
+        "strips",
+        "Check points with and without tie points",
+        "RMS at check points of all fields without ground control, metres: calibrated on control points and "
+        "intersected as measured; calibrated on control and tie points and intersected with the adjusted attitude and "
+        "orbit. The last scheme lets each field use its own parameters.",
+        ("scheme", "plan", "plan, with ties", "height", "height, with ties"),
+        rows,
+        (None, 2, 2, 2, 2),
+    )
+    turns: list[tuple[Cell, ...]] = [
+        (d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in found.datum
+    ]
+    common = Table(
+        "strip-datum",
+        f"What the tie points tell of turns of a whole pass, {run.campaign.passes[0].name}",
+        "Sigma from the readings' noise alone and with the ties, arcseconds, of rates arcseconds per second. A ratio "
+        "near 1 means that ties say nothing of it.",
+        ("turn", "before", "after", "ratio"),
+        turns,
+        (None, 4, 4, 3),
+    )
+    tracker = run.campaign.spec.errors.star_tracker
+    slow = max(tracker.slow.noise) / ARCSEC
+    noise = f"{max(tracker.noise) / ARCSEC:g}″ from reading to reading"
+    if slow:
+        noise += f" and {slow:g}″ that change within {tracker.slow.interval:g} s"
+    counts = ", ".join(f"{k} {n}" for k, n in found.ties.items())
+    text = (
+        f"Every pass is adjusted on points that three lines see ({counts}) without coordinates on the ground; the "
+        "errors of its attitude and orbit are unknowns with their own sigmas as priors. Check points, which are no "
+        "ties, are then intersected with the adjusted attitude and orbit. "
+        f"The attitude's noise here is {noise}.",
+        "Rays of one place that do not meet show errors of the attitude. What lasts for many readings and changes "
+        "within the pass is seen by many ties and is taken out; noise that is independent from one reading to the next "
+        "lies mostly in the mean of the three exposures, which no tie sees. A turn that the whole pass has in common "
+        "stays, and so does the bias of the scheme: plan hardly gains where biases make it. In pitch even more stays: "
+        "whatever repeats itself from one line's view of a place to the next, for as long as two such views last. It "
+        "shifts heights, and only a strip that is long against this, with errors slower than it is long, gains much.",
+        "Slow errors during the seconds in which a line sees the control points look like a change of its interior "
+        "orientation or of the bias, and a calibration on control points alone takes part of them for one. Adjusting "
+        "the attitude afterwards would count this part twice, and errors would grow. With the tie points of the whole "
+        "strip in the calibration, interior and attitude are told apart, and the adjusted attitude belongs to them. A "
+        "single campaign of few fields scatters: each slow error that a pass keeps is shared by all of its points, so "
+        "that one scheme may lose by chance where it gains on average.",
+    )
+    return Section("Adjustment of the strips", text, (table, common))
+
+
+def sections(run: CalibrationRun) -> tuple[Section, ...]:
+    """All but the lead, the facts and the main table."""
+    found = [_schemes(run)]
+    if run.repeats is not None:
+        found.append(_repeats(run, run.repeats))
+    if run.campaign.images is not None:
+        found.append(images_section(run.campaign))
+    if run.monitoring is not None:
+        found.append(monitoring_section(run, run.monitoring))
+    if run.strips is not None:
+        found.append(strips_section(run, run.strips))
+    found += [_parameters(run), fields_section(run), biases_section(run), light_section(run), datum_section(run)]
+    return (*found, _rank(run), _data(run))
+
+
+def scheme_names(run: CalibrationRun) -> list[str]:
+    """Schemes in words, with their numbers."""
+    names = [f"{k + 1}: {', '.join(s)}" for k, s in enumerate(run.campaign.spec.schemes)]
+    return [*names, f"{len(names) + 1}: each field its own"]
+
+
+def _schemes(run: CalibrationRun) -> Section:
+    spec = run.campaign.spec
+    limits = spec.limits
+    tables = []
+    for name, number, what in zip(("plan", "height"), (6, 7), RMS, strict=True):
+        columns = [values_of(run.before, what), *(values_of(e, what) for e in run.schemes.values())]
+        rows: list[tuple[Cell, ...]] = [(field, *(float(c[k]) for c in columns)) for k, field in enumerate(run.before)]
+        rows.append(("mean", *(float(c.mean()) for c in columns)))
+        rows.append(("spread", *(float(c.std()) for c in columns)))
+        tables.append(
+            Table(
+                name,
+                f"RMS in {name} at check points without ground control, metres",
+                f"Fields and schemes as in Table {number} of the paper, whose numbers are not in the text that is "
+                "available.",
+                ("field", "laboratory", *(f"scheme {k}" for k in run.schemes)),
+                rows,
+                (None, *(2,) * len(columns)),
+            )
+        )
+    text = (
+        "Every field is calibrated by itself (three attitude biases and nine elements of the interior orientation), "
+        f"and each scheme uses the mean of the parameters of its fields: {'; '.join(scheme_names(run))}. Check points "
+        "are intersected from all three lines with these parameters and the measured orbit and attitude, without "
+        "ground control.",
+        said(run.finding),
+        "What averaging changes are the biases of attitude, which differ from field to field and move all three lines "
+        "alike: they act in plan. Heights depend on the difference between the outer lines, which the interior "
+        "orientation holds and which hardly differs between fields; noise of the image and of the attitude makes the "
+        "rest.",
+        f"Maps at 1:50 000: {limits.plan:g} m in plan and {limits.height:g} m in height, assumed in the file, for the "
+        f"paper prints none. Every field meets them by {_good(run)}; the laboratory's camera "
+        f"{'meets them, too' if meets(run.before, limits.plan, limits.height) else 'does not meet them'}.",
+    )
+    figures = (
+        SvgFigure("schemes-of-fields", "Schemes", "Each line is a field.", drawn("schemes-of-fields", run)),
+        SvgFigure(
+            "check-points",
+            f"Errors at check points of {run.campaign.passes[0].name}",
+            "Arrows in plan, colour in height: before calibration and with the field's own parameters. The scales "
+            "differ.",
+            drawn("check-points", run),
+        ),
+    )
+    return Section("Schemes of averaged parameters", text, (figures[0], *tables, figures[1]))
+
+
+def _good(run: CalibrationRun) -> str:
+    limits = run.campaign.spec.limits
+    good = [k for k, errors in run.schemes.items() if meets(errors, limits.plan, limits.height)]
+    return f"scheme{'s' * (len(good) > 1)} {', '.join(good)}" if good else "no scheme"
+
+
+def said(finding: Finding | None) -> str:
+    """Whether the paper's finding holds, with the numbers."""
+    if finding is None:
+        return "With one scheme of averaged parameters there is nothing to compare."
+    plan, spread, height = finding.plan, finding.plan_spread, finding.height
+    first = (
+        f"The mean RMS in plan goes from {plan[0]:.2f} m with the first scheme to {plan[-1]:.2f} m with the last of "
+        f"averaged parameters, its spread over the fields from {spread[0]:.2f} m to {spread[-1]:.2f} m; in height it "
+        f"goes from {height[0]:.2f} m to {height[-1]:.2f} m and changes by "
+        f"{100.0 * finding.height_change:.1f}% at most."
+    )
+    if finding.holds:
+        return (
+            f"{first} The paper's finding holds: plan improves and evens out with more fields, height hardly changes."
+        )
+    parts = (
+        ("plan does not improve", finding.plan_improves),
+        ("plan does not even out", finding.plan_evens_out),
+        ("height changes by a fifth or more", finding.height_stays),
+    )
+    failed = ", ".join(text for text, good in parts if not good)
+    return f"{first} The paper's finding does not hold with these errors: {failed}."
+
+
+def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
+    count, limits = len(repeats.plan), run.campaign.spec.limits
+    met = repeats.met(limits.plan, limits.height)
+    rows: list[tuple[Cell, ...]] = []
+    for k, name in enumerate(scheme_names(run)):
+        cells: list[Cell] = [name]
+        for values in (repeats.plan[:, k], repeats.height[:, k]):
+            mean = values.mean(axis=1)
+            cells += [float(mean.mean()), float(mean.std(ddof=1)) if count > 1 else None]
+            cells += [float(values.std(axis=1).mean())]
+        rows.append((*cells, f"{100.0 * met[k]:.0f}%"))
+    table = Table(
+        "campaigns",
+        f"{count} campaigns over the same fields",
+        "RMS at check points, metres: mean of the fields, averaged over the campaigns, with its standard deviation "
+        "from campaign to campaign; spread over the fields; in how many campaigns every field meets 1:50 000.",
+        (
+            "parameters",
+            "plan, m",
+            "± campaign",
+            "spread of fields",
+            "height, m",
+            "± campaign",
+            "spread of fields",
+            "1:50 000",
+        ),
+        rows,
+        (None, 2, 2, 2, 2, 2, 2, None),
+    )
+    judged: list[tuple[Cell, ...]] = []
+    for key, sentence in (*STATEMENTS.items(), ("holds", "all three")) if repeats.findings else ():
+        share = repeats.share(key)
+        # Wilson's interval of one sigma, which is not empty at 0 and 1
+        middle = (share + 0.5 / count) / (1.0 + 1.0 / count)
+        half = np.sqrt(share * (1.0 - share) / count + 0.25 / count**2) / (1.0 + 1.0 / count)
+        here = "yes" if getattr(run.finding, key) else "no"
+        judged.append((sentence, here, share, float(middle - half), float(middle + half)))
+    sentences = Table(
+        "sentences",
+        "The paper's sentences",
+        "First averaged scheme against the last. Share of the campaigns in which a sentence holds, with the interval "
+        "of one sigma that so many campaigns leave.",
+        ("sentence", "this campaign", "share", "from", "to"),
+        judged,
+        (None, None, 2, 2, 2),
+    )
+    text = (
+        "Biases, orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude stay. One "
+        "campaign of seven fields may come out otherwise by the chance of its biases alone: when the one field of the "
+        "first scheme happens to lie near the mean of all, averaging cannot improve on it.",
+    )
+    return Section("Other campaigns", text, (sentences, table) if judged else (table,))
+
+
+def _parameters(run: CalibrationRun) -> Section:
+    found, laboratory = run.together, run.campaign.laboratory
+    sigma = found.sigma
+    start = dict(zip(INNER, np.ravel([laboratory[line].interior for line in LINES]), strict=True))
+    truth = dict(zip(found.names, run.truth, strict=True))
+    rows: list[tuple[Cell, ...]] = []
+    for name in INNER:
+        change, true = (1e6 * (v - start[name]) for v in (found.value(name), truth[name]))
+        held = sigma[name] == 0.0
+        z = None if held else float((found.value(name) - truth[name]) / sigma[name])
+        rows.append((name, float(change), None if held else 1e6 * sigma[name], float(true), z))
+    others: list[tuple[Cell, ...]] = []
+    for name in (n for n in found.names if n not in INNER):
+        scale, shown = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}[unit(name)]
+        value, true, s = found.value(name) / scale, truth[name] / scale, sigma[name] / scale
+        others.append((name, shown, float(value), float(s), float(true), float((value - true) / s)))
+    text = [
+        "All fields at once, one interior orientation for all: changes from the laboratory's values. z is the error in "
+        "sigmas of this adjustment.",
+    ]
+    if any(name in RATE for name in found.names):
+        text.append(
+            "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
+            "before and after the nadir line. The fit of the biases against latitude tells the drift, with its sigma, "
+            "and the outer lines' principal points share that sigma."
+        )
+    else:
+        text.append(
+            "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
+            "before and after the nadir line. With so few fields nothing tells the drift: the outer lines' principal "
+            "points take it up, and no sigma contains it."
+        )
+    tables = (
+        Table(
+            "interior",
+            "Interior orientation",
+            "Micrometres, changes from the laboratory. Without sigma: held (gauge).",
+            ("element", "change", "σ", "true change", "z"),
+            rows,
+            (None, 2, 2, 2, 2),
+        ),
+        Table(
+            "biases",
+            "Biases of the attitude and offsets of the orbit",
+            f"From measured to true; offsets {', '.join(OFFSET)} in metres with the orbit's sigma as prior.",
+            ("unknown", "unit", "value", "σ", "truth", "z"),
+            others,
+            (None, None, 3, 3, 3, 2),
+        ),
+    )
+    one = run.campaign.passes[0].name
+    figure = SvgFigure(
+        "residuals",
+        f"Residuals of the control points in the images, {one}",
+        "RMS of x and y in each line's title. What is left is noise of the image and of the attitude.",
+        drawn("residuals", run),
+    )
+    return Section("Parameters", tuple(text), (*tables, figure))
+
+
+def _rank(run: CalibrationRun) -> Section:
+    found, way = run.together, run.paper_way
+    size = np.abs(np.triu(found.correlation, 1))
+    size[~np.isfinite(size)] = 0.0
+    order = np.argsort(size, axis=None)[::-1][:10]
+    rows: list[tuple[Cell, ...]] = []
+    for i, j in zip(*np.unravel_index(order, size.shape), strict=True):
+        rows.append((found.names[int(i)], found.names[int(j)], float(found.correlation[i, j])))
+    text = [f"Gauge: {found.gauge}."]
+    text += [f"The points cannot tell: {c}." for c in found.open]
+    text += [f"Weak, but solved for: {c}." for c in found.weak]
+    state = "converges" if way.converged else "does not converge"
+    text.append(
+        f"The paper's stepwise solution, bias and interior in turn, {state} for {run.campaign.spec.schemes[0][0]} in "
+        f"{way.rounds} rounds to steps of {STEPWISE_TOLERANCE:g} sigma; a round leaves {way.rate:.4f} of the slowest "
+        "error. The simultaneous adjustment of all "
+        f"fields takes {found.iterations} steps."
+    )
+    table = Table(
+        "correlations",
+        "Largest correlations",
+        "Of the simultaneous adjustment; all of them are in calibration.json.",
+        ("unknown", "unknown", "correlation"),
+        rows,
+        (None, None, 4),
+    )
+    figure = SvgFigure(
+        "correlation-matrix",
+        "Correlations",
+        "Of the simultaneous adjustment, held unknowns left out. Yaw of all fields goes with y of the outer lines; "
+        "roll and pitch of a field go with the offset of its orbit.",
+        drawn("correlation-matrix", run),
+    )
+    return Section("What cannot be told apart", tuple(text), (table, figure))
+
+
+def _data(run: CalibrationRun) -> Section:
+    rows: list[tuple[Cell, ...]] = []
+    for name, result in run.fields.items():
+        orbit, attitude = result.orbit.rms, result.attitude.rms / ARCSEC
+        rows.append((name, *map(float, orbit), *map(float, attitude)))
+    table = Table(
+        "third-differences",
+        "RMS of third differences, as Table 2 of the paper",
+        "Measured positions in the Earth-fixed frame, metres; measured attitude against the orbital frame, arcseconds. "
+        "White noise of one sigma gives the square root of 20. Biases and drifts do not show.",
+        ("field", "x", "y", "z", "roll", "pitch", "yaw"),
+        rows,
+        (None, 4, 4, 4, 4, 4, 4),
+    )
+    return Section("Orbit and attitude data", (), (table,))

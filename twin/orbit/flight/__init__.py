@@ -1,0 +1,1 @@
+"""Earth, orbit, attitude, line cameras on a satellite: pixel to ground and back."""

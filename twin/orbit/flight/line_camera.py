@@ -1,0 +1,239 @@
+"""Line cameras in orbit: what every pixel of a line looks along, in the satellite's body frame.
+
+Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. A pixel's ray has an origin as well as a
+direction, because the chief rays of a mirror camera do not meet in one exact point. Both are smooth functions of the
+pixel and are kept as Chebyshev series over the line: exact for an ideal projection with distortion, which is a
+polynomial, and for a traced line as good as the trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from optics.geometry.pose import about_axis, rotation_matrix
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import points_to_world
+from optics.raytrace.line_of_sight import chief_rays
+from optics.raytrace.system import assemble
+from scenes.models.camera_assembly import line_body
+from scenes.models.instrument_model import Instrument
+from scenes.specs.channel import BASE
+from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.three_line_camera import LineCameraSpec, ThreeLineCameraSpec
+
+TRACED_POINTS = 49
+"""Points of a traced line. An unperturbed line needs nine terms; the rest is for figure errors."""
+_NOISE = 1e-14
+"""Terms of a traced series below this share are rounding and are dropped (one pixel is 1e-6 rad)."""
+_PLANE_POINTS = 1001
+
+
+@dataclass(frozen=True, eq=False)
+class LineCamera:
+    """One line of pixels and what it sees.
+
+    Pixels are counted along +Y' of the real focal plane, the centre of the first is 0, so they see the scene from +Y to
+    -Y of the body. A place on the line is any real number from -0.5 to pixels - 0.5.
+
+    Attributes:
+        name: of the line.
+        pixels: how many.
+        directions: Chebyshev coefficients over the line of a vector along the look, body frame, (K, 3); its length does
+            not matter.
+        origins: those of a point on the ray, body frame, (J, 3), metres.
+    """
+
+    name: str
+    pixels: int
+    directions: np.ndarray
+    origins: np.ndarray
+
+    def look(self, pixel: np.ndarray) -> np.ndarray:
+        """Unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
+
+        Raises:
+            ValueError: a pixel outside the line.
+        """
+        vector = self._series(self.directions, pixel)
+        return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+
+    def look_and_slope(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`look` and its derivative by the pixel, radians per pixel, both (N, 3); the derivative is square to the look.
+
+        Raises:
+            ValueError: a pixel outside the line.
+        """
+        vector = self._series(self.directions, pixel)
+        change = self._series(chebyshev.chebder(self.directions), pixel) * (2.0 / self.pixels)
+        length = np.linalg.norm(vector, axis=-1, keepdims=True)
+        look = vector / length
+        return look, (change - look * np.sum(look * change, axis=-1, keepdims=True)) / length
+
+    def origin(self, pixel: np.ndarray) -> np.ndarray:
+        """Points on the rays, body frame: pixels (N,) -> (N, 3), metres.
+
+        Raises:
+            ValueError: a pixel outside the line.
+        """
+        return self._series(self.origins, pixel)
+
+    def _series(self, coefficients: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        pixel = np.asarray(pixel, dtype=np.float64)
+        if not np.all((pixel >= -0.5) & (pixel <= self.pixels - 0.5)):
+            raise ValueError(f"a pixel outside the line {self.name!r}: it reaches from -0.5 to {self.pixels - 0.5}")
+        place = (2.0 * pixel + 1.0) / self.pixels - 1.0
+        return np.moveaxis(chebyshev.chebval(place, coefficients), 0, -1)
+
+
+def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
+    """The lines of a payload of ideal projections with distortion, by name (no approximation)."""
+    return {
+        name: _ideal_line(name, line, spec.pixels_of(name), spec.pitch_of(name)) for name, line in spec.lines.items()
+    }
+
+
+def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> LineCamera:
+    to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
+    x0, y0 = line.principal_point
+
+    def look(pixel: np.ndarray) -> np.ndarray:
+        y = (pixel - 0.5 * (pixels - 1)) * pitch - y0
+        x = np.full_like(y, -x0)
+        square = x**2 + y**2
+        corrected = 1.0 + line.k1 * square + line.k2 * square**2
+        return np.stack([-x * corrected, -y * corrected, np.full_like(y, line.focal_length)], axis=-1) @ to_body.T
+
+    degree = 5 if line.k2 else 3
+    return LineCamera(name, pixels, _coefficients(look, pixels, degree + 1), np.array([line.position]))
+
+
+def traced_line_cameras(instrument: Instrument, backend: Backend, state: State | None = None) -> dict[str, LineCamera]:
+    """The lines of an instrument of mirror cameras, by exact chief rays of their pixels.
+
+    Args:
+        instrument: cameras on their base, which is the satellite's body frame.
+        backend: where to trace.
+        state: what is perturbed; None for nothing.
+
+    Returns:
+        Camera -> its line. The origins are the points of the chief rays nearest to the camera's nominal origin.
+
+    Raises:
+        AimError, BeamMissedError: the perturbation moves the image off the mirrors.
+    """
+    names = list(instrument.cameras)
+    states: list[State] = [state or {}]
+    placed = instrument.assembly.place(states)
+    lines = {name: instrument.cameras[name].spec.line for name in names}
+    points, guesses = [], []
+    for name, line in lines.items():
+        y = (_nodes(line.pixels, TRACED_POINTS) - 0.5 * (line.pixels - 1)) * line.pitch
+        on_line = np.stack([np.zeros_like(y), y, np.zeros_like(y)], axis=-1)
+        points.append(points_to_world(placed, line_body(f"{BASE}/{name}"), on_line))
+        guesses.append(instrument.toward_optics(placed, name))
+    to_stop = assemble(instrument.assembly, [f"{name}/image_to_stop" for name in names], states, placed=placed)
+    to_object = assemble(instrument.assembly, [f"{name}/image_to_object" for name in names], states, placed=placed)
+    image, guess = np.concatenate(points), np.concatenate(guesses)[:, None]
+    position, direction = chief_rays(backend, to_stop, to_object, image, guess, np.array([0.0, 1.0, 0.0]))
+    cameras = {}
+    for i, (name, line) in enumerate(lines.items()):
+        camera_origin = np.array(instrument.spec.cameras[name].position)
+        offset = position[i] - camera_origin
+        nearest = position[i] - direction[i] * np.sum(offset * direction[i], axis=-1, keepdims=True)
+        series = [_chopped(_through(values)) for values in (direction[i], nearest)]
+        cameras[name] = LineCamera(name, line.pixels, *series)
+    return cameras
+
+
+def look_angle(a: LineCamera, b: LineCamera) -> float:
+    """Angle between the looks of the middles of two lines, radians, 0 to pi."""
+    first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
+    return _angle(first, second)
+
+
+def along_track_angle(a: LineCamera, b: LineCamera) -> float:
+    """Turn about the lines' mean direction that takes the middle of b to that of a, radians; + where a looks ahead.
+
+    The part of `look_angle` that makes heights: it has a sign, and lines that look the same way but side by side have
+    none. A line's direction is square to the look of its middle, in its plane.
+    """
+    first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
+    sides = [np.cross(look, line_normal(camera)) for look, camera in ((first, a), (second, b))]
+    axis = sum(side / np.linalg.norm(side) for side in sides)
+    axis = axis / np.linalg.norm(axis)
+    return float(np.arctan2(axis @ np.cross(second, first), first @ second - (first @ axis) * (second @ axis)))
+
+
+def dihedral_angle(
+    a: LineCamera, b: LineCamera, places: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+) -> float:
+    """Angle between the planes of two lines, radians, 0 to pi/2.
+
+    A line's plane is the one through the station that its looks depart from least (total least squares over the whole
+    line, or over the pixels `places`, each (N,)). It is what ground points of the strips give (paper 000, eqs. 1 to 7),
+    and differs from `look_angle` when the lines are not parallel.
+    """
+    angle = _angle(*(line_normal(camera, place) for camera, place in zip((a, b), places, strict=True)))
+    return min(angle, np.pi - angle)
+
+
+def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarray:
+    """Unit normal of a line's best plane through the station, body frame, (3,), on the forward side (+X).
+
+    pixel: (N,) places that the plane is fitted to; None for the whole line.
+    """
+    looks = camera.look(np.linspace(0.0, camera.pixels - 1.0, _PLANE_POINTS) if pixel is None else pixel)
+    # the singular vector itself, not that of the normal equations: half of the digits would be lost there
+    normal = np.linalg.svd(looks, full_matrices=False)[2][-1]
+    return normal if normal[0] > 0.0 else -normal
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def _nodes(pixels: int, count: int) -> np.ndarray:
+    """Chebyshev points of the line, (count,), in pixels."""
+    return 0.5 * (chebyshev.chebpts1(count) + 1.0) * pixels - 0.5
+
+
+def _through(values: np.ndarray) -> np.ndarray:
+    """Coefficients (K, 3) of the series that has these values (K, 3) at the Chebyshev points."""
+    count = len(values)
+    basis = chebyshev.chebvander(chebyshev.chebpts1(count), count - 1)
+    weight = np.full(count, 2.0 / count)
+    weight[0] = 1.0 / count
+    return weight[:, None] * (basis.T @ values)  # the points are orthogonal: no equations to solve
+
+
+def _coefficients(function: Callable[[np.ndarray], np.ndarray], pixels: int, count: int) -> np.ndarray:
+    return _through(function(_nodes(pixels, count)))
+
+
+def _chopped(coefficients: np.ndarray) -> np.ndarray:
+    """The series without its last terms that are rounding."""
+    size = np.max(np.abs(coefficients), axis=-1)
+    used = np.flatnonzero(size > _NOISE * np.max(size))
+    return coefficients[: used[-1] + 1]
+
+
+def changed_payload(
+    spec: OrbitCalibrationSpec | OrbitSimulateSpec, payload: ThreeLineCameraSpec
+) -> ThreeLineCameraSpec:
+    """The camera as it is after launch."""
+    lines = {}
+    for name, line in payload.lines.items():
+        if name in spec.changes:
+            change = spec.changes[name]
+            point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
+            focal = line.focal_length + change.focal_length
+            line = line.model_copy(update={"focal_length": focal, "principal_point": point})
+        lines[name] = line
+    return payload.model_copy(update={"lines": FrozenMap(lines)})

@@ -1,0 +1,258 @@
+"""Orbits: two-body motion and the Earth's flattening (J2), integrated numerically.
+
+The flattening's axis is the celestial pole of the epoch; within a day the pole moves by some 0.1 arcsec. Drag, other
+terms of the field, Sun and Moon are left out: over a pass they displace the orbit smoothly by metres, and change
+nothing in the geometry of an image, because a precise orbit determination follows them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_spec import ElementsSpec, OrbitSpec, PassingSpec
+
+GM = 3.986004415e14
+"""m^3/s^2 (EGM96)."""
+J2 = 1.0826266835e-3
+"""EGM96: -sqrt(5) times the normalised C20, -484.165371736e-6."""
+FIELD_RADIUS = 6378136.3
+"""Of the field's expansion, metres (EGM96)."""
+SUN_RATE = 2.0 * math.pi / (365.2421897 * DAY)
+"""Mean motion of the mean Sun in right ascension, rad/s; tropical year."""
+TOLERANCE = 1e-12
+"""Relative error of one integration step."""
+
+_ABSOLUTE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]) * 1e-5
+_LONGEST_STEP = 60.0
+_POLAR_RADIUS = EQUATORIAL_RADIUS * (1.0 - FLATTENING)
+
+
+def acceleration(position: np.ndarray) -> np.ndarray:
+    """Acceleration of the two-body + J2 field, m/s^2; positions (..., 3) in axes with z along the pole, metres."""
+    r2 = np.sum(position * position, axis=-1, keepdims=True)
+    sine2 = position[..., 2:] ** 2 / r2
+    flattening = 1.5 * J2 * FIELD_RADIUS**2 / r2
+    factor = 1.0 + flattening * (np.array([1.0, 1.0, 3.0]) - 5.0 * sine2)
+    return np.asarray(-GM / (r2 * np.sqrt(r2)) * factor * position)
+
+
+def node_rate(semi_major_axis: float, eccentricity: float, inclination: float) -> float:
+    """Secular rate of the node by J2, rad/s, from mean elements: -3/2 J2 (R/p)^2 n cos i (Kaula 1966, eq. 3.74)."""
+    n = math.sqrt(GM / semi_major_axis**3)
+    p = semi_major_axis * (1.0 - eccentricity**2)
+    return -1.5 * J2 * (FIELD_RADIUS / p) ** 2 * n * math.cos(inclination)
+
+
+def sun_synchronous_inclination(semi_major_axis: float, eccentricity: float = 0.0) -> float:
+    """Mean inclination at which the node follows the mean Sun, radians.
+
+    Raises:
+        ValueError: the orbit is too high.
+    """
+    cosine = SUN_RATE / node_rate(semi_major_axis, eccentricity, 0.0)
+    if abs(cosine) > 1.0:
+        raise ValueError(f"no sun-synchronous orbit has a semi-major axis of {semi_major_axis / 1e3:.0f} km")
+    return math.acos(cosine)
+
+
+def _osculating_inclination(semi_major_axis: float, eccentricity: float, argument: float | None, z: float) -> float:
+    """Osculating inclination of a sun-synchronous orbit at one argument of latitude, from osculating elements.
+
+    The short-period terms of first order for a small eccentricity (Kozai 1959) lead to the mean elements:
+    a = a' + 3/2 J2 R^2/a sin^2 i cos 2u and i = i' + 3/8 J2 (R/p)^2 sin 2i cos 2u. Where u is not given, sin u follows
+    from z = sin i sin u.
+    """
+    ratio = J2 * (FIELD_RADIUS / semi_major_axis) ** 2
+    inclination = sun_synchronous_inclination(semi_major_axis, eccentricity)
+    for _ in range(10):
+        sine2 = math.sin(argument) ** 2 if argument is not None else (z / math.sin(inclination)) ** 2
+        double = 1.0 - 2.0 * sine2
+        mean_axis = semi_major_axis * (1.0 - 1.5 * ratio * math.sin(inclination) ** 2 * double)
+        mean = sun_synchronous_inclination(mean_axis, eccentricity)
+        inclination = mean + 0.375 * ratio * math.sin(2.0 * mean) * double
+    return inclination
+
+
+@dataclass(frozen=True, eq=False)
+class Orbit:
+    """An orbit over a span of time; made by `propagate`.
+
+    Attributes:
+        epoch: UTC, ISO 8601 text; times are seconds from it.
+        earth: on which it is seen.
+        first, last: span of time, seconds.
+        to_gcrs: rotation from the frame of integration (equator of the epoch) to the GCRS, shape (3, 3).
+        rotation: the Earth's, over the span.
+        backward, forward: dense solutions before and after the epoch, in the frame of integration; None if there is no
+            such part.
+    """
+
+    epoch: str
+    earth: Earth
+    first: float
+    last: float
+    to_gcrs: np.ndarray
+    rotation: EarthRotation
+    backward: Any
+    forward: Any
+
+    def equatorial(self, seconds: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Position (..., 3), metres, and velocity (..., 3), m/s, in the frame of integration: z along the celestial
+        pole, x toward the celestial intermediate origin of the epoch, not turning.
+
+        Raises:
+            ValueError: a time is not a number or outside the orbit.
+        """
+        t = np.asarray(seconds, dtype=np.float64)
+        if not np.all((t >= self.first) & (t <= self.last)):
+            raise ValueError(
+                f"time outside the orbit, which is known from {self.first:g} s to {self.last:g} s: found "
+                f"{np.min(t):g} s to {np.max(t):g} s"
+            )
+        flat = t.ravel()
+        state = np.empty((6, flat.size))
+        for solution, part in ((self.backward, flat < 0.0), (self.forward, flat >= 0.0)):
+            if np.any(part):
+                state[:, part] = (solution or self.backward or self.forward)(flat[part])
+        state = state.T.reshape(*t.shape, 6)
+        return state[..., :3], state[..., 3:]
+
+    def gcrs(self, seconds: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Position (..., 3), metres, and velocity (..., 3), m/s, in the GCRS; raises as `equatorial`."""
+        r, v = self.equatorial(seconds)
+        return r @ self.to_gcrs.T, v @ self.to_gcrs.T
+
+    def itrs(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Position, metres, velocity against the turning Earth and velocity against the stars, m/s, all (..., 3) in
+        axes of the ITRS; raises as `equatorial`.
+        """
+        r, v = self.gcrs(seconds)
+        matrix = self.rotation.matrix(seconds)
+        position, inertial = (np.einsum("...ij,...j->...i", matrix, a) for a in (r, v))
+        return position, inertial - np.cross(self.rotation.rate(seconds), position), inertial
+
+
+def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Orbit:
+    """Follow an orbit over its span (Dormand-Prince 8(5,3) with dense output).
+
+    Args:
+        spec: the orbit.
+        earth: on which it is seen.
+        tolerance: relative error of one step.
+
+    Raises:
+        ValueError: no such orbit: the place lies beyond the inclination's latitudes, it is too high to be
+            sun-synchronous, or it runs into the Earth.
+        RuntimeError: the integration failed.
+    """
+    rotation = earth.rotation(spec.epoch, -spec.before, spec.after)
+    to_gcrs = rotation.celestial(0.0).T
+    if spec.passing is not None:
+        state = _passing_state(spec.passing, earth, to_gcrs.T @ rotation.matrix(0.0).T)
+    elif spec.elements is not None:
+        state = _element_state(spec.elements, rotation, ut1_of(spec.epoch, earth.dut1))
+    else:
+        assert spec.state is not None
+        state = np.concatenate([to_gcrs.T @ spec.state.position, to_gcrs.T @ spec.state.velocity])
+    parts = [_solve(state, end, tolerance) if end else None for end in (-spec.before, spec.after)]
+    return Orbit(spec.epoch, earth, -spec.before, spec.after, to_gcrs, rotation, *parts)
+
+
+def descending_local_time(orbit: Orbit) -> float:
+    """Local mean solar time of the osculating orbit's descending node at the epoch, seconds of the day."""
+    r, v = orbit.equatorial(0.0)
+    h = np.cross(r, v)
+    return _local_time(math.atan2(h[0], -h[1]) + math.pi, orbit.rotation.angle, ut1_of(orbit.epoch, orbit.earth.dut1))
+
+
+def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) -> float:
+    """UT1 plus the longitude of the meridian, seconds of the day."""
+    # a Julian day begins at noon
+    noon = (ut1[0] % 1.0 + ut1[1] % 1.0 + 0.5) * DAY
+    return (noon + (right_ascension - angle) / (2.0 * math.pi) * DAY) % DAY
+
+
+def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
+    def derivative(_: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[3:], acceleration(y[:3])])
+
+    def above_ground(_: float, y: np.ndarray) -> float:
+        return float(np.linalg.norm(y[:3])) - _POLAR_RADIUS
+
+    above_ground.terminal = True  # type: ignore[attr-defined]
+    found = solve_ivp(
+        derivative,
+        (0.0, end),
+        state,
+        method="DOP853",
+        dense_output=True,
+        rtol=tolerance,
+        atol=tolerance * 1e7 * _ABSOLUTE,
+        max_step=_LONGEST_STEP,
+        events=above_ground,
+    )
+    if found.status == 1 or above_ground(0.0, state) < 0.0:
+        raise ValueError(f"the orbit runs into the Earth {found.t[-1]:.0f} s from its epoch")
+    if not found.success:
+        raise RuntimeError(f"the orbit could not be followed: {found.message}")
+    return found.sol
+
+
+def _radial_and_along(inclination: float, node: float, argument: float) -> np.ndarray:
+    """Unit vectors away from the Earth and along the circular orbit, shape (2, 3), in the frame of integration."""
+    cu, su, cn, sn = math.cos(argument), math.sin(argument), math.cos(node), math.sin(node)
+    ci, si = math.cos(inclination), math.sin(inclination)
+    radial = [cn * cu - sn * su * ci, sn * cu + cn * su * ci, su * si]
+    along = [-cn * su - sn * cu * ci, -sn * su + cn * cu * ci, cu * si]
+    return np.array([radial, along])
+
+
+def _element_state(spec: ElementsSpec, rotation: EarthRotation, ut1: tuple[float, float]) -> np.ndarray:
+    a, e = EQUATORIAL_RADIUS + spec.altitude, spec.eccentricity
+    inclination = spec.inclination
+    if inclination is None:
+        inclination = _osculating_inclination(a, e, spec.argument, 0.0)
+    node = spec.node
+    if node is None:
+        assert spec.node_local_time is not None
+        at_zero = _local_time(0.0, rotation.angle, ut1)
+        node = 2.0 * math.pi * (spec.node_local_time - at_zero) / DAY - math.pi
+    anomaly = spec.argument - spec.perigee
+    p = a * (1.0 - e * e)
+    speed = math.sqrt(GM / p)
+    radial, along = _radial_and_along(inclination, node, spec.argument)
+    position = p / (1.0 + e * math.cos(anomaly)) * radial
+    velocity = speed * (e * math.sin(anomaly) * radial + (1.0 + e * math.cos(anomaly)) * along)
+    return np.concatenate([position, velocity])
+
+
+def _passing_state(spec: PassingSpec, earth: Earth, from_itrs: np.ndarray) -> np.ndarray:
+    """State of the osculating circle through a place: from its declination follow argument and node."""
+    position = from_itrs @ earth.ecef(spec.longitude, spec.latitude, spec.altitude)
+    a = float(np.linalg.norm(position))
+    z = position[2] / a
+    inclination = spec.inclination
+    if inclination is None:
+        # near the turning points there may be none; then the mean inclination says so below
+        reach = abs(z) < abs(math.sin(sun_synchronous_inclination(a)))
+        inclination = _osculating_inclination(a, 0.0, None, z) if reach else sun_synchronous_inclination(a)
+    if abs(z) > math.sin(inclination):
+        raise ValueError(
+            f"an orbit of inclination {math.degrees(inclination):.3f} deg never passes latitude "
+            f"{math.degrees(spec.latitude):.3f} deg"
+        )
+    argument = math.asin(z / math.sin(inclination))
+    if spec.direction == "descending":
+        argument = math.pi - argument
+    longitude_from_node = math.atan2(math.cos(inclination) * math.sin(argument), math.cos(argument))
+    node = math.atan2(position[1], position[0]) - longitude_from_node
+    along = _radial_and_along(inclination, node, argument)[1]
+    return np.concatenate([position, math.sqrt(GM / a) * along])

@@ -1,0 +1,305 @@
+"""A line sensor in orbit: from pixel and time to the ground and back.
+
+Along the track nothing is interpolated, so that no smoothness of attitude or orbit is assumed: every line is computed
+by the rigorous model at a few Chebyshev points of the line. Between them the ground point is an analytic function of
+the pixel, and one matrix product takes a block of lines from the points to all pixels.
+
+The two ways are written separately, each from the physics: `ground` follows a pixel's look down to a height, `image`
+looks for the line and the pixel on which the light from a point falls. They share no solution, so that the round trip
+tests both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.flight.light_effects import (
+    SPEED_OF_LIGHT,
+    LightEffects,
+    aberrated,
+    refracted,
+    turned_with_earth,
+    unrefracted,
+)
+from twin.orbit.flight.line_camera import LineCamera
+
+_COUNTS = (8, 12, 16, 24, 32, 48)
+_TRIAL_LINES = 9
+
+
+@dataclass(frozen=True, eq=False)
+class GeolocationGrid:
+    """How the ground coordinates of an image are interpolated along its lines; made by `prepare`.
+
+    Attributes:
+        sensor: the rigorous model.
+        height: of the surface, above the ellipsoid, metres.
+        nodes: pixels where the rigorous model is evaluated, (K,).
+        error: largest difference between interpolation and rigorous model that was found half-way between the nodes
+            and at the line's ends, on lines over the whole image, metres.
+    """
+
+    sensor: Sensor
+    height: float
+    nodes: np.ndarray
+    error: float
+
+    @classmethod
+    def prepare(cls, sensor: Sensor, height: float = 0.0, tolerance: float = 1e-6) -> GeolocationGrid:
+        """Take as few nodes as keep the error below a tolerance, metres.
+
+        Raises:
+            ValueError: a look misses the Earth, or the camera's looks are too rough for the tolerance.
+        """
+        line = np.linspace(-0.5, sensor.lines - 0.5, _TRIAL_LINES)
+        error = np.inf
+        for count in _COUNTS:
+            grid = cls(sensor, height, _nodes(count, sensor.camera.pixels), error)
+            ends = np.array([-0.5, sensor.camera.pixels - 0.5])
+            between = np.concatenate([0.5 * (grid.nodes[1:] + grid.nodes[:-1]), ends])
+            exact = _rigorous(sensor, line, between, height)
+            error = float(np.max(np.linalg.norm(grid._interpolated(line, between) - exact, axis=-1)))
+            if error <= tolerance:
+                return cls(sensor, height, grid.nodes, error)
+        raise ValueError(f"{_COUNTS[-1]} nodes leave an error of {error:.3g} m, more than {tolerance:.3g} m")
+
+    def blocks(self, lines: np.ndarray, pixels: np.ndarray, block: int = 128) -> Iterator[tuple[slice, np.ndarray]]:
+        """Ground points of all these lines and pixels, block by block.
+
+        Args:
+            lines: image coordinates, (L,), any real numbers inside the image.
+            pixels: likewise, (P,).
+            block: lines at a time; the memory is about 24 block P bytes.
+
+        Yields:
+            Which of the lines, and their points in the ITRS, (n, P, 3), metres (float64; a view whose coordinates lie
+            in planes, so that ``[..., 0]`` is contiguous).
+
+        Raises:
+            ValueError: a line or pixel outside the image, or a look that misses the Earth.
+        """
+        lines, pixels = np.asarray(lines, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
+        if not np.all((pixels >= -0.5) & (pixels <= self.sensor.camera.pixels - 0.5)):
+            raise ValueError(f"a pixel outside the line, which reaches from -0.5 to {self.sensor.camera.pixels - 0.5}")
+        weights = self._weights(pixels)
+        for start in range(0, len(lines), block):
+            part = slice(start, min(start + block, len(lines)))
+            yield part, self._spread(lines[part], weights)
+
+    def _interpolated(self, lines: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        return self._spread(lines, self._weights(pixels))
+
+    def _spread(self, lines: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        known = _rigorous(self.sensor, lines, self.nodes, self.height)
+        planes = np.ascontiguousarray(np.moveaxis(known, -1, 0))
+        return np.moveaxis((planes.reshape(-1, len(self.nodes)) @ weights).reshape(3, len(lines), -1), 0, -1)
+
+    def _weights(self, pixels: np.ndarray) -> np.ndarray:
+        """Values at the nodes -> values at pixels: (K, P)."""
+        count = len(self.nodes)
+        scale = np.full(count, 2.0 / count)
+        scale[0] = 1.0 / count
+        at_nodes, at_pixels = (
+            chebyshev.chebvander((2.0 * place + 1.0) / self.sensor.camera.pixels - 1.0, count - 1)
+            for place in (self.nodes, pixels)
+        )
+        return np.asarray((at_nodes * scale) @ at_pixels.T)
+
+
+def _nodes(count: int, pixels: int) -> np.ndarray:
+    return 0.5 * (chebyshev.chebpts1(count) + 1.0) * pixels - 0.5
+
+
+def _rigorous(sensor: Sensor, lines: np.ndarray, pixels: np.ndarray, height: float) -> np.ndarray:
+    """Points (L, P, 3).
+
+    Raises:
+        ValueError: a look misses the Earth; interpolation would spread it over the line.
+    """
+    line, pixel = np.meshgrid(lines, pixels, indexing="ij")
+    points = sensor.ground(line.ravel(), pixel.ravel(), height).reshape(*line.shape, 3)
+    if not np.all(np.isfinite(points)):
+        raise ValueError("a look misses the Earth")
+    return points
+
+
+_MOST_STEPS = 30
+_ARRIVED = 1e-7
+"""Pixels and lines: the last Newton step. The steps shrink a thousandfold each, so far less than this is left."""
+
+
+class Platform(Protocol):
+    """What the model needs to know of a trajectory, Earth-fixed (ITRS axes), at times (N,) in seconds.
+
+    Each raises ValueError for a time outside of what is known.
+    """
+
+    def position(self, seconds: np.ndarray) -> np.ndarray:
+        """Of the body's origin, (N, 3), metres."""
+
+    def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
+        """Against the stars, (N, 3), m/s."""
+
+    def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
+        """Columns = body axes X, Y, Z, (N, 3, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A line camera on its way.
+
+    Image coordinates are (line, pixel), real numbers; the centre of the first line's first pixel is (0, 0) and the
+    image reaches from -0.5 to lines - 0.5 and to pixels - 0.5.
+
+    Attributes:
+        camera: the line.
+        trajectory: position, velocity and attitude over time.
+        earth: the ellipsoid.
+        line_time: from one line to the next, seconds.
+        first_line_time: middle of the exposure of line 0, seconds of the trajectory.
+        lines: how many lines the image has.
+        effects: which of light time, aberration and refraction are on.
+
+    Raises:
+        ValueError: the image begins or ends outside of the trajectory's times.
+    """
+
+    camera: LineCamera
+    trajectory: Platform
+    earth: Earth
+    line_time: float
+    first_line_time: float
+    lines: int
+    effects: LightEffects = field(default_factory=LightEffects)
+
+    def __post_init__(self) -> None:
+        if not self.line_time > 0.0 or self.lines < 1:
+            raise ValueError("an image needs at least one line and a line time above zero")
+        self.trajectory.position(self.time(np.array([-0.5, self.lines - 0.5])))
+
+    def time(self, line: np.ndarray) -> np.ndarray:
+        """Time of exposure of lines (N,), seconds of the trajectory."""
+        return self.first_line_time + np.asarray(line, dtype=np.float64) * self.line_time
+
+    def ground(self, line: np.ndarray, pixel: np.ndarray, height: np.ndarray | float = 0.0) -> np.ndarray:
+        """Where pixels see the surface of a given height.
+
+        Args:
+            line: image coordinate, broadcastable to (N,).
+            pixel: likewise.
+            height: above the ellipsoid, metres, broadcastable to (N,).
+
+        Returns:
+            Points in the ITRS, (N, 3), metres; NaN where the look misses the Earth.
+
+        Raises:
+            ValueError: a line or a pixel outside the image.
+        """
+        line, pixel, height = (np.ravel(a) for a in np.broadcast_arrays(line, pixel, height))
+        self._require_inside(line)
+        seconds = self.time(line)
+        to_itrs = self.trajectory.body_to_itrs(seconds)
+        look = np.einsum("nij,nj->ni", to_itrs, self.camera.look(pixel))
+        station = self._station(seconds, to_itrs, pixel)
+        if self.effects.aberration:
+            look = aberrated(look, -self.trajectory.inertial_velocity(seconds))
+        point = self.earth.intersect(station, look, height)
+        if self.effects.light_time:
+            # heights do not change as the Earth turns: the point is brought to where it is in the axes of the moment
+            # at which its light left
+            way = np.linalg.norm(point - station, axis=-1) / SPEED_OF_LIGHT
+            point, station = turned_with_earth(point, way), turned_with_earth(station, way)
+        if self.effects.refraction:
+            point = refracted(point, station, self.earth, self.effects.wavelength)
+        return point
+
+    def image(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the image of ground points lies.
+
+        Newton's method on line and pixel, on the two components of the light's direction square to the pixel's look.
+
+        Args:
+            point: in the ITRS, (N, 3), metres.
+
+        Returns:
+            Line and pixel, (N,) each; both NaN for a point that the image does not hold (its mask is
+            ``np.isfinite(line)``), for a NaN, and for a point that the body of the Earth hides.
+        """
+        point = np.asarray(point, dtype=np.float64).reshape(-1, 3)
+        line, pixel = np.full(len(point), np.nan), np.full(len(point), np.nan)
+        moving = np.flatnonzero(np.all(np.isfinite(point), axis=-1))
+        line[moving], pixel[moving] = 0.5 * (self.lines - 1), 0.5 * (self.camera.pixels - 1)
+        lowest, highest = np.full(2, -0.5), np.array([self.lines, self.camera.pixels]) - 0.5
+        arrived = np.zeros(len(point), dtype=bool)
+        for _ in range(_MOST_STEPS):
+            if not len(moving):
+                break
+            here = np.stack([line[moving], pixel[moving]], axis=-1)
+            step = self._step(point[moving], *here.T)
+            # a place that would leave the image is held at its border; one that stays there has its image outside
+            there = np.clip(here + step, lowest, highest)
+            line[moving], pixel[moving] = there.T
+            close = np.max(np.abs(step), axis=-1) <= _ARRIVED
+            arrived[moving[close]] = True
+            moving = moving[~close & np.any(there != here, axis=-1) & np.all(np.isfinite(there), axis=-1)]
+        seen = np.flatnonzero(arrived)
+        arrived[seen] = self._faces(point[seen], line[seen])
+        return np.where(arrived, line, np.nan), np.where(arrived, pixel, np.nan)
+
+    def _step(self, point: np.ndarray, line: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Newton step (N, 2) of line and pixel."""
+        look, slope = self.camera.look_and_slope(pixel)
+        rate = np.linalg.norm(slope, axis=-1)
+        along = slope / rate[:, None]
+        across = np.cross(look, along)
+        ahead = np.where(line + 1.0 <= self.lines - 0.5, 1.0, -1.0) * min(1.0, 0.5 * self.lines)
+        arrivals = [self._arrival(point, at, pixel) for at in (line, line + ahead)]
+        here, there = (
+            np.stack([np.sum(a * along, axis=-1), np.sum(a * across, axis=-1)], axis=-1)
+            / np.sum(a * look, axis=-1, keepdims=True)
+            for a in arrivals
+        )
+        by_line = (there - here) / ahead[:, None]
+        line_step = -here[:, 1] / by_line[:, 1]
+        return np.stack([line_step, (here[:, 0] + by_line[:, 0] * line_step) / rate], axis=-1)
+
+    def _arrival(self, point: np.ndarray, line: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Unit directions, body frame, from which light of the points comes to the camera at a line, (N, 3)."""
+        seconds = self.time(line)
+        to_itrs = self.trajectory.body_to_itrs(seconds)
+        station = self._station(seconds, to_itrs, pixel)
+        source = point
+        if self.effects.refraction or self.effects.light_time:
+            way = np.zeros(len(point))
+            if self.effects.light_time:
+                way = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT
+            left_station = turned_with_earth(station, way)
+            if self.effects.refraction:
+                source = unrefracted(source, left_station, self.earth, self.effects.wavelength)
+            if self.effects.light_time:
+                way = np.linalg.norm(source - left_station, axis=-1) / SPEED_OF_LIGHT
+                source = turned_with_earth(source, -way)
+        direction = source - station
+        direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+        if self.effects.aberration:
+            direction = aberrated(direction, self.trajectory.inertial_velocity(seconds))
+        return np.einsum("nij,ni->nj", to_itrs, direction)
+
+    def _station(self, seconds: np.ndarray, to_itrs: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        return self.trajectory.position(seconds) + np.einsum("nij,nj->ni", to_itrs, self.camera.origin(pixel))
+
+    def _faces(self, point: np.ndarray, line: np.ndarray) -> np.ndarray:
+        """Whether the points see the satellite above their horizon, (N,)."""
+        lon, lat, _ = self.earth.geodetic(point)
+        outward = east_north_up(lon, lat)[:, 2]
+        return np.sum((self.trajectory.position(self.time(line)) - point) * outward, axis=-1) > 0.0
+
+    def _require_inside(self, line: np.ndarray) -> None:
+        if not np.all((line >= -0.5) & (line <= self.lines - 0.5)):
+            raise ValueError(f"a line outside the image, which reaches from -0.5 to {self.lines - 0.5}")

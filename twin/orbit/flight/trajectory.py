@@ -1,0 +1,289 @@
+"""Where a satellite is, how it holds itself, and how both are measured.
+
+The orbital frame has Z down, X forward and Y = Z x X, which lies to the right of the track and against the orbit's
+angular momentum.
+
+Readings come at a fixed interval. What depends on chance is drawn for every reading of the span beforehand and joined
+by a cubic spline, as a user of the data would interpolate them: at a reading the error has the stated deviation,
+halfway between two it is somewhat smaller. Each term draws from a random stream of its own, so that leaving one out
+does not change the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
+
+from optics.geometry.pose import rotation_matrix
+from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
+from twin.orbit.flight.orbit import Orbit
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_spec import AttitudeSpec, ErrorsSpec
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """A law of attitude.
+
+    Attributes:
+        geodetic: Z points along the ellipsoid's normal through the satellite; else to the Earth's centre.
+        yaw_steering: X lies along the motion of the point below over the turning Earth, so that the image of that point
+            moves square to a line along Y; else along the velocity against the stars.
+        offset: rotation vector of the body against the orbital frame, radians.
+    """
+
+    geodetic: bool = True
+    yaw_steering: bool = False
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def from_spec(cls, spec: AttitudeSpec) -> Attitude:
+        """From what the file says."""
+        return cls(spec.nadir == "geodetic", spec.steering == "yaw", spec.offset)
+
+    def orbital_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
+        """Axes of the orbital frame as columns: x_itrs = matrix @ x_orbital.
+
+        Args:
+            position: ITRS, metres, shape (..., 3).
+            velocity: against the turning Earth, m/s, shape (..., 3).
+            inertial_velocity: against the stars, in axes of the ITRS, m/s, shape (..., 3).
+
+        Returns:
+            Shape (..., 3, 3).
+        """
+        chosen = velocity if self.yaw_steering else inertial_velocity
+        if self.geodetic:
+            lon, lat, height = Earth().geodetic(position)
+            level = east_north_up(lon, lat)
+            up = level[..., 2, :]
+            east, north = (np.sum(level[..., k, :] * chosen, axis=-1) for k in (0, 1))
+            if self.yaw_steering:
+                # the point below moves slower than the satellite, and not alike along and across the meridian
+                meridian, normal = curvature_radii(lat)
+                east, north = east * normal / (normal + height), north * meridian / (meridian + height)
+            forward = east[..., None] * level[..., 0, :] + north[..., None] * level[..., 1, :]
+        else:
+            # the point below runs along its own radius as well, which moves it along the line of sight only
+            up = position / np.linalg.norm(position, axis=-1, keepdims=True)
+            forward = chosen - np.sum(chosen * up, axis=-1, keepdims=True) * up
+        x = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+        return np.stack([x, np.cross(-up, x), -up], axis=-1)
+
+    def body_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
+        """Axes of the body as columns, (..., 3, 3): x_itrs = matrix @ x_body; arguments as `orbital_to_itrs`."""
+        return self.orbital_to_itrs(position, velocity, inertial_velocity) @ rotation_matrix(self.offset)
+
+
+TERMS = (
+    "gps_noise",
+    "gps_drift",
+    "gps_velocity",
+    "attitude_noise",
+    "attitude_bias",
+    "attitude_thermal",
+    "attitude_slow",
+)
+"""All that can be switched."""
+
+_SPARE_READINGS = 8
+"""Beyond either end of the span, so that the spline's ends do not matter."""
+
+Series = Callable[[np.ndarray], np.ndarray]
+
+
+def readings(first: float, last: float, interval: float) -> np.ndarray:
+    """Times (K,) of readings, seconds: whole multiples of the interval that cover the span, with some to spare."""
+    begin, end = np.floor(first / interval) - _SPARE_READINGS, np.ceil(last / interval) + _SPARE_READINGS
+    return np.asarray(interval * np.arange(begin, end + 1.0))
+
+
+def _noise(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
+    return CubicSpline(time, sigma * np.random.default_rng(seed).standard_normal((time.size, 3)))
+
+
+def _drift(time: np.ndarray, sigma: np.ndarray, correlation_time: float, seed: np.random.SeedSequence) -> Series:
+    """A stationary first-order Gauss-Markov process: correlation exp(-|dt| / correlation_time), exact at readings."""
+    draws = np.random.default_rng(seed).standard_normal((time.size, 3))
+    kept = np.exp(-(time[1] - time[0]) / correlation_time)
+    draws[1:] *= np.sqrt(1.0 - kept * kept)
+    return CubicSpline(time, sigma * lfilter([1.0], [1.0, -kept], draws, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementErrors:
+    """Errors, measured minus true; made by `draw_errors`.
+
+    Attributes:
+        position_terms: series of position errors in the orbital frame, metres.
+        velocity_terms: series of velocity errors in the orbital frame, m/s.
+        attitude_terms: series of rotation vectors in body axes, radians.
+        bias: constant rotation vector in body axes, radians, shape (3,).
+        thermal: amplitude of what changes with latitude, radians, shape (3,).
+        reference: latitude at which that vanishes, radians.
+    """
+
+    position_terms: tuple[Series, ...]
+    velocity_terms: tuple[Series, ...]
+    attitude_terms: tuple[Series, ...]
+    bias: np.ndarray
+    thermal: np.ndarray
+    reference: float
+
+    def position(self, seconds: np.ndarray) -> np.ndarray:
+        """Position errors along the orbital frame's axes, metres; (...) -> (..., 3)."""
+        return _sum(self.position_terms, seconds)
+
+    def velocity(self, seconds: np.ndarray) -> np.ndarray:
+        """Velocity errors along the orbital frame's axes, m/s; (...) -> (..., 3)."""
+        return _sum(self.velocity_terms, seconds)
+
+    def attitude(self, seconds: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+        """Rotation vectors in body axes, radians: measured = true @ rotation_matrix(vector).
+
+        Args:
+            seconds: shape (...).
+            latitude: geodetic, of the point below, radians, shape (...).
+
+        Returns:
+            Shape (..., 3).
+        """
+        shape = np.sin(np.asarray(latitude) - self.reference)
+        return _sum(self.attitude_terms, seconds) + self.bias + shape[..., None] * self.thermal
+
+
+def draw_errors(
+    spec: ErrorsSpec, first: float, last: float, seed: int, terms: Collection[str] = TERMS
+) -> MeasurementErrors:
+    """Errors over a span of time.
+
+    Args:
+        spec: how large they are.
+        first: begin of the span, seconds.
+        last: its end, seconds.
+        seed: of all random numbers.
+        terms: which of `TERMS` are on; the others are zero.
+
+    Raises:
+        ValueError: an unknown term.
+    """
+    unknown = sorted(set(terms) - set(TERMS))
+    if unknown:
+        raise ValueError(f"no such error: {', '.join(unknown)}; there are {', '.join(TERMS)}")
+    streams = dict(zip(TERMS, np.random.SeedSequence(seed).spawn(len(TERMS)), strict=True))
+    gps, star = spec.gps, spec.star_tracker
+    fixes = readings(first, last, gps.interval)
+    position: list[Series] = []
+    velocity: list[Series] = []
+    attitude: list[Series] = []
+    if "gps_noise" in terms and any(gps.noise):
+        position.append(_noise(fixes, np.array(gps.noise), streams["gps_noise"]))
+    if "gps_drift" in terms and any(gps.drift):
+        position.append(_drift(fixes, np.array(gps.drift), gps.correlation_time, streams["gps_drift"]))
+    if "gps_velocity" in terms and any(gps.velocity):
+        velocity.append(_noise(fixes, np.array(gps.velocity), streams["gps_velocity"]))
+    if "attitude_noise" in terms and any(star.noise):
+        looks = readings(first, last, star.interval)
+        attitude.append(_noise(looks, np.array(star.noise), streams["attitude_noise"]))
+    if "attitude_slow" in terms and any(star.slow.noise):
+        values = readings(first, last, star.slow.interval)
+        attitude.append(_noise(values, np.array(star.slow.noise), streams["attitude_slow"]))
+    return MeasurementErrors(
+        tuple(position),
+        tuple(velocity),
+        tuple(attitude),
+        np.array(star.bias) * ("attitude_bias" in terms),
+        np.array(star.thermal.amplitude) * ("attitude_thermal" in terms),
+        star.thermal.reference,
+    )
+
+
+def _sum(series: tuple[Series, ...], seconds: np.ndarray) -> np.ndarray:
+    t = np.asarray(seconds, dtype=np.float64)
+    return sum((one(t) for one in series), np.zeros((*t.shape, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Position and attitude over the span of an orbit, seconds from its epoch; times have shape (...).
+
+    Every method raises ValueError for a time outside the orbit.
+
+    Attributes:
+        orbit: true orbit.
+        attitude: law that the true attitude follows.
+        errors: of the measured orbit and attitude; None for the truth.
+    """
+
+    orbit: Orbit
+    attitude: Attitude = field(default_factory=Attitude)
+    errors: MeasurementErrors | None = None
+
+    @property
+    def first(self) -> float:
+        """Begin of the span, seconds."""
+        return self.orbit.first
+
+    @property
+    def last(self) -> float:
+        """End of the span, seconds."""
+        return self.orbit.last
+
+    def position(self, seconds: Any) -> np.ndarray:
+        """Position in the ITRS, metres; (...) -> (..., 3)."""
+        return self._motion(seconds)[0]
+
+    def velocity(self, seconds: Any) -> np.ndarray:
+        """Velocity against the turning Earth in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        return self._motion(seconds)[1]
+
+    def inertial_velocity(self, seconds: Any) -> np.ndarray:
+        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        return self._motion(seconds)[2]
+
+    def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
+        """True axes of the orbital frame as columns, (...) -> (..., 3, 3)."""
+        return self.attitude.orbital_to_itrs(*self.orbit.itrs(seconds))
+
+    def body_to_itrs(self, seconds: Any) -> np.ndarray:
+        """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        true = self.orbit.itrs(seconds)
+        body = self.attitude.body_to_itrs(*true)
+        if self.errors is None:
+            return body
+        latitude = self.orbit.earth.geodetic(true[0])[1]
+        return body @ rotation_matrix(self.errors.attitude(seconds, latitude))
+
+    def with_errors(self, spec: ErrorsSpec, seed: int, terms: Collection[str] = TERMS) -> Trajectory:
+        """The trajectory as the satellite measures it: this one with errors, in place of those it may have.
+
+        Args:
+            spec: how large the errors are.
+            seed: of all random numbers.
+            terms: which errors are on, of `twin.orbit.flight.trajectory.TERMS`.
+
+        Raises:
+            ValueError: an unknown term.
+        """
+        return replace(self, errors=draw_errors(spec, self.first, self.last, seed, terms))
+
+    def without_errors(self) -> Trajectory:
+        """The truth."""
+        return replace(self, errors=None)
+
+    def _motion(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        position, velocity, inertial = self.orbit.itrs(seconds)
+        if self.errors is None:
+            return position, velocity, inertial
+        axes = self.attitude.orbital_to_itrs(position, velocity, inertial)
+        place, speed = (
+            np.einsum("...ij,...j->...i", axes, error(seconds))
+            for error in (self.errors.position, self.errors.velocity)
+        )
+        return position + place, velocity + speed, inertial + speed

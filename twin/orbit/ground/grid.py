@@ -1,0 +1,224 @@
+"""The ground's frame, random fields on a grid and splines through it.
+
+East and north are longitude and latitude times constant lengths, those of the ellipsoid at the patch's middle. The way
+to longitude, latitude and height and back is thus exact wherever one is; only the lengths are not quite true away from
+the middle (at 40 degrees of latitude an east metre is 1.3e-4 wrong 1 km to the north). Heights are above the ellipsoid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import map_coordinates
+from scipy.sparse import csr_array
+
+from optics.numerics.threads import cores
+from twin.orbit.flight.earth import Earth, curvature_radii
+
+_EARTH = Earth()
+"""Only the ellipsoid is used."""
+
+
+@dataclass(frozen=True)
+class GroundFrame:
+    """Coordinates about a place.
+
+    Attributes:
+        longitude, latitude: of the place, geodetic, radians.
+    """
+
+    longitude: float
+    latitude: float
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Metres east per radian of longitude, and metres north per radian of latitude."""
+        meridian, normal = curvature_radii(self.latitude)
+        return float(normal * np.cos(self.latitude)), float(meridian)
+
+    def itrs(self, east: Any, north: Any, height: Any) -> np.ndarray:
+        """Points in the ITRS: coordinates (...), metres -> (..., 3), metres."""
+        per_longitude, per_latitude = self.scale
+        longitude = self.longitude + np.asarray(east, dtype=np.float64) / per_longitude
+        return _EARTH.ecef(longitude, self.latitude + np.asarray(north, dtype=np.float64) / per_latitude, height)
+
+    def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """East, north and height, metres, (...) each, of points (..., 3) in the ITRS; NaN stays NaN."""
+        longitude, latitude, height = _EARTH.geodetic(points)
+        per_longitude, per_latitude = self.scale
+        turn = (longitude - self.longitude + np.pi) % (2.0 * np.pi) - np.pi
+        return turn * per_longitude, (latitude - self.latitude) * per_latitude, height
+
+
+_CORRELATION_MARGIN = 4.0
+"""Correlation lengths by which a correlated field is drawn larger, so that opposite edges are independent."""
+
+
+def stream(seed: np.random.SeedSequence, number: int) -> np.random.SeedSequence:
+    """A random stream of a seed, by number; unlike ``spawn`` it leaves the seed as it is and can be repeated."""
+    return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number), pool_size=seed.pool_size)
+
+
+def fractal_field(
+    shape: tuple[int, int], spacing: float, exponent: float, longest: float, seed: np.random.SeedSequence
+) -> np.ndarray:
+    """A field of zero mean and unit rms whose amplitude spectrum falls like frequency^-exponent.
+
+    Args:
+        shape: rows and columns.
+        spacing: of the grid, metres.
+        exponent: for a surface of fractal dimension D it is 4 - D, between 1 and 2; mountains have about 2.
+        longest: wavelength above which the spectrum stays level, metres.
+        seed: of the noise.
+
+    Returns:
+        float32, of the shape.
+    """
+    spectrum = _white_spectrum(shape, seed)
+    along = fft.rfftfreq(shape[1], spacing) ** 2 + longest**-2.0
+    for row, across in enumerate(fft.fftfreq(shape[0], spacing)):
+        spectrum[row] *= ((along + across**2) ** (-0.5 * exponent)).astype(np.float32)
+    field = np.asarray(fft.irfft2(spectrum, s=shape, workers=cores(), overwrite_x=True))
+    field -= field.mean()
+    field /= np.sqrt(np.mean(np.square(field), dtype=np.float64))
+    return field
+
+
+def correlated_field(shape: tuple[int, int], spacing: float, length: float, seed: np.random.SeedSequence) -> np.ndarray:
+    """A field whose values have zero expectation, unit standard deviation and correlation exp(-(distance/length)^2/2).
+
+    Args:
+        shape: rows and columns.
+        spacing: of the grid, metres.
+        length: of the correlation, metres.
+        seed: of the noise.
+
+    Returns:
+        float32, of the shape.
+    """
+    spare = int(np.ceil(_CORRELATION_MARGIN * length / spacing))
+    larger = (fft.next_fast_len(shape[0] + spare, True), fft.next_fast_len(shape[1] + spare, True))
+    rows, columns = (_root_of_covariance(count, spacing / length) for count in larger)
+    spectrum = _white_spectrum(larger, seed)
+    spectrum *= rows[:, None]
+    spectrum *= columns[: spectrum.shape[1]]
+    return np.asarray(fft.irfft2(spectrum, s=larger, workers=cores(), overwrite_x=True))[: shape[0], : shape[1]]
+
+
+def _root_of_covariance(count: int, step: float) -> np.ndarray:
+    """Square root of the transform of the covariance along one axis, whose grid closes to a ring, (count,)."""
+    distance = step * np.minimum(np.arange(count), count - np.arange(count))
+    # the covariance of a ring is not quite positive: what is below zero is rounding
+    return np.sqrt(np.maximum(fft.fft(np.exp(-0.5 * distance**2)).real, 0.0)).astype(np.float32)
+
+
+def _white_spectrum(shape: tuple[int, int], seed: np.random.SeedSequence) -> np.ndarray:
+    noise = np.random.Generator(np.random.SFC64(seed)).standard_normal(shape, dtype=np.float32)
+    return np.asarray(fft.rfft2(noise, workers=cores()))
+
+
+Beyond = Literal["mirror", "grid-wrap", "nothing"]
+
+
+@dataclass(frozen=True, eq=False)
+class SplineGrid:
+    """A cubic B-spline over a grid.
+
+    Attributes:
+        coefficients: weights of the B-splines, (rows, columns); rows go north, columns east.
+        spacing: of the grid east and north, metres.
+        first: east and north of the first row's first column, metres.
+        beyond: how it goes on outside: mirrored about the outer rows and columns, repeated, or not at all.
+    """
+
+    coefficients: np.ndarray
+    spacing: tuple[float, float]
+    first: tuple[float, float]
+    beyond: Beyond = "nothing"
+
+    @property
+    def reach(self) -> tuple[float, float, float, float]:
+        """West, east, south and north end of where it is known, metres, if nothing is beyond."""
+        (rows, columns), (east, north) = self.coefficients.shape, self.first
+        # a place needs one B-spline before its cell and two after
+        return (
+            east + self.spacing[0],
+            east + (columns - 2) * self.spacing[0],
+            north + self.spacing[1],
+            north + (rows - 2) * self.spacing[1],
+        )
+
+    def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
+        """Values at places, metres, any equal shapes.
+
+        Raises:
+            ValueError: a place outside, where nothing is.
+        """
+        if self.beyond == "nothing":
+            self._require_inside(east, north)
+        row = (north - self.first[1]) / self.spacing[1]
+        column = (east - self.first[0]) / self.spacing[0]
+        mode = "nearest" if self.beyond == "nothing" else self.beyond
+        return np.asarray(
+            map_coordinates(self.coefficients, [row, column], order=3, prefilter=False, mode=mode, output=np.float64)
+        )
+
+    def on_grid(self, east: np.ndarray, north: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
+        """Values, or first derivatives, on a regular grid: east (E,) and north (N,), metres -> (N, E).
+
+        Args:
+            east: of the columns.
+            north: of the rows.
+            derivative: how often by east and by north, 0 or 1.
+
+        Raises:
+            ValueError: a place outside, where nothing is.
+        """
+        if self.beyond == "nothing":
+            self._require_inside(east, north)
+        rows, columns = self.coefficients.shape
+        along = (
+            self._weights((east - self.first[0]) / self.spacing[0], columns, derivative[0])
+            / self.spacing[0] ** derivative[0]
+        )
+        across = (
+            self._weights((north - self.first[1]) / self.spacing[1], rows, derivative[1])
+            / self.spacing[1] ** derivative[1]
+        )
+        return np.asarray((along @ (across @ self.coefficients).T).T)
+
+    def _weights(self, place: np.ndarray, count: int, derivative: int) -> csr_array:
+        """Matrix from the coefficients along one axis to values at places in cells, (places, count)."""
+        cell = np.floor(place).astype(np.intp)
+        t = (place - cell)[:, None]
+        if derivative:
+            weight = np.hstack([-0.5 * (1.0 - t) ** 2, 1.5 * t**2 - 2.0 * t, 0.5 + t - 1.5 * t**2, 0.5 * t**2])
+        else:
+            s = 1.0 - t
+            parts = [s**3 / 6.0, 2.0 / 3.0 - t**2 + 0.5 * t**3, 2.0 / 3.0 - s**2 + 0.5 * s**3, t**3 / 6.0]
+            weight = np.hstack(parts)
+        column = cell[:, None] + np.arange(-1, 3)
+        if self.beyond == "grid-wrap":
+            column %= count
+        else:
+            column %= 2 * (count - 1)
+            column = np.minimum(column, 2 * (count - 1) - column)
+        row = np.repeat(np.arange(len(place)), 4)
+        return csr_array((weight.ravel(), (row, column.ravel())), shape=(len(place), count))
+
+    def _require_inside(self, east: np.ndarray, north: np.ndarray) -> None:
+        west_end, east_end, south_end, north_end = self.reach
+        if not (
+            np.min(east) >= west_end
+            and np.max(east) <= east_end
+            and np.min(north) >= south_end
+            and np.max(north) <= north_end
+        ):
+            raise ValueError(
+                f"ground beyond what is known: east {np.min(east):.0f} to {np.max(east):.0f} m, north "
+                f"{np.min(north):.0f} to {np.max(north):.0f} m; it reaches from {west_end:.0f} to {east_end:.0f} m and "
+                f"from {south_end:.0f} to {north_end:.0f} m"
+            )

@@ -1,0 +1,480 @@
+"""Points measured in the images of a patch by matching.
+
+A template's samples are the pixels about the predicted place of its point, which is not a whole pixel. Each sample is
+followed by the measured sensor to the reference heights: over so few pixels the way to the ground is affine in row and
+column and linear in height, to a millimetre. What the measured sensor is wrong by moves the whole template and is left
+to the search.
+
+Control and check points are distinct places of the orthophoto with the reference height; tie points are distinct places
+of the nadir line's frame. Their templates are brought into each line's geometry
+(`twin.orbit.images.image_points`), matched (`analysis.matching`), and what does not follow one smooth displacement
+per patch and line is rejected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter, zoom
+
+from analysis.matching.consensus import DisplacementField, consensus
+from analysis.matching.correlation import distinct_points
+from analysis.matching.matches import MatchOptions, match
+from analysis.matching.options import Reason
+from analysis.matching.spline import resampled
+from optics.numerics.frozen_map import FrozenMap
+from twin.orbit.ground.grid import GroundFrame
+from twin.orbit.ground.orthophoto import Raster
+from twin.orbit.images.patch import LineImage, Patch
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_scene import ImagePointsSpec
+
+
+SOFTENING = 0.4
+"""Rms of the Gaussian low pass of an orthophoto over the distance of the image's pixels: what pixel, lens and motion of
+the line add to an orthophoto that is sharp itself. What is left the matching solves for."""
+_STEP = 50.0
+"""Metres of height over which the way to the ground is taken as straight."""
+_FOLLOWED = 8
+"""Turns of looking up the height; each makes the error smaller by the terrain's slope times the look's, 0.2 or less."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceHeights:
+    """Heights of a reference elevation model, a cubic spline through its posts.
+
+    Attributes:
+        raster: of the posts.
+        coefficients: of the spline.
+    """
+
+    raster: Raster
+    coefficients: np.ndarray
+
+    @classmethod
+    def of(cls, dem: Raster) -> ReferenceHeights:
+        """Through a raster of heights, metres."""
+        return cls(dem, spline_filter(dem.values.astype(np.float64), order=3, mode="mirror"))
+
+    def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
+        """Heights at places, metres; NaN beyond the posts."""
+        place = np.stack(self.raster.row_column(east, north))
+        found = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
+        last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
+        return np.asarray(np.where(np.all((place >= 0.0) & (place <= last), axis=0), found, np.nan))
+
+
+def predicted(image: LineImage, points: np.ndarray) -> np.ndarray:
+    """Row and column (n, 2) of the frame at which the measured sensor has points (n, 3), ITRS; NaN beyond its image."""
+    line, pixel = image.measured.image(points)
+    return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
+
+
+def fits(image: LineImage, place: np.ndarray, border: float) -> np.ndarray:
+    """Which places (..., 2) lie in a frame, so far from its border; not a place that is NaN."""
+    last = np.array(image.frame.shape) - 1.0 - border
+    return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
+
+
+def ground_of_samples(
+    image: LineImage, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """East, north and height (n, side, side) each, metres, of what the pixels about places see.
+
+    Args:
+        image: whose pixels; its measured sensor is used.
+        frame: coordinates of the ground.
+        heights: of the ground.
+        points: (n, 3) ITRS, metres, that the measured sensor has at the places: their height is kept, and the
+            reference heights count against theirs at the points.
+        place: (n, 2) rows and columns of the frame.
+        side: of a template, pixels.
+    """
+    east, north, height = (v[:, None, None] for v in frame.local(points))
+    half = side // 2
+    row, column = image.image_point(place[:, 0], place[:, 1])
+    offsets = [(-half, 0, 0.0), (half, 0, 0.0), (0, -half, 0.0), (0, half, 0.0), (0, 0, _STEP)]
+    known = image.measured
+    ends = []
+    for down, across, up in offsets:
+        seen = known.ground(row + down, column + across, height[:, 0, 0] + up)
+        ends.append(np.stack(frame.local(seen)[:2]))
+    centre = np.stack([east, north])[:, :, 0, 0]
+    by_row, by_column = ((ends[k + 1] - ends[k]) / (2.0 * half) for k in (0, 2))
+    by_height = (ends[4] - centre) / _STEP
+    grid = np.arange(-half, half + 1.0)
+    level = centre[..., None, None] + by_row[..., None, None] * grid[:, None] + by_column[..., None, None] * grid
+    above: np.ndarray = np.zeros(level.shape[1:])
+    for _ in range(_FOLLOWED):
+        e, n = level + by_height[..., None, None] * above
+        above = heights(e, n) - height
+    e, n = level + by_height[..., None, None] * above
+    return e, n, height + above
+
+
+def templates_of_map(photo: Raster, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
+    """Templates (n, k, k) from an orthophoto; sample: distance of the image's pixels on the ground, metres."""
+    rows, columns = photo.row_column(samples[0], samples[1])
+    return resampled(photo.values, rows, columns, smoothing=SOFTENING * sample / photo.spacing)
+
+
+def templates_of_image(
+    source: LineImage,
+    frame: GroundFrame,
+    samples: tuple[np.ndarray, np.ndarray, np.ndarray],
+    points: np.ndarray,
+    place: np.ndarray,
+) -> np.ndarray:
+    """Templates (n, k, k) from another image.
+
+    Args:
+        source: the other image.
+        frame: coordinates of the ground.
+        samples: of the ground, as `ground_of_samples` has them.
+        points: (n, 3) ITRS, metres, of the templates' middles.
+        place: (n, 2) where the source has them, row and column.
+    """
+    centre = np.stack(frame.local(points))
+    base = predicted(source, points)
+    at = np.broadcast_to(place.T[:, :, None, None], (2, *samples[0].shape))
+    for k, sample in enumerate(samples):
+        moved = centre.copy()
+        moved[k] += _STEP
+        slope = (predicted(source, frame.itrs(*moved)) - base) / _STEP
+        at = at + slope.T[:, :, None, None] * (sample - centre[k][:, None, None])
+    return resampled(source.frame, at[0], at[1])
+
+
+CONSENSUS = 100
+"""Status of a match that its neighbours contradict; others are codes of `analysis.matching.options.Reason`."""
+SOURCE = 101
+"""Status of a tie point in the frame it was chosen in: nothing was matched, its place is its definition."""
+_MASK = 16
+"""Pixels of an orthophoto between places at which is asked whether every line sees it."""
+_GROUND_TURNS = 12
+_RISE = 10.0
+"""Metres over which the displacement by height is taken as linear."""
+Kind = Literal["map", "tie"]
+
+
+POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
+"""For a PointsError."""
+
+
+class PointsError(ValueError):
+    """Points that cannot be measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedLine:
+    """What one line's frame gave.
+
+    Attributes:
+        predicted: (n, 2) row and column in the frame at which the measured sensor has the points.
+        place: (n, 2) row and column found; NaN where matching gave none.
+        covariance: (n, 2, 2) px^2.
+        correlation: (n,) of image and fitted template.
+        status: (n,) 0 accepted, `CONSENSUS`, `SOURCE`, or why it was not matched.
+        first: line and pixel of the frame's first pixel in the whole image.
+        scatter: px; of the displacements about the smooth one beyond the covariances.
+        text: of the consensus.
+        way: smooth displacement from predicted to found; None in the frame that ties were chosen in.
+    """
+
+    predicted: np.ndarray
+    place: np.ndarray
+    covariance: np.ndarray
+    correlation: np.ndarray
+    status: np.ndarray
+    first: tuple[int, int]
+    scatter: float
+    text: str
+    way: DisplacementField | None = None
+
+    @property
+    def accepted(self) -> np.ndarray:
+        """(n,) bool: matched and not contradicted, or the place by definition."""
+        return np.asarray((self.status == 0) | (self.status == SOURCE))
+
+    @property
+    def matched(self) -> np.ndarray:
+        """(n,) bool: accepted by matching, whatever the neighbours say."""
+        return np.asarray((self.status == 0) | (self.status == CONSENSUS))
+
+    @property
+    def image(self) -> np.ndarray:
+        """(n, 2) line and pixel of the whole image."""
+        return self.place + np.array(self.first)
+
+    def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """(n, 2) from predicted to found, as its matches say, at places (n, 2) and heights (n,), metres."""
+        if self.way is None:
+            return np.zeros_like(place)
+        return self.way(place, None if self.way.heights is None else height)
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedPoints:
+    """Points and where the lines have them.
+
+    Attributes:
+        kind: places of the orthophoto, or ties.
+        east, north, height: (n,) of the map, metres; of ties where the nadir line's measured sensor meets the
+            reference heights.
+        ground: (n, 3) the same, ITRS, metres.
+        check: (n,) bool: kept apart to test with.
+        lines: name -> what its frame gave.
+    """
+
+    kind: Kind
+    east: np.ndarray
+    north: np.ndarray
+    height: np.ndarray
+    ground: np.ndarray
+    check: np.ndarray
+    lines: Mapping[str, MatchedLine]
+
+    @property
+    def source(self) -> str | None:
+        """The line whose frame ties were chosen in."""
+        return next((name for name, line in self.lines.items() if line.way is None), None)
+
+    @property
+    def in_all(self) -> np.ndarray:
+        """(n,) bool: accepted in every line."""
+        return np.all([line.accepted for line in self.lines.values()], axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class PatchPoints:
+    """All points measured in a patch; None where none were asked for."""
+
+    control: MatchedPoints | None
+    ties: MatchedPoints | None
+
+    @property
+    def sorts(self) -> Mapping[str, MatchedPoints]:
+        """``control`` (with the check points) and ``tie``, those that there are."""
+        both = {"control": self.control, "tie": self.ties}
+        return {name: points for name, points in both.items() if points is not None}
+
+
+def measure_points(patch: Patch, spec: ImagePointsSpec) -> PatchPoints:
+    """Control, check and tie points.
+
+    Raises:
+        PointsError: too little room, nothing distinct, too few matches.
+    """
+    if spec.tie and len(patch.images) < 2:
+        raise PointsError("tie points need two lines")
+    control = map_points(patch, spec) if spec.control + spec.check else None
+    source = "nadir" if "nadir" in patch.images else next(iter(patch.images))
+    return PatchPoints(control, tie_points(patch, spec, control, source) if spec.tie else None)
+
+
+def status_text(code: int) -> str:
+    """A status in words."""
+    extra = {CONSENSUS: "its neighbours contradict it", SOURCE: "chosen here"}
+    return extra.get(code) or Reason(code).text
+
+
+def map_points(patch: Patch, spec: ImagePointsSpec) -> MatchedPoints:
+    """Control and check points.
+
+    Raises:
+        PointsError: a frame too small for template and reach, nothing distinct that every line sees, too few matches.
+    """
+    border = spec.template // 2 + spec.reach
+    _require_room(patch, spec)
+    heights = ReferenceHeights.of(patch.control.dem)
+    wanted = spec.control + spec.check
+    east, north = _distinct_map(patch, heights, wanted, border, spec)
+    height = heights(east, north)
+    ground = patch.frame.itrs(east, north, height)
+    lines = {}
+    for name, image in patch.images.items():
+        at = predicted(image, ground)
+        samples = ground_of_samples(image, patch.frame, heights, ground, at, spec.template)
+        patterns = templates_of_map(patch.control.orthophoto, samples, float(np.mean(image.sample)))
+        lines[name] = _matched(name, image, patterns, at, _rise(patch, image, ground, at), height, spec)
+    which = np.arange(len(east))
+    share = spec.check / max(wanted, 1)
+    # spread evenly over the strength of the points
+    check = np.floor((which + 1) * share + 1e-9) > np.floor(which * share + 1e-9)
+    return MatchedPoints("map", east, north, height, ground, check, FrozenMap(lines))
+
+
+def tie_points(
+    patch: Patch, spec: ImagePointsSpec, control: MatchedPoints | None = None, source: str = "nadir"
+) -> MatchedPoints:
+    """Points of one line's frame, sought in the others.
+
+    Args:
+        patch: images and what is known of the ground.
+        spec: how many, and how they are matched.
+        control: of the patch; where they have lain is taken out of the prediction. Without them the heights of the
+            reference are read where the measured sensor looks, some 100 m off.
+        source: the line they are chosen in.
+
+    Raises:
+        PointsError: as `map_points`.
+    """
+    border = spec.template // 2 + spec.reach
+    _require_room(patch, spec)
+    heights = ReferenceHeights.of(patch.control.dem)
+    image = patch.images[source]
+    place = distinct_points(image.frame, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
+    ground = _followed(patch, image, heights, place, control.lines[source] if control else None)
+    seen = [fits(other, predicted(other, ground), border) for other in patch.images.values() if other is not image]
+    good = np.all([np.isfinite(ground).all(axis=1), *seen], axis=0)
+    place, ground = place[good], ground[good]
+    if not len(place):
+        raise PointsError(f"{source}: no distinct point is seen by every line {border} pixels from the frames' borders")
+    east, north, height = patch.frame.local(ground)
+    none = np.zeros(len(place))
+    lines = {
+        source: MatchedLine(
+            place,
+            place,
+            np.zeros((len(place), 2, 2)),
+            none + 1.0,
+            np.full(len(place), SOURCE),
+            (image.window.first_line, image.window.first_pixel),
+            0.0,
+            f"{len(place)} points chosen",
+        )
+    }
+    for name, other in patch.images.items():
+        if name == source:
+            continue
+        at = predicted(other, ground)
+        samples = ground_of_samples(other, patch.frame, heights, ground, at, spec.template)
+        patterns = templates_of_image(image, patch.frame, samples, ground, place)
+        rise = _rise(patch, other, ground, at)
+        if control:
+            at = at + control.lines[name].displacement(at, height)
+        lines[name] = _matched(name, other, patterns, at, rise, height, spec)
+    ordered = {name: lines[name] for name in patch.images}
+    return MatchedPoints("tie", east, north, height, ground, none.astype(bool), FrozenMap(ordered))
+
+
+def _require_room(patch: Patch, spec: ImagePointsSpec) -> None:
+    least = 2 * (spec.template // 2 + spec.reach) + 1
+    for name, image in patch.images.items():
+        if min(image.frame.shape) <= least:
+            size = " x ".join(str(n) for n in image.frame.shape)
+            raise PointsError(
+                f"the image of {name}, {size} pixels, has no room for a template of {spec.template} pixels that is "
+                f"sought {spec.reach} pixels to each side; that takes more than {least}"
+            )
+
+
+def _distinct_map(
+    patch: Patch, heights: ReferenceHeights, count: int, border: int, spec: ImagePointsSpec
+) -> tuple[np.ndarray, np.ndarray]:
+    """East and north of distinct places of the orthophoto that every line sees within its border."""
+    photo = patch.control.orthophoto
+    sides = [np.arange(0, n, _MASK) for n in photo.values.shape]
+    row, column = np.meshgrid(*sides, indexing="ij")
+    east, north = photo.east_north(row.ravel(), column.ravel())
+    ground = patch.frame.itrs(east, north, heights(east, north))
+    seen = np.all([fits(im, predicted(im, ground), border) for im in patch.images.values()], axis=0).reshape(row.shape)
+    if not seen.any():
+        raise PointsError(f"no place of the orthophoto is seen by every line {border} pixels from the frames' borders")
+    scale = float(np.mean([np.mean(im.sample) for im in patch.images.values()])) / photo.spacing
+    (top, bottom), (left, right) = ((int(v.min()), int(v.max())) for v in np.nonzero(seen))
+    inside = seen[top : bottom + 1, left : right + 1]
+    cut = tuple(slice(a * _MASK, b * _MASK + 1) for a, b in ((top, bottom), (left, right)))
+    grey = gaussian_filter(photo.values[cut].astype(np.float32), SOFTENING * scale)
+    shape = [s / t for s, t in zip(grey.shape, inside.shape, strict=True)]
+    mask = zoom(inside, shape, order=0, grid_mode=True, mode="nearest")
+    grey[~mask] = np.nan
+    share = max(float(mask.mean()), 0.05)
+    place = distinct_points(grey, int(np.ceil(count / share)), spacing=max(0.5 * spec.template * scale, 1.0), border=0)
+    if not len(place):
+        raise PointsError("the orthophoto has no distinct places where every line sees it")
+    found_east, found_north = photo.east_north(place[:, 0] + top * _MASK, place[:, 1] + left * _MASK)
+    ground = patch.frame.itrs(found_east, found_north, heights(found_east, found_north))
+    good = np.all([fits(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
+    return found_east[good][:count], found_north[good][:count]
+
+
+def _followed(
+    patch: Patch, image: LineImage, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
+) -> np.ndarray:
+    """Where the measured sensor's looks meet the reference heights, ITRS, (n, 3), metres; NaN beyond them.
+
+    known: matches that tell where the measured sensor has what the frame has at a place.
+    """
+    height = np.full(len(place), float(np.mean(heights.raster.values)))
+    at = place
+    for _ in range(_GROUND_TURNS):
+        if known is not None:
+            at = place - known.displacement(at, height)
+        points = image.measured.ground(*image.image_point(at[:, 0], at[:, 1]), height)
+        found = heights(*patch.frame.local(points)[:2])
+        height = np.where(np.isfinite(found), found, height)
+    points[~np.isfinite(found)] = np.nan
+    return np.asarray(points)
+
+
+def _rise(patch: Patch, image: LineImage, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(n, 2) lines and pixels by which points that lie a metre higher have their image displaced."""
+    east, north, height = patch.frame.local(ground)
+    return (predicted(image, patch.frame.itrs(east, north, height + _RISE)) - at) / _RISE
+
+
+def _matched(
+    name: str,
+    image: LineImage,
+    patterns: np.ndarray,
+    at: np.ndarray,
+    rise: np.ndarray,
+    height: np.ndarray,
+    spec: ImagePointsSpec,
+) -> MatchedLine:
+    options = MatchOptions(least_correlation=spec.least_correlation, largest_sigma=spec.largest_sigma)
+    found = match(image.frame, patterns, at, reach=spec.reach, options=options)
+    status = found.reason.astype(np.int64)
+    good = found.accepted
+    degree = _degree(int(good.sum()))
+    if degree is None:
+        raise PointsError(f"{name}: too few matches to tell right from wrong: {found.text}")
+    place = np.where(good[:, None], found.place, np.nan)
+    agreed = consensus(
+        at,
+        place,
+        # neither wrong reference heights nor an attitude that swings make a wrong match
+        covariance=found.covariance
+        + spec.height_sigma**2 * rise[:, :, None] * rise[:, None, :]
+        + spec.roughness**2 * np.eye(2),
+        height=height if np.ptp(height[good]) > 1.0 else None,
+        degree=degree,
+        false_alarm=spec.false_alarm,
+    )
+    if not agreed.accepted.any():
+        raise PointsError(f"{name}: {agreed.text}; {found.text}")
+    status[good & ~agreed.accepted] = CONSENSUS
+    return MatchedLine(
+        at,
+        found.place,
+        found.covariance,
+        found.correlation,
+        status,
+        (image.window.first_line, image.window.first_pixel),
+        agreed.scatter,
+        agreed.text,
+        agreed.field,
+    )
+
+
+def _degree(count: int) -> int | None:
+    """Of the smooth displacement for so many matches: four a term with the term for height; None for too few."""
+    for degree, terms in ((2, 7), (1, 4), (0, 2)):
+        if count >= 4 * terms:
+            return degree
+    return None

@@ -1,0 +1,337 @@
+"""Points measured in images as data, tables and figures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
+
+from scenes.specs.orbit_scene import ImagePointsSpec
+from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints, PatchPoints, status_text
+from twin.orbit.images.patch import LineImage, Patch
+from twin.orbit.images.point_judgement import (
+    WRONG_FLOOR,
+    WRONG_PIXELS,
+    WRONG_SIGMAS,
+    LineJudgement,
+    judged,
+    true_ground,
+)
+from twin.run.artefact import Cell, Data, PngFigure, Table
+from twin.run.data_files import csv_table
+from twin.run.result import Section
+from twin.run.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
+
+
+def pixel_axes(axes: Axes) -> None:
+    """Name the axes of a shown image, and label them sparsely with whole numbers of pixels and lines.
+
+    Limits must be set before.
+    """
+    axes.set(xlabel="pixel", ylabel="line")
+    axes.ticklabel_format(useOffset=False)
+    axes.locator_params(axis="x", nbins=4)
+    axes.locator_params(axis="y", nbins=6)
+    axes.tick_params(axis="y", labelrotation=90)
+    for label in axes.get_yticklabels():
+        label.set_verticalalignment("center")
+
+
+HEADS = (
+    "sort",
+    "point",
+    "line_name",
+    "longitude_deg",
+    "latitude_deg",
+    "height_m",
+    "x_itrs_m",
+    "y_itrs_m",
+    "z_itrs_m",
+    "predicted_line",
+    "predicted_pixel",
+    "line",
+    "pixel",
+    "sigma_line_px",
+    "sigma_pixel_px",
+    "correlation_of_sigmas",
+    "template_correlation",
+    "accepted",
+    "status",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PointListing(Data):
+    """Rows under `HEADS`, kept as CSV and named in the report."""
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "csv"
+
+    def content(self) -> bytes:
+        """The rows with all their digits; what there is not is empty."""
+        return csv_table([HEADS, *self.data])
+
+
+def listing(patch: Patch, points: PatchPoints) -> list[list[Any]]:
+    """A row for each point and line."""
+    rows: list[list[Any]] = []
+    for sort, one in points.sorts.items():
+        degrees = _degrees(patch, one)
+        for name, line in one.lines.items():
+            image, expected = line.image, line.predicted + np.array(line.first)
+            sigma = np.sqrt(np.diagonal(line.covariance, axis1=1, axis2=2))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                together = line.covariance[:, 0, 1] / np.prod(sigma, axis=1)
+            for k in range(len(one.ground)):
+                kind = "check" if one.check[k] else sort
+                numbers = (*expected[k], *image[k], *sigma[k], together[k], line.correlation[k])
+                shown = [float(v) if np.isfinite(v) else None for v in numbers]
+                code = int(line.status[k])
+                ground = [*map(float, degrees[k]), *map(float, one.ground[k])]
+                rows.append([kind, k, name, *ground, *shown, int(line.accepted[k]), status_text(code)])
+    return rows
+
+
+def points_data(points: PatchPoints) -> dict[str, Any]:
+    """What the user knows, by sort and line."""
+    out: dict[str, Any] = {}
+    for sort, one in points.sorts.items():
+        lines = {name: _line(line) for name, line in one.lines.items() if name != one.source}
+        out[sort] = {"sought": len(one.ground), "in_all_lines": int(one.in_all.sum()), "lines": lines}
+    return out
+
+
+def points_truth(patch: Patch, points: PatchPoints) -> dict[str, Any]:
+    """What only the truth knows, by sort and line."""
+    out: dict[str, Any] = {}
+    for sort, one in points.sorts.items():
+        lines = {name: _judged(line) for name, line in judged(patch, one).items()}
+        out[sort] = {"itrs_m": true_ground(patch, one).tolist(), "lines": lines}
+    return out
+
+
+def reasons(line: MatchedLine) -> Mapping[str, int]:
+    """Why points were not accepted, the most frequent first."""
+    count = Counter(int(code) for code in line.status[~line.accepted])
+    return {status_text(code): number for code, number in count.most_common()}
+
+
+def median_way(line: MatchedLine) -> np.ndarray:
+    """(2,) from predicted to found, median of the accepted, lines and pixels."""
+    return np.asarray(np.median((line.place - line.predicted)[line.accepted], axis=0))
+
+
+def median_sigma(line: MatchedLine) -> np.ndarray:
+    """(2,) of lines and pixels, median of the accepted."""
+    return np.asarray(np.median(np.sqrt(np.diagonal(line.covariance[line.accepted], axis1=1, axis2=2)), axis=0))
+
+
+def _line(line: MatchedLine) -> dict[str, Any]:
+    way, sigma = median_way(line), median_sigma(line)
+    return {
+        "found": int(np.isfinite(line.place[:, 0]).sum()),
+        "matched": int(line.matched.sum()),
+        "accepted": int(line.accepted.sum()),
+        "rejected_by_consensus": int((line.status == CONSENSUS).sum()),
+        "not_accepted": dict(reasons(line)),
+        "displacement_lines_px": float(way[0]),
+        "displacement_pixels_px": float(way[1]),
+        "sigma_lines_px": float(sigma[0]),
+        "sigma_pixels_px": float(sigma[1]),
+        "consensus_scatter_px": line.scatter,
+    }
+
+
+def _judged(one: LineJudgement) -> dict[str, Any]:
+    error = [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
+    return {
+        "found": one.found,
+        "matched": one.matched,
+        "accepted": one.accepted,
+        "wrong_found": one.wrong_found,
+        "wrong_matched": one.wrong_matched,
+        "wrong_accepted": one.wrong_accepted,
+        "right_rejected_by_consensus": one.good_lost,
+        "rms_lines_px": float(one.rms[0]),
+        "rms_pixels_px": float(one.rms[1]),
+        "mean_lines_px": float(one.mean[0]),
+        "mean_pixels_px": float(one.mean[1]),
+        "chi_square": one.chi_square,
+        "degrees_of_freedom": one.degrees_of_freedom,
+        "error_px": error,
+    }
+
+
+def _degrees(patch: Patch, points: MatchedPoints) -> np.ndarray:
+    """Longitude and latitude, degrees, and height, metres, (n, 3)."""
+    per_longitude, per_latitude = patch.frame.scale
+    longitude = np.degrees(patch.frame.longitude + points.east / per_longitude)
+    latitude = np.degrees(patch.frame.latitude + points.north / per_latitude)
+    return np.column_stack([longitude, latitude, points.height])
+
+
+_DPI = 110
+_NAMES = {"control": "orthophoto", "tie": "tie"}
+
+
+def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> Section:
+    """Numbers, figure and listing of a patch's points."""
+    text = [
+        f"Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
+        f"image are brought into each line's geometry by the measured sensor, templates of {spec.template} pixels, "
+        f"sought {spec.reach} pixels to each side of where it expects them, and fitted by least squares. Rejected is "
+        "what fails a threshold of the matching, and what does not follow the smooth displacement of its neighbours. "
+        "Where orthophoto points have lain is taken into the prediction of tie points.",
+    ]
+    if points.control is not None:
+        text.append(
+            "The covariances come from the residuals of each fit. They do not hold what another season's light and "
+            "changed parcels move a match by; chi-square per degree of freedom says by how much they are too small. "
+            "The error that orthophoto and heights have in common in the whole patch is in none of these numbers: "
+            "matches are judged against the place of what the orthophoto shows."
+        )
+    figures = [
+        PngFigure(
+            f"points-{sort}",
+            f"From predicted to found, {_NAMES[sort]} points",
+            "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
+            "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
+            drawn_points(patch, one),
+        )
+        for sort, one in points.sorts.items()
+    ]
+    listed = PointListing(
+        "points",
+        "Points",
+        "Every point in every line: ground coordinates as given, image coordinates, sigmas, verdict.",
+        listing(patch, points),
+    )
+    tables = _found(points), _true(patch, points)
+    return Section("Measured points", tuple(text), (*tables, *figures, _why(points), listed))
+
+
+def _found(points: PatchPoints) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for sort, one in points.sorts.items():
+        for name, line in one.lines.items():
+            if name == one.source:
+                continue
+            counts = len(line.status), int(line.matched.sum()), int(line.accepted.sum())
+            rows.append((_NAMES[sort], name, *counts, *_floats(median_way(line)), *_floats(median_sigma(line))))
+    return Table(
+        "points-found",
+        "Matching",
+        "Displacement from predicted to found and sigma: medians of the accepted, px along the track (lines) and along "
+        "the line (pixels).",
+        ("points", "line", "sought", "matched", "accepted", "moved, track", "moved, line", "σ track", "σ line"),
+        rows,
+        (None, None, None, None, None, 2, 2, 3, 3),
+    )
+
+
+def _true(patch: Patch, points: PatchPoints) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for sort, one in points.sorts.items():
+        for name, j in judged(patch, one).items():
+            wrong = f"{j.wrong_found} of {j.found}", f"{j.wrong_matched} of {j.matched}"
+            ratio = j.chi_square / max(j.degrees_of_freedom, 1)
+            after = f"{j.wrong_accepted} of {j.accepted}"
+            rows.append((_NAMES[sort], name, *wrong, after, j.good_lost, *_floats(j.rms), *_floats(j.mean), ratio))
+    return Table(
+        "points-truth",
+        "Against the truth",
+        f"Wrong: more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px; of "
+        "all places that a fit gave, of those that matching let pass, of those that the neighbours agree with. RMS and "
+        "mean error, px, and chi-square over degrees of freedom, of right places.",
+        (
+            "points",
+            "line",
+            "wrong before",
+            "after matching",
+            "after consensus",
+            "right lost",
+            "RMS track",
+            "RMS line",
+            "mean track",
+            "mean line",
+            "χ²/dof",
+        ),
+        rows,
+        (None, None, None, None, None, None, 3, 3, 3, 3, 2),
+    )
+
+
+def _why(points: PatchPoints) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for sort, one in points.sorts.items():
+        count = {name: reasons(line) for name, line in one.lines.items() if name != one.source}
+        total: Counter[str] = Counter()
+        for found in count.values():
+            total.update(found)
+        for text, _ in total.most_common():
+            rows.append((_NAMES[sort], text, ", ".join(f"{n} {c.get(text, 0)}" for n, c in count.items())))
+    return Table("points-lost", "Why points were not accepted", "", ("points", "reason", "how many"), rows)
+
+
+def _floats(pair: np.ndarray) -> tuple[float, float]:
+    return float(pair[0]), float(pair[1])
+
+
+def drawn_points(patch: Patch, points: MatchedPoints) -> bytes:
+    """PNG: every line's frame with its points and their displacements."""
+    with look(f"points-{points.kind}"):
+        names = [n for n in points.lines if n != points.source]
+        figure = new_figure(4.3 if len(names) > 2 else 5.6)
+        panels = np.atleast_1d(figure.subplots(1, len(names)))
+        for axes, name in zip(panels, names, strict=True):
+            _panel(axes, name, patch.images[name], points)
+        marks = [
+            Line2D([], [], color=YELLOW, marker=r"$\rightarrow$", ls="", ms=9, label="accepted"),
+            Line2D([], [], color=VERMILION, marker="x", ls="", label="rejected by its neighbours"),
+            Line2D([], [], color=SKY, marker=".", ls="", label="not matched"),
+        ]
+        figure.legend(handles=marks, loc="outside lower center", ncols=3, labelcolor="black")
+        return to_png(figure, _DPI)
+
+
+def _panel(axes: Axes, name: str, image: LineImage, points: MatchedPoints) -> None:
+    line = points.lines[name]
+    low, high = np.percentile(image.frame, (0.5, 99.5))
+    row, column = line.first
+    rows, columns = image.frame.shape
+    ends = (column - 0.5, column + columns - 0.5, row + rows - 0.5, row - 0.5)
+    axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
+    at, to = line.predicted + np.array(line.first), line.image
+    # no minus before zero
+    middle = np.round(median_way(line), 1) + 0.0
+    rest = to - at - middle
+    good, against = line.accepted, line.status == CONSENSUS
+    longest = float(np.quantile(np.linalg.norm(rest[good], axis=1), 0.95))
+    enlarged = _round(0.06 * min(rows, columns) / max(longest, 1e-3))
+    arrow: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / enlarged, "width": 0.004}
+    effects = [Stroke(linewidth=1.2, foreground="black"), Normal()]
+    axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=YELLOW, path_effects=effects, **arrow)
+    axes.plot(to[against, 1], to[against, 0], "x", color=VERMILION, ms=6, mew=1.6)
+    lost = ~good & ~against
+    # where it would be, for a point that was not matched
+    axes.plot(at[lost, 1] + middle[1], at[lost, 0] + middle[0], ".", color=SKY, ms=5, mec="black", mew=0.4)
+    axes.set(
+        title=f"{name}: moved by {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nrest shown {enlarged:g} × enlarged",
+        xlim=ends[:2],
+        ylim=ends[2:],
+    )
+    pixel_axes(axes)
+
+
+def _round(value: float) -> float:
+    """To 1, 2 or 5 times a power of ten, not above."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9)))

@@ -1,0 +1,123 @@
+"""A pass over a patch of ground from what its file says: orbit, the camera as it is and as it was known, images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.yaml.errors import KeyPath
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.ground.grid import stream
+from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
+from twin.orbit.images.line_optics import optics_of
+from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
+from twin.run.result import BenchError
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_setup import SimulateSetup
+
+_REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
+    {
+        "span": (("orbit",), "an orbit that is followed longer before and after, or another patch.time"),
+        "place": (("patch", "pixel"), "a patch inside the swath of every line"),
+        "size": (("patch",), "a smaller patch, or one farther from the ends of the lines"),
+        "terrain": (("ground", "terrain"), "less relief, a larger exponent or larger posts"),
+    }
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A pass and what it gave.
+
+    Attributes:
+        spec: the test.
+        laboratory: the camera as it was measured before launch.
+        truth: the camera as it is.
+        trajectory: the true one.
+        measured: what the satellite says of it.
+        lines: those that are rendered, by name.
+        place: longitude and latitude of the patch's middle, radians.
+        patch: images and control.
+        points: measured in the images; None where none were asked for.
+    """
+
+    spec: OrbitSimulateSpec
+    laboratory: ThreeLineCameraSpec
+    truth: ThreeLineCameraSpec
+    trajectory: Trajectory
+    measured: Trajectory
+    lines: Mapping[str, ImagedLine]
+    place: tuple[float, float]
+    patch: Patch
+    points: PatchPoints | None
+
+
+def simulate(setup: SimulateSetup, seed: int) -> Simulation:
+    """Fly the pass.
+
+    Raises:
+        BenchError: no such orbit, a patch that a line cannot image, points that cannot be measured.
+    """
+    spec, root = setup.test, np.random.SeedSequence(seed)
+    earth = Earth.from_spec(spec.earth)
+    try:
+        trajectory = Trajectory(propagate(spec.orbit, earth), Attitude.from_spec(spec.attitude))
+    except ValueError as error:
+        raise BenchError(str(error), ("orbit",), "an orbit that the satellite can fly") from error
+    measured = trajectory.with_errors(spec.errors, int(np.random.default_rng(stream(root, 0)).integers(2**31)))
+    truth = changed_payload(spec, setup.camera)
+    true, known = line_cameras(truth), line_cameras(setup.camera)
+    sensors = {name: sensor_of(true[name], trajectory, earth, spec) for name in spec.lines}
+    users = {name: sensor_of(known[name], measured, earth, spec) for name in spec.lines}
+    optics = optics_of(setup.camera, spec.lines, spec.line_time, setup.detectors)
+    lines = imaged_lines(sensors, users, optics, stream(root, 1))
+    looking = sensor_of(true[spec.patch.line], trajectory, earth, spec)
+    place = _place(looking, spec)
+    patch = spec.patch
+    try:
+        done = fly_patch(
+            lines, place, (patch.lines, patch.pixels), spec.ground, spec.control, stream(root, 2), spec.oversampling
+        )
+    except PatchError as error:
+        key, remedy = _REMEDIES[error.part]
+        raise BenchError(str(error), key, remedy) from error
+    points = _points(done, spec)
+    return Simulation(spec, setup.camera, truth, trajectory, measured, FrozenMap(lines), place, done, points)
+
+
+def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:
+    if spec.points is None:
+        return None
+    try:
+        return measure_points(patch, spec.points)
+    except PointsError as error:
+        raise BenchError(str(error), ("points",), POINTS_REMEDY) from error
+
+
+def sensor_of(camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: OrbitSimulateSpec) -> Sensor:
+    """A line's image over the whole orbit."""
+    lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
+    effects = LightEffects(
+        *(getattr(spec.effects, n) for n in ("light_time", "aberration", "refraction", "wavelength"))
+    )
+    return Sensor(camera, trajectory, earth, spec.line_time, trajectory.first + 0.5 * spec.line_time, lines, effects)
+
+
+def _place(sensor: Sensor, spec: OrbitSimulateSpec) -> tuple[float, float]:
+    line = (spec.patch.time - sensor.first_line_time) / sensor.line_time
+    line = float(np.clip(line, -0.5, sensor.lines - 0.5))
+    point = sensor.ground(np.array([line]), np.array([spec.patch.pixel]), spec.ground.terrain.height)
+    longitude, latitude, _ = sensor.earth.geodetic(point[0])
+    return float(longitude), float(latitude)

@@ -1,0 +1,493 @@
+"""A monitored stereo pair along its orbit: temperatures, readings, and points it measures on the ground.
+
+Both views of a point, which are half a minute to a minute apart, are those of the state at the course's time, midway
+between them. Light time, aberration and refraction are left out: they are taken as corrected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.monitor.model_fit import fit
+from analysis.monitor.monitoring import CameraParameters, shift_covariance
+from analysis.monitor.recovery import measure_spots, recover
+from analysis.orbit.monitored_camera import CalibratedLine, Sightings
+from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
+from analysis.units import ARCSEC
+from optics.geometry.tree import Motion, State, compose
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import cores, one_blas_thread
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from optics.thermal.heat import Temperature
+from scenes.models.thermal_model import TemperatureError
+from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.specs.course import moment
+from twin.monitor.monitor_experiment import MonitorExperiment, motions_of
+from twin.monitor.truth import trace_truth
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_cameras
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.run.result import Advance, BenchError
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_monitor import OrbitMonitorSpec
+    from scenes.specs.orbit_setup import MonitorSetup
+
+
+CHUNK = 25
+"""States rendered at once, to bound memory."""
+TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
+Series = dict[str, CameraParameters]
+
+
+def states_of(
+    experiment: MonitorExperiment,
+    spec: OrbitMonitorSpec,
+    numbers: Sequence[int] | None = None,
+    only: tuple[str, str] | None = None,
+) -> list[State]:
+    """States at times of the course.
+
+    Args:
+        experiment: the instrument.
+        spec: the test.
+        numbers: of the times, all by default.
+        only: "temperature" or "motion", and the node of the course that alone has one; the others of the course have
+            temperatures of 0 K, so that nothing is inherited. What `perturb` says stays.
+
+    Raises:
+        InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+    """
+    job, bodies = spec.job, {body.path: body for body in experiment.instrument.assembly.tree.bodies}
+    out: list[State] = []
+    for k in range(len(spec.course.times)) if numbers is None else numbers:
+        time, fields = spec.course.times[k], job.fields(k)
+        if only is not None:
+            fields = {path: field if only == ("temperature", path) else Temperature() for path, field in fields.items()}
+        try:
+            experiment.thermal.check(fields)
+            state = experiment.thermal.state(fields, motions_of(job))
+        except TemperatureError as error:
+            own = error.origin in spec.course.temperature
+            key = ("course", *spec.course.key(error.origin, k)) if own else ("perturb", error.origin, "temperature")
+            raise spec.error(f"{error} at {moment(time)}", key, allowed=error.allowed) from error
+        moves = {}
+        for path, motion in spec.motion.items():
+            if only is None or only == ("motion", path):
+                share = motion.share(time)
+                rotate, shift = ((share * v[0], share * v[1], share * v[2]) for v in (motion.rotate, motion.shift))
+                moves[path] = Motion(rotate, shift, motion.pivot)
+        out.append(compose(state, moves, bodies))
+    return out
+
+
+class MonitorSeries:
+    """A monitor with its reference images.
+
+    Args:
+        experiment: the instrument with its calibration on the ground.
+        spec: the test.
+        reference: state at the reference time.
+    """
+
+    def __init__(self, experiment: MonitorExperiment, spec: OrbitMonitorSpec, reference: State) -> None:
+        self.experiment, self.spec = experiment, spec
+        self.frames: int = spec.frames or experiment.instrument.spec.monitor.frames
+        self.reference = experiment.path.expected_photons([reference])
+        self._clean_reference = self._spots(experiment.expected_frames(self.reference), None)
+
+    def measured(self, states: Sequence[State], seed: int) -> tuple[Series, Series]:
+        """Camera -> changes (S,) since the reference, from exposed frames and from expected images without noise.
+
+        Raises:
+            BenchError: a spot cannot be measured.
+            AimError, BeamMissedError: light is lost.
+        """
+        experiment = self.experiment
+        # a stream of its own: states are numbered from 0
+        before = experiment.frames_after(self.reference, self.frames, seed, len(states))[0]
+        noisy: list[Series] = []
+        clean: list[Series] = []
+        for piece, photons in experiment.path.iterate_photons(states, chunk=CHUNK):
+            after = experiment.frames_after(photons, self.frames, seed, piece.start)
+            noisy.append(self._recovered(before, after, piece.start))
+            clean.append(self._without_noise(photons, piece.start))
+        return _joined(noisy), _joined(clean)
+
+    def clean(self, states: Sequence[State]) -> Series:
+        """Camera -> changes (S,) since the reference, from expected images without noise. Raises as `measured`."""
+        pieces = self.experiment.path.iterate_photons(states, chunk=CHUNK)
+        return _joined([self._without_noise(photons, piece.start) for piece, photons in pieces])
+
+    def of_prisms(self) -> Series:
+        """Without noise, what temperatures say that the file gives to the monitor's prisms themselves, at all times."""
+        job = self.spec.job
+        states = []
+        for k in range(len(self.spec.course.times)):
+            own = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
+            states.append(self.experiment.thermal.state(own, {}))
+        at, every = self.spec.referred, self.clean(states)
+        return {n: CameraParameters.from_vector(p.vector - p.vector[at], p.covariance) for n, p in every.items()}
+
+    def repeated(self, state: State, count: int, seed: int, number: int) -> Series:
+        """Camera -> changes (count,): reference and state measured anew each time, with another detector's pattern.
+
+        ``number`` is that of the state's time, for messages.
+        """
+        experiment = self.experiment
+        photons = experiment.path.expected_photons([state])
+        pieces = []
+        for k in range(count):
+            before = experiment.frames_after(self.reference, self.frames, seed + k, 1)[0]
+            after = experiment.frames_after(photons, self.frames, seed + k)
+            pieces.append(self._recovered(before, after, number))
+        return _joined(pieces)
+
+    def _recovered(self, before: np.ndarray, after: np.ndarray, first: int) -> Series:
+        experiment = self.experiment
+        try:
+            with one_blas_thread():
+                found = recover(before, after, experiment.calibration, self.spec.analysis.centroid, cores())
+        except SpotError as error:
+            raise self._lost(error, first) from error
+        return {name: estimators["model"] for name, estimators in found.parameters.items()}
+
+    def _without_noise(self, photons: np.ndarray, first: int) -> Series:
+        calibration, noise = self.experiment.calibration, self.experiment.calibration.noise
+        after = self._spots(self.experiment.expected_frames(photons), first)
+        before, spots = self._clean_reference, calibration.spots
+        spread = difference_covariance(before, after, noise).reshape(len(photons), -1, 2, 2, 2)
+        joint = shift_covariance(spread[:, :, 0], spread[:, :, 1])
+        shift = after.position.reshape(len(photons), spots, 2) - before.position.reshape(1, spots, 2)
+        out = {}
+        for k, (name, camera) in enumerate(calibration.cameras.items()):
+            moved = shift[:, 2 * k : 2 * k + 2].reshape(-1, 4)
+            jacobians = (camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
+            out[name] = fit(moved, joint[:, k], *jacobians)
+        return out
+
+    def _spots(self, frames: np.ndarray, first: int | None) -> SpotPositions:
+        calibration = self.experiment.calibration
+        flat = frames.reshape(-1, *frames.shape[-2:])
+        try:
+            with one_blas_thread():
+                return measure_spots(flat, self.frames, calibration, self.spec.analysis.centroid, cores())
+        except SpotError as error:
+            raise self._lost(error, self.spec.referred if first is None else first) from error
+
+    def _lost(self, error: SpotError, first: int) -> BenchError:
+        state, spot = divmod(error.indices[0], self.experiment.calibration.spots)
+        number = min(first + state, len(self.spec.course.times) - 1)
+        channel = self.experiment.path.channels[spot].key
+        reason = error.reasons[error.indices[0]]
+        time = moment(self.spec.course.times[number])
+        return BenchError(f"the spot {channel} cannot be measured at {time} ({reason})", ("course",), TOO_FAR)
+
+
+def _joined(parts: Sequence[Series]) -> Series:
+    return {
+        name: CameraParameters.from_vector(
+            np.concatenate([np.atleast_2d(p[name].vector) for p in parts]),
+            np.concatenate([p[name].covariance.reshape(-1, 4, 4) for p in parts]),
+        )
+        for name in parts[0]
+    }
+
+
+HALF_SPAN = 60.0
+"""Seconds of the orbit to either side of a time of the course that its images take; two views 53 degrees apart from 500
+km are 70 s apart."""
+_SPARE = 2
+"""Candidates for each ground point; those that a line does not see are left out."""
+_MIDDLE = 1e-3
+"""Seconds to which the two views are brought to equal times before and after; a satellite goes 8 m."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Check points at one time.
+
+    Attributes:
+        ground: (n, 3) true, ITRS, metres.
+        exact: of each camera of the pair, as it truly is, with the true orbit and attitude.
+        seen: as measured.
+    """
+
+    ground: np.ndarray
+    exact: tuple[Sightings, Sightings]
+    seen: tuple[Sightings, Sightings]
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """One entry of the file alone, all others without effect.
+
+    Attributes:
+        what: temperature or motion.
+        path: of the node.
+        truth: camera -> (4,) true changes since the reference.
+        error: camera -> (4,) what the monitor says, without noise, minus the truth.
+    """
+
+    what: str
+    path: str
+    truth: Mapping[str, np.ndarray]
+    error: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorFlight:
+    """Truth and measurements at T times.
+
+    Attributes:
+        spec: the test.
+        pair: names of the two cameras.
+        looks: their nominal look angles, radians.
+        times: (T,) seconds from the orbit's epoch.
+        truth: camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
+        angle: (T,) true angle between the lines of sight, radians.
+        lines: of each time: camera -> its line as it truly is.
+        calibrated: camera -> its line at the reference, which the ground knows.
+        causes: what each temperature and motion of the file does alone at time `worst`, without noise.
+        monitored: camera -> what the monitor says of its changes since the reference.
+        clean: camera -> (T, 4) the same from expected images without noise.
+        prisms: camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
+        views: of each time.
+        repeated: camera -> what the monitor says at time `worst`, measured again and again.
+        worst: number of the time with the largest change of the angle.
+        turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
+    """
+
+    spec: OrbitMonitorSpec
+    pair: tuple[str, str]
+    looks: tuple[float, float]
+    times: np.ndarray
+    truth: Mapping[str, np.ndarray]
+    angle: np.ndarray
+    lines: tuple[Mapping[str, LineCamera], ...]
+    calibrated: Mapping[str, CalibratedLine]
+    monitored: Mapping[str, CameraParameters]
+    clean: Mapping[str, np.ndarray]
+    prisms: Mapping[str, np.ndarray]
+    views: tuple[View, ...]
+    repeated: Mapping[str, CameraParameters]
+    worst: int
+    causes: tuple[Cause, ...]
+    turned: Mapping[str, LineCamera]
+
+    def true_line(self, camera: str, k: int) -> CalibratedLine:
+        """A camera as it truly is at time number k, in the analysis's form: for comparison only."""
+        return in_analysis(self.lines[k][camera], self.calibrated[camera])
+
+
+def in_analysis(line: LineCamera, like: CalibratedLine) -> CalibratedLine:
+    """A traced line in the analysis's form, with the axes and principal distance of another."""
+    return CalibratedLine(line.pixels, line.directions, line.origins, like.axes, like.principal_distance)
+
+
+def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorFlight:
+    """Trace, render, measure, look down.
+
+    Raises:
+        InputError: an unknown node or an impossible temperature.
+        BenchError: the test cannot be carried out as its file says.
+    """
+    spec, pair = setup.test, setup.pair
+    ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
+    number = int(np.random.default_rng(monitor_seed).integers(2**31))
+    parts = 6
+    advance("monitor", 0, parts)
+    experiment = MonitorExperiment(setup.resolved, backend)
+    spec.check_nodes(experiment.instrument.nodes)
+    states = states_of(experiment, spec)
+    advance("monitor", 1, parts)
+    instrument, reference = experiment.instrument, states[spec.referred]
+    try:
+        truth, distance = _changes(experiment, states, spec.referred)
+        lines = tuple(_lines(experiment, state, pair) for state in states)
+        turned = {name: _lines(experiment, _turned(experiment, reference, name), pair)[name] for name in pair}
+        advance("monitor", 2, parts)
+        angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
+        worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
+        # before the images, which take longer
+        views = look_down(spec, pair, lines, ground_seed, advance)
+        monitor = MonitorSeries(experiment, spec, reference)
+        noisy, clean = monitor.measured(states, number)
+        advance("monitor", 3, parts)
+        prisms = monitor.of_prisms()
+        advance("monitor", 4, parts)
+        repeated = monitor.repeated(states[worst], spec.repeats, number + 1, worst)
+        advance("monitor", 5, parts)
+        causes = _causes(experiment, spec, monitor, worst, pair)
+        advance("monitor", 6, parts)
+    except (AimError, BeamMissedError) as error:
+        raise BenchError(f"the instrument cannot be rendered: {error}", ("course",), TOO_FAR) from error
+    calibrated = {}
+    for name in pair:
+        line, axes = lines[spec.referred][name], instrument.camera_axes(name)
+        calibrated[name] = CalibratedLine(line.pixels, line.directions, line.origins, axes, distance[name])
+    quiet = not (spec.errors.switched_on and spec.errors.monitor)
+    return MonitorFlight(
+        spec,
+        pair,
+        (instrument.spec.cameras[pair[0]].look, instrument.spec.cameras[pair[1]].look),
+        np.array(spec.course.times),
+        FrozenMap({name: truth[name] for name in pair}),
+        angle,
+        lines,
+        FrozenMap(calibrated),
+        FrozenMap({name: (clean if quiet else noisy)[name] for name in pair}),
+        FrozenMap({name: clean[name].vector for name in pair}),
+        FrozenMap({name: prisms[name].vector for name in pair}),
+        views,
+        FrozenMap({name: repeated[name] for name in pair}),
+        worst,
+        causes,
+        FrozenMap(turned),
+    )
+
+
+def _changes(
+    experiment: MonitorExperiment, states: Sequence[State], reference: int
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Camera -> (T, 4) true changes since the reference, and camera -> principal distance there.
+
+    The trace refers changes to the nominal camera; their differences are those between two states but for products of
+    two arcseconds, 1e-11 rad.
+    """
+    out, distance = {}, {}
+    for name, change in trace_truth(experiment.instrument, experiment.backend, states).cameras.items():
+        values = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1)
+        out[name] = values - values[reference]
+        distance[name] = float(change.principal_distance[reference])
+    return out, distance
+
+
+def _causes(
+    experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, pair: tuple[str, str]
+) -> tuple[Cause, ...]:
+    """What each temperature of the course and each motion does from the reference to time number ``worst``."""
+    named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
+    states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
+    truth, _ = _changes(experiment, states, 0)
+    said = monitor.clean(states)
+    out = []
+    for k, (what, path) in enumerate(named):
+        true = {n: truth[n][2 * k + 1] - truth[n][2 * k] for n in pair}
+        error = {n: said[n].vector[2 * k + 1] - said[n].vector[2 * k] - true[n] for n in pair}
+        out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
+    return tuple(out)
+
+
+def _lines(experiment: MonitorExperiment, state: State, pair: tuple[str, str]) -> Mapping[str, LineCamera]:
+    traced = traced_line_cameras(experiment.instrument, experiment.backend, state)
+    return FrozenMap({name: traced[name] for name in pair})
+
+
+def _turned(experiment: MonitorExperiment, state: State, camera: str) -> State:
+    """The state with a whole camera turned by 1 arcsec about its Y."""
+    bodies = {body.path: body for body in experiment.instrument.assembly.tree.bodies}
+    return compose(state, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
+
+
+def look_down(
+    spec: OrbitMonitorSpec,
+    pair: tuple[str, str],
+    lines: Sequence[Mapping[str, LineCamera]],
+    seed: np.random.SeedSequence,
+    advance: Advance,
+) -> tuple[View, ...]:
+    """Check points at every time, as both lines see them.
+
+    Raises:
+        BenchError: no such orbit, or not enough points that both lines see.
+    """
+    earth = Earth.from_spec(spec.earth)
+    try:
+        true = Trajectory(propagate(spec.orbit, earth), Attitude.from_spec(spec.attitude))
+    except ValueError as error:
+        raise BenchError(str(error), ("orbit",), "an orbit that exists") from error
+    data, *streams = seed.spawn(1 + len(lines))
+    measured = true
+    if spec.errors.switched_on:
+        measured = true.with_errors(spec.errors, int(np.random.default_rng(data).integers(2**31)))
+    out = []
+    for k, (line, stream) in enumerate(zip(lines, streams, strict=True)):
+        out.append(_view(spec, k, [line[name] for name in pair], true, measured, earth, stream))
+        advance("ground", k + 1, len(lines))
+    return tuple(out)
+
+
+def _view(
+    spec: OrbitMonitorSpec,
+    number: int,
+    cameras: Sequence[LineCamera],
+    true: Trajectory,
+    measured: Trajectory,
+    earth: Earth,
+    seed: np.random.SeedSequence,
+) -> View:
+    """Points at time number ``number``."""
+    place, image = (np.random.default_rng(s) for s in seed.spawn(2))
+    ground, time = spec.ground, spec.course.times[number]
+    begin, lines = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
+    try:
+        sensors = [Sensor(c, true, earth, spec.line_time, begin, lines, NO_EFFECTS) for c in cameras]
+    except ValueError as error:
+        remedy = "an orbit that goes on for a minute before the first and after the last time of the course"
+        raise BenchError(f"{error} around {moment(time)}", ("orbit", "after"), remedy) from error
+    at = _second_view(sensors, time, 0.5 * (ground.first + ground.last), ground.height, number)
+    wanted = ground.points
+    height = ground.height + ground.relief * place.uniform(-1.0, 1.0, _SPARE * wanted)
+    pixel = place.uniform(ground.first, ground.last, len(height))
+    speed = float(np.linalg.norm(true.velocity(time))) * float(
+        np.linalg.norm(earth.ecef(0.0, 0.0)) / np.linalg.norm(true.position(time))
+    )
+    reach = 0.5 * ground.length / speed
+    line = (at + place.uniform(-reach, reach, len(height)) - begin) / spec.line_time
+    inside = (line > 0.0) & (line < lines - 1.0)
+    points = sensors[1].ground(line[inside], pixel[inside], height[inside])
+    seen = [s.image(points) for s in sensors]
+    good = np.flatnonzero(np.all([np.isfinite(row) for row, _ in seen], axis=0))[:wanted]
+    if len(good) < wanted:
+        problem = f"at {moment(time)} only {len(good)} of {len(height)} places are seen by both lines"
+        remedy = "places inside both strips: nearer to the line's middle, or attitude {steering: yaw}"
+        raise BenchError(problem, ("ground",), remedy)
+    noise = spec.errors.image * spec.errors.switched_on
+    exact, noisy = [], []
+    for sensor, (row, column) in zip(sensors, seen, strict=True):
+        exact.append(_sightings(sensor, true, row[good], column[good]))
+        drawn = noise * image.standard_normal((2, len(good)))
+        noisy.append(_sightings(sensor, measured, row[good] + drawn[0], column[good] + drawn[1]))
+    return View(points[good], (exact[0], exact[1]), (noisy[0], noisy[1]))
+
+
+def _second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float, number: int) -> float:
+    """When the second line sees a point that the first sees as long before ``time`` (or after it), seconds."""
+    at = time
+    for _ in range(20):
+        line = (at - sensors[1].first_line_time) / sensors[1].line_time
+        point = sensors[1].ground(np.array([line]), np.array([pixel]), height)
+        row, _ = sensors[0].image(point)
+        if not np.isfinite(row[0]):
+            break
+        off = 0.5 * (at + float(sensors[0].time(row)[0])) - time
+        at -= off
+        if abs(off) < _MIDDLE:
+            return at
+    problem = f"at {moment(time)} the first line does not see what the second sees within {HALF_SPAN:g} s"
+    raise BenchError(problem, ("cameras",), "two cameras whose strips overlap, and attitude {steering: yaw}")
+
+
+def _sightings(sensor: Sensor, trajectory: Trajectory, row: np.ndarray, column: np.ndarray) -> Sightings:
+    seconds = sensor.time(row)
+    return Sightings(column, trajectory.position(seconds), trajectory.body_to_itrs(seconds))

@@ -1,0 +1,280 @@
+"""What a monitored orbit gives: the main table and the report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.monitor.monitoring import PER_SI
+from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
+from scenes.specs.course import moment
+from scenes.specs.orbit_monitor import PARAMETERS
+from twin.orbit.monitoring.monitoring_figures import PART_NAMES, drawn
+from twin.orbit.monitoring.monitoring_json import cause_heights, to_dict
+from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms, run_monitored
+from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.result import Advance, LabResult, Section
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit_setup import MonitorSetup
+
+
+def sections(run: MonitorRun) -> tuple[Section, ...]:
+    """All parts."""
+    return (_angle(run), _height(run), _interval(run), _rest(run), _conversion(run), _noise(run))
+
+
+def _angle(run: MonitorRun) -> Section:
+    error = (run.angle - run.angle_change) / ARCSEC
+    text = (
+        f"Traced, the angle changes by {np.ptp(run.angle_change) / ARCSEC:.3g}″ over the course. The monitor follows "
+        f"it to {rms(error):.2g}″ RMS, {np.abs(error).max():.2g}″ at worst. Both are counted from the reference at "
+        f"{moment(run.flight.spec.reference)}, when the cameras were calibrated and the monitor took its reference.",
+    )
+    figure = SvgFigure(
+        "angle", "Intersection angle over the orbit", "Model estimator, all frames.", drawn("angle", run)
+    )
+    return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.flight.pair)))
+
+
+def _changes(run: MonitorRun, name: str) -> Table:
+    flight = run.flight
+    rows: list[tuple[Cell, ...]] = []
+    for time, true, said in zip(flight.times, flight.truth[name], flight.monitored[name].vector, strict=True):
+        both = zip(true * PER_SI, said * PER_SI, strict=True)
+        rows.append((float(time / 60.0), *(float(v) + 0.0 for pair in both for v in pair)))
+    heads = ["time, min"]
+    for key in PARAMETERS:
+        heads += [f"{key}, {'µm' if key == 'd_f' else '″'}", "monitored"]
+    return Table(
+        f"changes-{name.lower()}",
+        f"Changes of {name}, true and monitored",
+        "Since the reference.",
+        tuple(heads),
+        rows,
+        (1, *([3] * 6), 1, 1),
+    )
+
+
+def _height(run: MonitorRun) -> Section:
+    floor = run.cases["true"]
+    text = (
+        "What the cameras alone do is the difference to the true cameras with the same image points, orbit and "
+        f"attitude. True cameras leave {floor.height_rms:.3g} m in height and {floor.plan_rms:.3g} m in plan.",
+        "Attitude errors that both cameras share turn the body, not the angle: the monitor does not see them. One "
+        f"arcsecond in pitch of both makes {abs(run.conversion.of_common):.2f} m of height, for the pair does not look "
+        "evenly forward and back.",
+    )
+    caption = "Above: mean over the points. Below: all errors, with the points' noise."
+    figure = SvgFigure("height", "Height errors over the orbit", caption, drawn("height", run))
+    return Section("Heights with and without monitoring", text, (figure,))
+
+
+def _interval(run: MonitorRun) -> Section:
+    rows: list[tuple[Cell, ...]] = [
+        (
+            float(interval / 60.0),
+            len(run.flight.spec.measured(interval)),
+            case.height_rms,
+            case.worst,
+            case.camera_height_rms,
+            case.plan_rms,
+        )
+        for interval, case in run.intervals.items()
+    ]
+    table = Table(
+        "intervals",
+        "Height error against the monitoring interval",
+        "Measured from the reference on, linear between, held before the first and after the last; metres.",
+        ("interval, min", "measurements", "height RMS", "worst time", "by the cameras", "plan RMS"),
+        rows,
+        (1, None, 3, 3, 3, 3),
+    )
+    figure = SvgFigure("interval", "RMS in height against the interval", "Over all times.", drawn("interval", run))
+    return Section("How often to measure", (), (figure, table))
+
+
+def _rest(run: MonitorRun) -> Section:
+    flight = run.flight
+    rows: list[tuple[Cell, ...]] = [
+        (PART_NAMES[name], rms(part), float(np.abs(part).max())) for name, part in run.parts.items()
+    ]
+    parts = Table(
+        "parts",
+        "Parts of the corrected cameras' height error",
+        "Metres, over all times; signed, they add up to the whole but for products of two small errors.",
+        ("part", "RMS, m", "largest, m"),
+        rows,
+        (None, 4, 4),
+    )
+    causes: list[tuple[Cell, ...]] = []
+    for cause in flight.causes:
+        without, left = cause_heights(run, cause)
+        errors = [float(cause.error[n][0] / ARCSEC) + 0.0 for n in flight.pair]
+        causes.append((cause.what, cause.path, without, left, *errors))
+    table = Table(
+        "causes",
+        f"Each cause alone, at {moment(float(flight.times[flight.worst]))}",
+        "Height that it makes without monitoring, and height that the monitor makes by misreading it; error of the "
+        "monitored d_alpha.",
+        ("cause", "node", "unmonitored, m", "misread, m", *(f"{n} Δ d_alpha, ″" for n in flight.pair)),
+        causes,
+        (None, None, 3, 3, 4, 4),
+    )
+    largest = max(run.parts, key=lambda name: rms(run.parts[name]))
+    text = (
+        f"Most of the rest comes from {PART_NAMES[largest]}, {rms(run.parts[largest]):.2g} m RMS. A prism that bends "
+        "the beam by its own temperature looks to the monitor like a camera that has turned.",
+        "The true four parameters put through the correction leave "
+        f"{1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and {run.residual / ARCSEC:.2g}″ at the "
+        "worst place of a line: what a camera does beyond them, such as a change of distortion.",
+        *_worse(run),
+    )
+    caption = "Mean over the points; parts below 5 mm are left out."
+    figure = SvgFigure("remainder", "What the correction leaves", caption, drawn("remainder", run))
+    return Section("Where the rest comes from", text, (figure, parts, table))
+
+
+def _worse(run: MonitorRun) -> tuple[str, ...]:
+    """What the monitor says worse than nothing would."""
+    flight, found = run.flight, []
+    for name in flight.pair:
+        for k, key in enumerate(PARAMETERS):
+            error, change = (rms(v[:, k]) for v in (flight.clean[name] - flight.truth[name], flight.truth[name]))
+            if error > change and key in flight.spec.apply:
+                found.append(f"{key} of {name}, by {error * PER_SI[k]:.2g} {'µm' if key == 'd_f' else '″'} RMS")
+    if not found:
+        return ()
+    return (
+        f"The monitor misreads by more than the true change: {'; '.join(found)}. Such values are better left out, by "
+        "the key apply.",
+    )
+
+
+def _conversion(run: MonitorRun) -> Section:
+    told, flight = run.conversion, run.flight
+    rows: list[tuple[Cell, ...]] = []
+    at = flight.spec.referred
+    for name in flight.pair:
+        slopes = [float(v) for v in run.slopes[name][at] / PER_SI]
+        rows.append((name, told.traced[name], told.theory[name], *slopes))
+    table = Table(
+        "conversion",
+        "Metres of height",
+        "Of a whole camera turned by 1″ about its Y and traced, by base to height, and of each parameter that the "
+        "analysis is told wrongly: a bias of the monitor acts like this.",
+        ("camera", "traced, m/″", "theory, m/″", "d_alpha, m/″", "d_beta, m/″", "d_gamma, m/″", "d_f, m/µm"),
+        rows,
+        (None, 4, 4, 4, 4, 4, 6),
+    )
+    predicted = -sum(run.slopes[n][:, 0] * flight.truth[n][:, 0] for n in flight.pair)
+    none = run.cases["none"].camera
+    size = rms(none) or 1.0
+    by_angle = -told.of_angle * run.angle_change / ARCSEC
+    text = (
+        f"Base to height is {told.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
+        f"{abs(told.of_angle):.2f} m; it is more by the camera that looks farther aside, so that the angle alone gives "
+        f"the height without monitoring to {100.0 * rms(none - by_angle) / size:.1f}% of its RMS, and the d_alpha of "
+        f"both cameras to {100.0 * rms(none - predicted) / size:.1f}%.",
+    )
+    return Section("From arcseconds to metres", text, (table,))
+
+
+def _noise(run: MonitorRun) -> Section:
+    seen, (low, high) = run.scatter, run.scatter.limits
+    verdict = "agrees" if seen.agrees else "does not agree"
+    text = (
+        f"Measured {len(seen.heights)} times at {moment(float(run.flight.times[run.flight.worst]))}, reference images "
+        f"and detectors' patterns drawn anew, heights scatter by {1e3 * seen.spread:.2f} mm; the monitor's covariance "
+        f"propagates to {1e3 * seen.sigma:.2f} mm. The ratio {seen.spread / seen.sigma:.3f} {verdict} with its limits "
+        f"{low:.2f} to {high:.2f} (false alarm {FALSE_ALARM:g}).",
+    )
+    return Section("Noise of the monitor", text)
+
+
+def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
+    """Fly, monitor, intersect, and put the result together."""
+    return monitor_result(run_monitored(setup, backend, seed, advance), setup, seed)
+
+
+def monitor_result(run: MonitorRun, setup: MonitorSetup, seed: int) -> LabResult:
+    """Numbers, table and report."""
+    cases, spec = run.cases, setup.test
+    none, chosen, floor = cases["none"], cases["interval"], cases["true"]
+    lead = (
+        f"The intersection angle changes by {np.ptp(run.angle_change) / ARCSEC:.2g}″ over the course. Without "
+        f"monitoring heights are wrong by {none.height_rms:.2f} m RMS, monitored every {moment(spec.interval)} by "
+        f"{chosen.height_rms:.2f} m, of which {floor.height_rms:.2f} m are left with the true cameras.",
+        f"The cameras alone: {none.camera_height_rms:.2f} m without, {chosen.camera_height_rms:.2f} m with this "
+        f"interval, {cases['monitored'].camera_height_rms:.2f} m monitored at every time. "
+        f"One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height.",
+    )
+    return LabResult(
+        "monitor",
+        "What on-board monitoring buys on the ground",
+        lead,
+        _facts(setup),
+        to_dict(run, seed),
+        _table(run),
+        sections(run),
+        warnings=_warnings(run),
+    )
+
+
+def _table(run: MonitorRun) -> Table:
+    spec = run.flight.spec
+    names = {
+        "none": "as calibrated, no monitoring",
+        "interval": f"monitored every {moment(spec.interval)}",
+        "monitored": "monitored at every time",
+        "parameters": "true four parameters (bound)",
+        "true": "true cameras (bound)",
+    }
+    rows: list[tuple[Cell, ...]] = []
+    for key, name in names.items():
+        case = run.cases[key]
+        numbers = (case.height_rms, case.worst, case.camera_height_rms, case.plan_rms, rms(case.camera_plan))
+        rows.append((name, *numbers))
+    return Table(
+        "cases",
+        "Errors at check points over the course",
+        "RMS of all points and times; worst: RMS of the worst time; by the cameras: without image, orbit and attitude.",
+        ("cameras", "height, m", "worst, m", "height by the cameras, m", "plan, m", "plan by the cameras, m"),
+        rows,
+        (None, 3, 3, 4, 3, 4),
+    )
+
+
+def _facts(setup: MonitorSetup) -> tuple[tuple[str, str], ...]:
+    test, errors = setup.test, setup.test.errors
+    times = test.course.times
+    span = f"{moment(times[0])} to {moment(times[-1])} in steps of {moment(test.step)}"
+    on = errors.switched_on
+    return (
+        ("Instrument", f"{setup.instrument.name}, {setup.instrument.description}"),
+        ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
+        ("Course", f"{span}, from {test.orbit.epoch}"),
+        ("Reference", moment(test.reference)),
+        ("Applied", ", ".join(test.apply)),
+        ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
+        ("Image points", f"σ {errors.image:g} px, drawn, not matched in images" if on else "exact"),
+        ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
+        ("Calibration at the reference", "taken as exact"),
+        ("Effects on the light", "taken as corrected"),
+        ("Description", test.description),
+    )
+
+
+def _warnings(run: MonitorRun) -> tuple[str, ...]:
+    out = []
+    if not run.scatter.agrees:
+        low, high = run.scatter.limits
+        ratio = run.scatter.spread / run.scatter.sigma
+        out.append(
+            f"scatter and propagated sigma of the heights differ: ratio {ratio:.3g}, limits {low:.2f} to {high:.2f}"
+        )
+    if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
+        out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
+    return tuple(out)

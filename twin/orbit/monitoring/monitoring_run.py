@@ -1,0 +1,361 @@
+"""Heights with and without on-board monitoring: points of every time intersected by cameras as calibrated, corrected by
+the monitor, corrected by values interpolated over an interval, and as they truly are.
+
+The analysis gets calibrated lines, measured orbit and attitude, image points and the monitor's values. Truth enters
+where errors are counted, and in two cases that are bounds: the true four parameters, and the true lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import chi2
+
+from analysis.monitor.intersection_angle import exact
+from analysis.monitor.monitoring import CameraParameters
+from analysis.orbit.forward_intersection import check_errors
+from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, between, intersect_pair
+from analysis.units import ARCSEC
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.orbit_monitor import PARAMETERS
+from twin.orbit.flight.line_camera import look_angle
+from twin.orbit.monitoring.monitoring_flight import MonitorFlight, fly_monitored, in_analysis
+from twin.run.result import BenchError
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.specs.orbit_setup import MonitorSetup
+    from twin.run.result import Advance
+
+CASES = ("none", "monitored", "interval", "parameters", "true")
+"""As calibrated; corrected at every time; corrected by values interpolated over the file's interval; by the true four
+parameters; the true lines. The last two are bounds that no measurement gives."""
+FALSE_ALARM = 1e-4
+"""Chance that right sigmas are called wrong, both sides together."""
+_STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
+"""Of the derivatives, rad and m: the intersection is linear over it to 1e-5."""
+
+
+@dataclass(frozen=True, eq=False)
+class CaseErrors:
+    """Errors at the check points over T times.
+
+    Attributes:
+        plan: (T,) RMS, both axes, metres; height: (T,) likewise.
+        bias: (T,) mean of the height errors, found minus true.
+        camera: (T,) the same less that of the true cameras at the same image points, orbit and attitude: what the
+            cameras alone do.
+        camera_plan: (T,) RMS over the points of what the cameras alone do in plan; camera_height: likewise in height.
+    """
+
+    plan: np.ndarray
+    height: np.ndarray
+    bias: np.ndarray
+    camera: np.ndarray
+    camera_plan: np.ndarray
+    camera_height: np.ndarray
+
+    @property
+    def plan_rms(self) -> float:
+        """Over all times, metres."""
+        return rms(self.plan)
+
+    @property
+    def height_rms(self) -> float:
+        """Over all times, metres."""
+        return rms(self.height)
+
+    @property
+    def camera_height_rms(self) -> float:
+        """Over all times, metres."""
+        return rms(self.camera_height)
+
+    @property
+    def worst(self) -> float:
+        """Largest RMS in height of one time, metres."""
+        return float(self.height.max())
+
+
+@dataclass(frozen=True, eq=False)
+class Conversion:
+    """Metres of height for one arcsecond, at the reference time.
+
+    Attributes:
+        traced: camera -> height change when this camera alone is turned by 1 arcsec about its Y, by the trace, m.
+        angle_step: camera -> what that turn does to the intersection angle by the trace, arcsec.
+        theory: camera -> the same by base to height: slant range x 1 arcsec / cos(incidence) over the difference of the
+            tangents of both incidences, m.
+        base_to_height: that difference.
+    """
+
+    traced: Mapping[str, float]
+    angle_step: Mapping[str, float]
+    theory: Mapping[str, float]
+    base_to_height: float
+
+    @property
+    def of_angle(self) -> float:
+        """Metres per arcsec of the angle when both cameras turn by half of it against one another."""
+        first, second = self.traced.values()
+        return 0.5 * (first - second)
+
+    @property
+    def of_common(self) -> float:
+        """Metres per arcsec by which both cameras turn alike, which leaves the angle as it is."""
+        return float(sum(self.traced.values()))
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """Height errors of one time's points when the monitor measures again and again.
+
+    Attributes:
+        heights: (R,) mean height error from the monitor's values alone, metres.
+        sigma: by propagation of the claimed covariance, metres, mean over the repeats.
+    """
+
+    heights: np.ndarray
+    sigma: float
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation seen, metres."""
+        return float(np.std(self.heights, ddof=1))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Of spread / sigma, exceeded with a chance of `FALSE_ALARM`."""
+        free = len(self.heights) - 1
+        low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], free)
+        return float(np.sqrt(low / free)), float(np.sqrt(high / free))
+
+    @property
+    def agrees(self) -> bool:
+        """The spread lies within the limits."""
+        low, high = self.limits
+        return low < self.spread / self.sigma < high
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorRun:
+    """A finished test.
+
+    Attributes:
+        flight: truth and measurements.
+        cases: of `CASES` -> errors.
+        intervals: seconds -> errors with values interpolated over it.
+        angle: (T,) change of the intersection angle by the monitor, radians; angle_sigma likewise.
+        slopes: camera -> (T, 4) change of the mean height with the parameters that the analysis assumes, m/rad, m/m.
+        sigma: (T,) of the mean height by propagation of the monitor's covariance, metres.
+        parts: name -> (T,) parts of the monitored cameras' mean height error, metres.
+        conversion: arcseconds to metres.
+        scatter: of repeated measurements.
+        residual: largest angle between a true line and the calibrated one corrected by the true four parameters, over
+            the line and all times, radians.
+    """
+
+    flight: MonitorFlight
+    cases: Mapping[str, CaseErrors]
+    intervals: Mapping[float, CaseErrors]
+    angle: np.ndarray
+    angle_sigma: np.ndarray
+    slopes: Mapping[str, np.ndarray]
+    sigma: np.ndarray
+    parts: Mapping[str, np.ndarray]
+    conversion: Conversion
+    scatter: Scatter
+    residual: float
+
+    @property
+    def angle_change(self) -> np.ndarray:
+        """(T,) true, radians."""
+        return np.asarray(self.flight.angle - self.flight.angle[self.flight.spec.referred])
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def run_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
+    """Fly, measure, intersect. Raises BenchError, InputError as `fly_monitored`."""
+    flight = fly_monitored(setup, backend, seed, advance)
+    try:
+        return analysed(flight)
+    except IntersectionError as error:
+        raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
+
+
+def analysed(flight: MonitorFlight) -> MonitorRun:
+    """All cases of a flight."""
+    count, spec = len(flight.times), flight.spec
+    said = {n: flight.monitored[n].vector * _mask(flight) for n in flight.pair}
+    changes = {
+        "none": {n: np.zeros((count, 4)) for n in flight.pair},
+        "monitored": said,
+        "interval": _interpolated(flight, said, spec.interval),
+        "parameters": dict(flight.truth),
+    }
+    true = _intersected(flight, [_true_pair(flight, k) for k in range(count)])
+    cases = {name: _errors(_intersected(flight, _corrected(flight, each)), true) for name, each in changes.items()}
+    cases["true"] = _errors(true, true)
+    intervals = {
+        interval: _errors(_intersected(flight, _corrected(flight, _interpolated(flight, said, interval))), true)
+        for interval in spec.compared
+    }
+    slopes = _slopes(flight)
+    spread = sum(_propagated(flight, slopes, n, flight.monitored[n]) for n in flight.pair)
+    first, second = (flight.monitored[n] for n in flight.pair)
+    angle = exact(first, second, *flight.looks)
+    return MonitorRun(
+        flight,
+        FrozenMap(cases),
+        FrozenMap(intervals),
+        angle.change_rad,
+        angle.sigma_rad,
+        FrozenMap(slopes),
+        np.sqrt(spread),
+        FrozenMap(_parts(flight, slopes, cases)),
+        _conversion(flight),
+        _scatter(flight, slopes),
+        max(_residual(flight, n, k) for n in flight.pair for k in range(count)),
+    )
+
+
+def _mask(flight: MonitorFlight) -> np.ndarray:
+    """(4,) 1 for parameters that are applied."""
+    return np.array([float(name in flight.spec.apply) for name in PARAMETERS])
+
+
+def _interpolated(flight: MonitorFlight, said: Mapping[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
+    at = flight.spec.measured(interval)
+    return {n: between(flight.times, flight.times[at], values[at]) for n, values in said.items()}
+
+
+def _corrected(flight: MonitorFlight, changes: Mapping[str, np.ndarray]) -> list[list[CalibratedLine]]:
+    return [[flight.calibrated[n].corrected(changes[n][k]) for n in flight.pair] for k in range(len(flight.times))]
+
+
+def _true_pair(flight: MonitorFlight, k: int) -> list[CalibratedLine]:
+    return [flight.true_line(n, k) for n in flight.pair]
+
+
+def _found(flight: MonitorFlight, cameras: list[CalibratedLine], k: int, exact_data: bool = False) -> np.ndarray:
+    """Errors (n, 3) east, north, up of time number k."""
+    view = flight.views[k]
+    seen = view.exact if exact_data else view.seen
+    return check_errors(intersect_pair(cameras[0], cameras[1], *seen).ground, view.ground).error
+
+
+def _intersected(flight: MonitorFlight, cameras: list[list[CalibratedLine]]) -> np.ndarray:
+    """(T, n, 3) errors."""
+    return np.array([_found(flight, pair, k) for k, pair in enumerate(cameras)])
+
+
+def _errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
+    alone = found - true
+    return CaseErrors(
+        plan=np.sqrt(np.mean(np.sum(found[..., :2] ** 2, axis=-1), axis=1)),
+        height=np.sqrt(np.mean(found[..., 2] ** 2, axis=1)),
+        bias=found[..., 2].mean(axis=1),
+        camera=alone[..., 2].mean(axis=1),
+        camera_plan=np.sqrt(np.mean(np.sum(alone[..., :2] ** 2, axis=-1), axis=1)),
+        camera_height=np.sqrt(np.mean(alone[..., 2] ** 2, axis=1)),
+    )
+
+
+def _slopes(flight: MonitorFlight) -> dict[str, np.ndarray]:
+    """By central differences of the intersection of exact image points by the calibrated cameras."""
+    out = {}
+    for i, name in enumerate(flight.pair):
+        table = np.empty((len(flight.times), 4))
+        for k in range(len(flight.times)):
+            for j, step in enumerate(_STEP):
+                ends = []
+                for sign in (1.0, -1.0):
+                    pair = [flight.calibrated[n] for n in flight.pair]
+                    pair[i] = pair[i].corrected(sign * step * np.eye(4)[j])
+                    ends.append(float(_found(flight, pair, k, exact_data=True)[:, 2].mean()))
+                table[k, j] = (ends[0] - ends[1]) / (2.0 * step)
+        out[name] = table
+    return out
+
+
+def _propagated(
+    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], name: str, said: CameraParameters, at: int | None = None
+) -> np.ndarray:
+    """Variance of the mean height by one camera's values, m^2; ``at``: all of them belong to this time."""
+    slope = (slopes[name] if at is None else slopes[name][at]) * _mask(flight)
+    return np.asarray(np.einsum("...i,...ij,...j->...", slope, said.covariance, slope))
+
+
+def _parts(
+    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], cases: Mapping[str, CaseErrors]
+) -> dict[str, np.ndarray]:
+    def height(values: Mapping[str, np.ndarray]) -> np.ndarray:
+        every = [np.sum(slopes[n] * _mask(flight) * values[n], axis=1) for n in flight.pair]
+        return np.asarray(np.sum(every, axis=0))
+
+    system = {n: flight.clean[n] - flight.truth[n] for n in flight.pair}
+    left_out = {n: -flight.truth[n] * (1.0 - _mask(flight)) for n in flight.pair}
+    unused = np.sum([np.sum(slopes[n] * left_out[n], axis=1) for n in flight.pair], axis=0)
+    return {
+        "prisms": height(flight.prisms),
+        "other_systematic": height({n: system[n] - flight.prisms[n] for n in flight.pair}),
+        "noise": height({n: flight.monitored[n].vector - flight.clean[n] for n in flight.pair}),
+        "not_applied": np.asarray(unused),
+        "beyond_parameters": cases["parameters"].camera,
+        "interpolation": cases["interval"].camera - cases["monitored"].camera,
+    }
+
+
+def _conversion(flight: MonitorFlight) -> Conversion:
+    """At the reference, where the calibrated cameras are the true ones."""
+    k = flight.spec.referred
+    view, traced, step = flight.views[k], {}, {}
+    lines = flight.lines[k]
+    first, second = flight.pair
+    plain = look_angle(lines[first], lines[second])
+    calm = _found(flight, _true_pair(flight, k), k, exact_data=True)[:, 2].mean()
+    slant, incidence = {}, {}
+    up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
+    for i, name in enumerate(flight.pair):
+        turned = flight.turned[name]
+        pair = _true_pair(flight, k)
+        pair[i] = in_analysis(turned, flight.calibrated[name])
+        traced[name] = float(_found(flight, pair, k, exact_data=True)[:, 2].mean() - calm)
+        both = {**lines, name: turned}
+        step[name] = (look_angle(both[first], both[second]) - plain) / ARCSEC
+        arm = view.exact[i].station - view.ground
+        slant[name] = np.linalg.norm(arm, axis=1)
+        forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
+        incidence[name] = np.arctan2(-np.sum(arm * forward, axis=1), np.sum(arm * up, axis=1))
+    ratio = np.tan(incidence[first]) - np.tan(incidence[second])
+    # a ray that is taken to look farther forward passes above the point, and the other ray is met the higher, the more
+    # it comes from ahead
+    theory = {
+        name: float(np.mean(sign * slant[name] * ARCSEC / np.cos(incidence[name]) / ratio))
+        for name, sign in ((first, 1.0), (second, -1.0))
+    }
+    return Conversion(FrozenMap(traced), FrozenMap(step), FrozenMap(theory), float(np.mean(np.abs(ratio))))
+
+
+def _scatter(flight: MonitorFlight, slopes: Mapping[str, np.ndarray]) -> Scatter:
+    """Exact image points, so that the monitor's noise is all there is."""
+    k, mask = flight.worst, _mask(flight)
+    said = {n: flight.repeated[n].vector * mask for n in flight.pair}
+    heights = []
+    for row in range(flight.spec.repeats):
+        pair = [flight.calibrated[n].corrected(said[n][row]) for n in flight.pair]
+        heights.append(_found(flight, pair, k, exact_data=True)[:, 2].mean())
+    variance = sum(_propagated(flight, slopes, n, flight.repeated[n], k) for n in flight.pair)
+    return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))
+
+
+def _residual(flight: MonitorFlight, name: str, k: int) -> float:
+    pixel = np.linspace(0.0, flight.lines[k][name].pixels - 1.0, 101)
+    model = flight.calibrated[name].corrected(flight.truth[name][k]).look(pixel)
+    return float(np.max(np.linalg.norm(model - flight.lines[k][name].look(pixel), axis=-1)))

@@ -1,0 +1,113 @@
+"""Ghosts and stray light on the area CCDs, added to the wave path's images.
+
+The path tracer (``twin.path_tracing``) gives where light goes by all other ways than the nominal one, as geometric rays
+in pixels. That light went through apertures of the same size as the nominal spot's, so that it is spread by the nominal
+spot's diffraction image before it is added. Its interference with the nominal light is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from optics.geometry.tree import State
+from optics.waves.diffraction import Grid, image
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.path_tracing.path_result import Family
+from twin.path_tracing.stray_rays import StrayResult, trace_stray
+
+REACH = 88
+"""Pixels from the middle of the diffraction image out to which stray light is spread."""
+
+FAMILIES = 20
+"""How many families of each source are listed, the strongest first."""
+
+
+@dataclass(frozen=True, eq=False)
+class StrayLight:
+    """Stray light of one state.
+
+    Attributes:
+        photons: expected photons per pixel and frame beside the nominal spot, (C, rows, columns).
+        traced: the path tracer's result.
+        paths: traced for every source.
+    """
+
+    photons: np.ndarray
+    traced: StrayResult
+    paths: int
+
+    def share(self, nominal: np.ndarray) -> np.ndarray:
+        """Stray over nominal light of every area CCD, (C,)."""
+        return np.asarray(self.photons.sum(axis=(1, 2)) / nominal.sum(axis=(1, 2)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Contents of stray.json: by source, the families at any detector and where the light went."""
+        out: dict[str, Any] = {}
+        for channel, run in self.traced.runs.items():
+            families = sorted(self.traced.relative(channel), key=lambda pair: -pair[1])[:FAMILIES]
+            balance = run.balance
+            out[channel] = {
+                "families": [_family(family, share) for family, share in families],
+                "balance": {
+                    "emitted": balance.emitted,
+                    "absorbed": dict(balance.absorbed),
+                    "detected": dict(balance.detected),
+                    "escaped": balance.escaped,
+                    "under_way": balance.under_way,
+                    "relative_error": balance.error,
+                },
+            }
+        return {"paths_per_source": self.paths, "sources": out}
+
+
+def _family(family: Family, share: float) -> dict[str, Any]:
+    return {
+        "detector": family.detector,
+        "kind": family.kind,
+        "surfaces": [str(touch) for touch in family.touches],
+        "relative_to_nominal": share,
+        "paths": family.count,
+        "x_um": 1e6 * family.centroid[0],
+        "y_um": 1e6 * family.centroid[1],
+        "rms_x_um": 1e6 * family.rms[0],
+        "rms_y_um": 1e6 * family.rms[1],
+    }
+
+
+def stray_light(
+    experiment: MonitorExperiment,
+    state: State,
+    paths: int,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> StrayLight:
+    """Trace the stray light of all channels in one state.
+
+    Args:
+        experiment: the instrument.
+        state: what is perturbed.
+        paths: of every source.
+        seed: of the random numbers.
+        progress: told the paths done and in all.
+
+    Raises:
+        NominalPathLost: too few paths, or the perturbation moves a beam off.
+    """
+    traced = trace_stray(experiment.instrument, experiment.backend, state, paths, seed, progress=progress)
+    spots = diffraction_spots(experiment)
+    raw = np.stack([traced.photons[f"{c.key}/area_ccd"] for c in experiment.path.channels])
+    spread = np.stack([fftconvolve(light, spot, mode="same") for light, spot in zip(raw, spots, strict=True)])
+    return StrayLight(np.maximum(spread, 0.0), traced, paths)  # the transform leaves rounding below zero
+
+
+def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
+    """Every channel's diffraction image about its middle, of unit sum, (C, 2 REACH + 1, 2 REACH + 1)."""
+    path = experiment.path
+    grid = Grid(-REACH * path.pitch, path.pitch, 2 * REACH + 1)
+    spots = image(path.fields([{}]), grid, grid, single=True).astype(np.float64)
+    return np.asarray(spots / spots.sum(axis=(1, 2), keepdims=True))

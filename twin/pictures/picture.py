@@ -1,0 +1,223 @@
+"""Pictures of an instrument, rendered by Mitsuba and cleaned of noise.
+
+``picture.png`` shows both cameras, ``picture_prisms.png`` the central prism and what is next to it, and
+``picture_focal_plane.png`` the detectors of the first camera. They are for looking at, not for measuring: lines of
+light are drawn a few pixels thick, and the room is a photographer's studio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from scenes.models.instrument_model import Instrument
+from scenes.specs.channel import BASE, CENTRAL_PRISM
+from twin.pictures.light_paths import LightPaths, trace_light_paths
+from twin.pictures.picture_light import PictureError, Studio, colour_variant
+from twin.pictures.picture_scene import Part, View, framed, points_in_world, studio_parts
+from twin.pictures.scene_file import build_scene
+
+BLUR, BLUR_SHARE = (6.0, 16.0), 0.025
+"""Over how many pixels the light on a flat patch is averaged: limits, and share of the root of its area."""
+EXPOSURE = 0.88
+SHOULDER = 0.75
+"""Exposed light above this is compressed, so that nothing is burnt out."""
+
+
+def still_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[bool]) -> np.ndarray:
+    """Numbers of the flat patches of matt surfaces, (H, W); -1 on their borders and everywhere else.
+
+    Args:
+        seen: some looks at the scene: number of the part (H, W), -1 for none, and normal (H, W, 3).
+        matt: of every part, whether the light on it changes slowly.
+    """
+    first, square = _patches(*seen[0]), np.ones((3, 3), np.uint8)
+    still = np.array([*matt, False])[seen[0][0]]
+    for part, normal in seen:  # a border is a pixel that shows two things in any look, and its neighbours
+        patches = _patches(part, normal)
+        still &= (patches == first) & (cv2.dilate(patches, square) == cv2.erode(patches, square))
+    return np.where(still, first, -1.0).astype(np.int64)
+
+
+def without_grain(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
+    """Average the light over each patch; what belongs to none stays as it is.
+
+    Args:
+        image: (H, W, 3) rendered light.
+        patches: (H, W) numbers, -1 for none.
+    """
+    out = image.astype(np.float32)
+    for value in np.unique(patches[patches >= 0]):
+        mask = patches == value
+        blur = float(np.clip(BLUR_SHARE * np.sqrt(mask.sum()), *BLUR))
+        margin = int(3.0 * blur)
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        window = np.s_[max(rows[0] - margin, 0) : rows[-1] + margin, max(columns[0] - margin, 0) : columns[-1] + margin]
+        weight = mask[window].astype(np.float32)
+        light = cv2.GaussianBlur(image[window].astype(np.float32) * weight[..., None], (0, 0), blur)
+        share = cv2.GaussianBlur(weight, (0, 0), blur)
+        out[window][mask[window]] = (light / np.maximum(share, 1e-6)[..., None])[mask[window]]
+    return out
+
+
+def displayed(light: np.ndarray) -> np.ndarray:
+    """Light -> sRGB grey values, uint8."""
+    x = np.clip(EXPOSURE * light, 0.0, None)
+    room = 1.0 - SHOULDER
+    x = np.where(x > SHOULDER, SHOULDER + room * -np.expm1(-(x - SHOULDER) / room), x)
+    grey = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1.0 / 2.4) - 0.055)
+    return np.asarray(np.rint(255.0 * np.clip(grey, 0.0, 1.0)), dtype=np.uint8)
+
+
+def _patches(part: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """A number for every part and direction of its surface, float32 (H, W); exact for up to 16000 parts."""
+    steps = np.rint(4.0 * normal).astype(int) + 5
+    return (part * 1000 + steps @ np.array([1, 10, 100])).astype(np.float32)
+
+
+PICTURE = "render the pictures"
+"""Name of the work in the progress display."""
+
+LOOKS = ((0.0, 0.0), (-0.35, -0.25), (0.35, 0.25))
+"""Where in a pixel it is looked at to find out whether it shows one thing only, pixels from its middle."""
+
+Advance = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture.
+
+    Attributes:
+        name: of the file.
+        width, height: pixels.
+        coarse, fine: samples per pixel, of matt surfaces (which are smoothed) and of all else.
+        shows: ``instrument``, ``prisms`` or ``focal_plane``.
+    """
+
+    name: str
+    width: int
+    height: int
+    coarse: int
+    fine: int
+    shows: str
+
+
+SHOTS = (
+    Shot("picture.png", 1600, 1000, 8, 48, "instrument"),
+    Shot("picture_prisms.png", 1200, 750, 8, 64, "prisms"),
+    Shot("picture_focal_plane.png", 1200, 500, 8, 32, "focal_plane"),
+)
+
+
+def write_pictures(
+    instrument: Instrument,
+    backend: Backend,
+    state: State,
+    write: Callable[[str, Callable[[Path], None]], None],
+    seed: int = 0,
+    advance: Advance = lambda part, done, total: None,
+    shots: tuple[Shot, ...] = SHOTS,
+) -> None:
+    """Render the pictures of an instrument in a perturbed state and hand them over as PNG files.
+
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
+        state: what is perturbed; motions are far too small to be seen.
+        write: takes the name of a file and what writes it, e.g. ``RunFolder.write_with``.
+        seed: of the samples.
+        advance: told how many percent of all pictures are done.
+        shots: which pictures.
+
+    Raises:
+        PictureError: Mitsuba cannot run the variant that the pictures need, or fails.
+    """
+    paths = trace_light_paths(instrument, backend, state)
+    pixels = [shot.width * shot.height for shot in shots]
+    for k, shot in enumerate(shots):
+        before, own = sum(pixels[:k]) / sum(pixels), pixels[k] / sum(pixels)
+
+        def say(share: float, before: float = before, own: float = own) -> None:
+            advance(PICTURE, round(100.0 * (before + own * share)), 100)
+
+        image = render_shot(instrument, paths, backend, shot, seed, say)
+        write(shot.name, partial(_save, image))
+
+
+def _save(image: np.ndarray, place: Path) -> None:
+    ok, encoded = cv2.imencode(".png", image[..., ::-1])
+    if not ok:
+        raise PictureError(f"{place.name} cannot be encoded as PNG")
+    place.write_bytes(encoded.tobytes())
+
+
+def render_shot(
+    instrument: Instrument,
+    paths: LightPaths,
+    backend: Backend,
+    shot: Shot,
+    seed: int = 0,
+    advance: Callable[[float], None] = lambda share: None,
+) -> np.ndarray:
+    """One picture, (height, width, 3) uint8, red first.
+
+    Raises:
+        PictureError: Mitsuba cannot run the variant that the pictures need, or fails.
+    """
+    view, parts = staged(instrument, paths, shot)
+    with colour_variant(backend) as mi:
+        studio = Studio(mi, parts, view)
+        seen = [studio.first_hits(x, y) for x, y in LOOKS]
+        patches = still_patches(seen, [part.matt for part in parts])
+        plain = np.flatnonzero(patches >= 0)
+        busy = np.flatnonzero(patches < 0)
+        work = len(plain) * shot.coarse + len(busy) * shot.fine
+        image = np.zeros((shot.height * shot.width, 3))
+        done = 0
+        for pixels, samples in ((plain, shot.coarse), (busy, shot.fine)):
+            for chosen in studio.chunks(pixels, samples):
+                image[chosen] = studio.light(chosen, samples, seed)
+                done += len(chosen) * samples
+                advance(done / work)
+    return displayed(without_grain(image.reshape(shot.height, shot.width, 3), patches))
+
+
+def which_body(instrument: Instrument, paths: LightPaths, backend: Backend, shot: Shot) -> tuple[np.ndarray, list[str]]:
+    """What the middle of every pixel shows first: (height, width) number into the list of bodies, -1 for nothing.
+
+    Raises:
+        PictureError: as for ``render_shot``.
+    """
+    view, parts = staged(instrument, paths, shot)
+    with colour_variant(backend) as mi:
+        index, _ = Studio(mi, parts, view).first_hits(0.0, 0.0)
+    return index, [part.body for part in parts]
+
+
+def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View, list[Part]]:
+    """Where the camera of a picture stands, and all that it may see."""
+    points = points_in_world(build_scene(instrument, paths))
+    if shot.shows == "instrument":
+        wanted, (azimuth, elevation, field) = list(points), (-66.0, 24.0, 28.0)
+    elif shot.shows == "prisms":
+        wanted = [name for name in points if name.startswith(CENTRAL_PRISM) or name.endswith("prism_0")]
+        azimuth, elevation, field = -66.0, 24.0, 24.0
+    else:
+        plane = f"{BASE}/{next(iter(instrument.cameras))}/focal_plane"
+        wanted = [name for name in points if name.startswith(plane)]
+        # into the housing, against the light, a little from the side
+        x, y, z = -paths.placed.pose(plane).rotation[:, 2]
+        azimuth = float(np.degrees(np.arctan2(y, x))) + 12.0
+        elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y)))) + 5.0
+        field = 24.0
+    shown = np.concatenate([points[name] for name in wanted])
+    view = framed(shown, azimuth, elevation, field, (shot.width, shot.height))
+    return view, studio_parts(instrument, paths, view.pixel_at(shown))

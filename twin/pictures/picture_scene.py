@@ -1,0 +1,354 @@
+"""The scene of a picture: from where it is seen, and what stands in it.
+
+Bodies come from ``twin.pictures.scene_file``, so that a picture and ``scene.glb`` show the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from scenes.models.instrument_model import Instrument
+from scenes.models.meshes import behind
+from scenes.specs.channel import BASE
+from twin.pictures.light_paths import LightPaths
+from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON, build_scene
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A pinhole camera; +Z of the base frame is up in the picture.
+
+    Attributes:
+        eye: where it stands, metres.
+        forward, right, up: unit vectors in the base frame.
+        half_width: tangent of half the horizontal field.
+        width, height: of the picture, pixels.
+    """
+
+    eye: np.ndarray
+    forward: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+    half_width: float
+    width: int
+    height: int
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """World points (N, 3) -> column and row, (N, 2) pixels from the picture's top left corner."""
+        away = np.asarray(points, dtype=float) - self.eye
+        scale = 0.5 * self.width / self.half_width / (away @ self.forward)
+        return np.stack(
+            [0.5 * self.width + scale * (away @ self.right), 0.5 * self.height - scale * (away @ self.up)], axis=-1
+        )
+
+    def pixel_at(self, points: np.ndarray) -> float:
+        """Size of a pixel in the middle of points, metres."""
+        depth = float((np.asarray(points) - self.eye).mean(axis=0) @ self.forward)
+        return 2.0 * self.half_width * depth / self.width
+
+    @property
+    def horizontal_field(self) -> float:
+        """Horizontal field of view, degrees."""
+        return float(np.degrees(2.0 * np.arctan(self.half_width)))
+
+
+def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Forward, right and up of a camera that stands at an azimuth (from +X toward +Y) and elevation, degrees."""
+    a, e = np.radians([azimuth, elevation])
+    forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return forward, right, np.cross(right, forward)
+
+
+def framed(
+    points: np.ndarray,
+    azimuth: float,
+    elevation: float,
+    field: float,
+    size: tuple[int, int],
+    margin: float = 0.04,
+) -> View:
+    """The nearest camera of a direction that has all points in its picture.
+
+    Args:
+        points: (N, 3), metres.
+        azimuth: of the camera as seen from the points, from +X toward +Y, degrees.
+        elevation: likewise, toward +Z, degrees.
+        field: horizontal field of view, degrees.
+        size: width and height, pixels.
+        margin: share of the width that stays free on every side.
+    """
+    width, height = size
+    forward, right, up = looking(azimuth, elevation)
+    half_width = float(np.tan(np.radians(0.5 * field)))
+    depth = points @ forward
+    slope = np.array([1.0 - 2.0 * margin, height / width - 2.0 * margin]) * half_width
+    middle, distance = np.zeros(2), np.zeros(2)
+    for i, axis in enumerate((right, up)):
+        # both edges of the picture touch the outermost points: |across - middle| = slope (depth - distance)
+        across = points @ axis
+        high, low = np.max(across - slope[i] * depth), np.max(-across - slope[i] * depth)
+        middle[i], distance[i] = 0.5 * (high - low), -0.5 * (high + low) / slope[i]
+    eye = middle[0] * right + middle[1] * up + float(distance.min()) * forward
+    return View(eye, forward, right, up, half_width, width, height)
+
+
+SMOOTH = 0.35
+"""Edges flatter than this are not edges but facets of a curved surface, radians."""
+BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
+"""Radius of beams and of the drawn edges of glass, in pixels at the middle of the picture."""
+GLOW = 1.3
+"""Radiance of beams; the floor's is about 0.9."""
+FLOOR = "floor"
+GAP = 0.05
+"""From the lowest point of the instrument to the floor, metres."""
+
+_GLASS_EDGE = (0.03, 0.12, 0.15)
+_BSDF: dict[str, dict[str, Any]] = {
+    "mirror": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "conductor",
+            "material": "none",
+            "specular_reflectance": {"type": "rgb", "value": [0.93, 0.935, 0.94]},
+        },
+    },
+    "substrate": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.30, 0.29, 0.275]},
+            "roughness": 0.45,
+            "specular": 0.4,
+        },
+    },
+    "block": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.32, 0.42, 0.48]},
+            "roughness": 0.25,
+            "specular": 0.5,
+        },
+    },
+    "board": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.025, 0.028, 0.034]},
+            "roughness": 0.45,
+        },
+    },
+    "silicon": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.06, 0.16, 0.62]},
+            "metallic": 0.6,
+            "roughness": 0.35,
+        },
+    },
+    "gold": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": [0.95, 0.66, 0.2]},
+            "metallic": 0.9,
+            "roughness": 0.3,
+        },
+    },
+    "glass": {
+        "type": "dielectric",
+        "int_ior": 1.457,
+        "ext_ior": 1.0,
+        "specular_transmittance": {"type": "rgb", "value": [0.80, 0.93, 0.95]},
+    },
+    "edge": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": _GLASS_EDGE}}},
+    "lamp": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+    "floor": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.80, 0.80, 0.80]}},
+}
+_MATERIALS = (
+    (MIRROR, "mirror"),
+    (DARK, "board"),
+    (SILICON, "silicon"),
+    (BRASS, "gold"),
+    (GLASS, "glass"),
+    (BLOCK, "block"),
+)
+"""What a body is painted with in ``scene.glb``, and what it is made of here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A mesh of one material.
+
+    Attributes:
+        body: path of the body that it belongs to; ``light/...`` for beams, ``floor``.
+        mesh: in the base frame, metres.
+        bsdf: Mitsuba's description of the material.
+        radiance: red, green, blue that it emits.
+        matt: whether light on it changes slowly: neither mirror nor glass, and no thin line.
+    """
+
+    body: str
+    mesh: trimesh.Trimesh
+    bsdf: Mapping[str, Any]
+    radiance: tuple[float, float, float] | None = None
+    matt: bool = True
+
+
+def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> list[Part]:
+    """All that stands in the studio.
+
+    Args:
+        instrument: the instrument.
+        paths: its beams and where its bodies stand.
+        pixel: size of a picture's pixel at the instrument, metres; it decides how thick lines are drawn.
+    """
+    scene = build_scene(instrument, paths, tube=BEAM_PIXELS * pixel)
+    backs = {
+        f"{BASE}/{camera}/{mirror}": behind(model, mirror)
+        for camera, model in instrument.cameras.items()
+        for mirror in model.mirrors
+    }
+    parts: list[Part] = []
+    lowest = np.inf
+    for name in scene.graph.nodes_geometry:
+        matrix, geometry = scene.graph.get(name)
+        own = scene.geometry[geometry]
+        world = trimesh.Trimesh(own.vertices, own.faces, process=False)
+        world.apply_transform(matrix)
+        lowest = min(lowest, float(world.bounds[0, 2]))
+        material = own.visual.material
+        if name.startswith("light/"):
+            colour = _linear(material.baseColorFactor[:3])
+            parts.append(Part(name, world, _BSDF["lamp"], tuple(GLOW * colour), False))
+            continue
+        kind = next((kind for known, kind in _MATERIALS if known is material), "")
+        if name in backs:
+            polished = own.face_normals[:, 2] * backs[name] < -0.5
+            parts.append(Part(name, _part_of(world, polished), _BSDF["mirror"], matt=False))
+            parts.append(Part(name, _part_of(world, ~polished), _BSDF["substrate"]))
+        else:
+            matt = kind not in ("mirror", "glass")
+            parts.append(Part(name, world, _BSDF.get(kind) or _paint(material), matt=matt))
+        if kind in ("glass", "block"):
+            parts.append(Part(name, _edges(world, EDGE_PIXELS * pixel), _BSDF["edge"], matt=False))
+    parts.append(Part(FLOOR, _floor(lowest - GAP), _BSDF["floor"]))
+    return parts
+
+
+def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
+    """Name of a node with a mesh -> its vertices in the base frame, (N, 3) metres."""
+    out = {}
+    for name in scene.graph.nodes_geometry:
+        matrix, geometry = scene.graph.get(name)
+        out[name] = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
+    return out
+
+
+def _paint(material: Any) -> dict[str, Any]:
+    """What ``scene.glb`` has a body painted with."""
+    return {
+        "type": "twosided",
+        "bsdf": {
+            "type": "principled",
+            "base_color": {"type": "rgb", "value": _linear(material.baseColorFactor[:3]).tolist()},
+            "metallic": float(material.metallicFactor),
+            "roughness": float(material.roughnessFactor),
+        },
+    }
+
+
+def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[faces], process=False)
+
+
+def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
+    """The sharp edges of a body as thin rods."""
+    sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > SMOOTH]
+    rods = [
+        trimesh.creation.cylinder(radius=radius, segment=mesh.vertices[ends], sections=6)
+        for ends in sharp
+        if np.ptp(mesh.vertices[ends], axis=0).max() > 0.0
+    ]
+    joined = trimesh.util.concatenate(rods)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
+
+
+def _floor(height: float, reach: float = 500.0) -> trimesh.Trimesh:
+    corners = reach * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    corners[:, 2] = height
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def _linear(colour: Any) -> np.ndarray:
+    """Grey values of sRGB, 0..255, -> linear 0..1."""
+    value = np.asarray(colour, dtype=float) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
+    """Soft neutral light from all sides, two large soft boxes beside and above the camera, a dark horizon opposite."""
+    theta = np.pi * (np.arange(rows) + 0.5) / rows
+    phi = 2.0 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
+    polar, azimuth = np.meshgrid(theta, phi, indexing="ij")
+    # Mitsuba's maps have +Y up; to_world below turns it to +Z, and longitude then runs from +Y toward +X
+    toward = np.stack([np.sin(polar) * np.sin(azimuth), np.sin(polar) * np.cos(azimuth), np.cos(polar)], axis=-1)
+    height = toward[..., 2]
+    flat = -np.array([view.forward[0], view.forward[1], 0.0])
+    flat /= np.linalg.norm(flat)  # horizontally toward the camera
+    side = np.array([view.right[0], view.right[1], 0.0])
+    # mirrors show what is behind the instrument: it is dark near the floor, so that they stand out from the floor
+    behind_it = np.clip(toward @ -flat, 0.0, 1.0)
+    rise = np.clip(height / 0.75, 0.0, 1.0)
+    level = 0.55 + 0.45 * np.clip(height, 0.0, 1.0)
+    level = level + np.sqrt(behind_it) * (0.10 + 1.0 * rise**1.5 - level)
+    for place, reach, strength in (
+        (0.60 * flat - 0.75 * side + 0.85 * np.array([0, 0, 1]), 0.55, 1.5),
+        (0.45 * flat + 0.90 * side + 0.80 * np.array([0, 0, 1]), 0.40, 0.9),
+    ):
+        off = np.arccos(np.clip(toward @ (place / np.linalg.norm(place)), -1.0, 1.0))
+        level = level + strength / (1.0 + np.exp((off - reach) / 0.05))
+    colour = np.repeat(level[..., None], 3, axis=-1).astype(np.float32)
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(colour),
+        "to_world": mi.ScalarTransform4f().rotate([1.0, 0.0, 0.0], 90.0),
+    }
+
+
+def load_studio(mi: Any, parts: list[Part], view: View) -> Any:
+    """A ``mi.Scene`` of the parts under the studio's light; Mitsuba's index of a shape is the number of the part."""
+    names = [f"part{i:04d}" for i in range(len(parts))]
+    description: dict[str, Any] = {"type": "scene", "light": studio_light(mi, view)}
+    for name, part in zip(names, parts, strict=True):
+        description[name] = _mesh(mi, name, part)
+    scene = mi.load_dict(description, optimize=False)
+    if [shape.id() for shape in scene.shapes()] != names:
+        raise RuntimeError("mitsuba has put the shapes of a scene in another order")
+    return scene
+
+
+def _mesh(mi: Any, name: str, part: Part) -> Any:
+    smooth = trimesh.graph.smooth_shade(part.mesh, angle=SMOOTH)
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(dict(part.bsdf))
+    if part.radiance is not None:
+        # no light is sampled toward the many thin beams; a ray that meets one sees it
+        light = {"type": "area", "sampling_weight": 0.0, "radiance": {"type": "rgb", "value": list(part.radiance)}}
+        properties["emitter"] = mi.load_dict(light)
+    mesh = mi.Mesh(name, len(smooth.vertices), len(smooth.faces), has_vertex_normals=True, props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(smooth.vertices, dtype=np.float32).ravel())
+    parameters["vertex_normals"] = mi.Float(np.ascontiguousarray(smooth.vertex_normals, dtype=np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.ascontiguousarray(smooth.faces, dtype=np.uint32).ravel())
+    parameters.update()
+    return mesh

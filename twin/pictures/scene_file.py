@@ -1,0 +1,190 @@
+"""``scene.glb``: the perturbed instrument and its light paths in three dimensions, for any glTF viewer.
+
+The scene is in the base frame, in metres (X = flight direction, Y = along the line CCDs, Z toward the scene). Every
+body of the tree is a node whose name is the body's path; a viewer shows the tree as the twin has it. Mirrors have their
+true shape and clear aperture; figure errors, far too small to be seen, are left out. What has no size of its own
+(board, reticle) is given one that is easy to see; the light-sensitive faces are to scale.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from trimesh.visual.material import PBRMaterial
+
+from optics.geometry.aperture import Circle
+from optics.geometry.solid import solid_mesh
+from optics.geometry.tree import State
+from scenes.models.instrument_model import Instrument
+from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
+from scenes.specs.baffle import Plate
+from scenes.specs.channel import BASE, Channel
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.pictures.light_paths import RIM, Beam, LightPaths, trace_light_paths
+
+LINE_WIDTH = 0.002
+RETICLE = 0.0005
+"""Width of the line CCD and radius of the reticle as drawn, metres."""
+SHEET = 0.001
+"""Thickness of baffles as drawn, metres."""
+TUBE = 0.0015
+TUBE_SIDES = 5
+"""Radius of drawn rays, metres, and their number of sides."""
+
+_WORLD = "world"
+
+
+def _metal(
+    red: int, green: int, blue: int, metallic: float = 0.55, roughness: float = 0.25, alpha: int = 255
+) -> PBRMaterial:
+    return PBRMaterial(
+        baseColorFactor=[red, green, blue, alpha],
+        metallicFactor=metallic,
+        roughnessFactor=roughness,
+        alphaMode="BLEND" if alpha < 255 else "OPAQUE",
+        doubleSided=True,
+    )
+
+
+MIRROR = _metal(205, 208, 214)
+DARK = _metal(60, 64, 72, 0.2, 0.7)
+BAFFLE = _metal(30, 32, 36, 0.0, 0.9)
+SILICON = _metal(40, 60, 130, 0.3, 0.3)
+BRASS = _metal(200, 160, 60)
+GLASS = _metal(120, 190, 210, 0.1, 0.1, 110)
+BLOCK = _metal(150, 170, 185, 0.2, 0.3)
+IMAGING = (_metal(0, 114, 178, 0.0, 0.8), _metal(86, 180, 233, 0.0, 0.8))
+MONITOR = (_metal(213, 94, 0, 0.0, 0.8), _metal(230, 159, 0, 0.0, 0.8))
+
+
+def write_scene(experiment: MonitorExperiment, state: State, place: Path) -> None:
+    """Write the instrument in a perturbed state as binary glTF.
+
+    Args:
+        experiment: the instrument and where to trace.
+        state: what is perturbed.
+        place: the file, ``scene.glb``.
+    """
+    paths = trace_light_paths(experiment.instrument, experiment.backend, state)
+    place.write_bytes(build_scene(experiment.instrument, paths).export(file_type="glb"))
+
+
+def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -> trimesh.Scene:
+    """The scene as a tree of nodes with the bodies' names; rays are tubes of radius ``tube``, metres."""
+    meshes = body_meshes(instrument, paths)
+    scene = trimesh.Scene(base_frame=_WORLD)
+    placed = paths.placed
+    for body in instrument.assembly.tree.bodies:
+        parent = body.parent or _WORLD
+        pose = placed.pose(body.path)
+        relative = placed.pose(body.parent).inverse() @ pose if body.parent else pose
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = relative.rotation, relative.translation
+        scene.graph.update(body.path, parent, matrix=matrix)
+        mesh = meshes.get(body.path)
+        if mesh is not None:
+            mesh.vertices = mesh.vertices * placed.scale[0, placed.index[body.path]].real
+            scene.geometry[body.path] = mesh
+            scene.graph.update(body.path, parent, matrix=matrix, geometry=body.path)
+    for name, (carrier, mesh) in baffle_meshes(instrument.baffles).items():
+        node = f"baffles/{name}"
+        scene.geometry[node] = mesh
+        scene.graph.update(node, carrier, matrix=np.eye(4), geometry=node)
+    for beam in paths.beams:
+        name = f"light/{beam.camera}/{beam.name.replace(' ', '_')}"
+        scene.geometry[name] = _tubes(beam, list(instrument.cameras).index(beam.camera), tube)
+        scene.graph.update(name, _WORLD, matrix=np.eye(4), geometry=name)
+    return scene
+
+
+def body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
+    """Body path -> mesh in the body's own frame, metres, unscaled."""
+    out: dict[str, trimesh.Trimesh] = {}
+    for camera, model in instrument.cameras.items():
+        for mirror in model.mirrors:
+            mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror))
+            out[f"{BASE}/{camera}/{mirror}"] = _painted(mesh, MIRROR)
+        plane = f"{BASE}/{camera}/focal_plane"
+        line = model.spec.line.pixels * model.spec.line.pitch
+        channels = [c for c in instrument.channels if c.camera == camera]
+        reach_x, reach_y = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
+        # light arrives along +Z of the focal plane, so what carries the detectors stands on the +Z side
+        out[plane] = _painted(_box((reach_x, reach_y, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
+        out[f"{plane}/line"] = _painted(_box((LINE_WIDTH, line, CHIP), 0.5 * CHIP), SILICON)
+        for channel in channels:
+            out.update(_channel_meshes(instrument, channel))
+    placed = paths.placed
+    for solid in instrument.solids:  # as they have grown: brought back to nominal size like all others
+        mesh = solid_mesh(solid, placed).mesh
+        mesh.vertices = mesh.vertices / placed.scale[0, placed.index[solid.path]].real
+        out[solid.path] = _painted(mesh, GLASS if solid.transparent else BLOCK)
+    return out
+
+
+def baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
+    """Name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
+    parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
+    for plate in plates:
+        outline = plate.outline
+        if isinstance(outline, Circle):
+            mesh = trimesh.creation.annulus(outline.inner, outline.radius, SHEET, sections=64)
+        else:
+            mesh = trimesh.creation.box(extents=(2.0 * outline.half_x, 2.0 * outline.half_y, SHEET))
+        matrix = np.eye(4)
+        matrix[:3, :3] = plate.pose.rotation
+        matrix[:3, 3] = plate.pose.apply(np.array([*outline.centre, 0.0]))
+        mesh.apply_transform(matrix)
+        parts.setdefault(plate.name, (plate.body, []))[1].append(mesh)
+    return {name: (body, _painted(trimesh.util.concatenate(meshes), BAFFLE)) for name, (body, meshes) in parts.items()}
+
+
+def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trimesh.Trimesh]:
+    ccd = instrument.spec.monitor.area_ccd
+    face = instrument.assembly.elements[f"{channel.key}/return_face"].aperture
+    assert isinstance(face, Circle)
+    disc = trimesh.creation.cylinder(radius=face.radius, height=CHIP, sections=48)  # a coating, as thick as can be seen
+    disc.apply_translation([0.0, 0.0, 0.5 * CHIP])
+    reticle = trimesh.creation.cylinder(radius=RETICLE, height=CHIP, sections=24)
+    reticle.apply_translation([0.0, 0.0, 0.5 * CHIP])
+    size = (ccd.columns * ccd.pitch, ccd.rows * ccd.pitch, CHIP)
+    return {
+        channel.ccd_body: _painted(_box(size, -0.5 * CHIP), SILICON),  # faces the light along its own +Z
+        channel.reticle_body: _painted(reticle, BRASS),
+        channel.face_body: _painted(disc, MIRROR),
+    }
+
+
+def _box(size: tuple[float, float, float], z: float) -> trimesh.Trimesh:
+    """A box centred on (0, 0, z)."""
+    box = trimesh.creation.box(extents=size)
+    box.apply_translation([0.0, 0.0, z])
+    return box
+
+
+def _painted(mesh: trimesh.Trimesh, material: PBRMaterial) -> trimesh.Trimesh:
+    mesh.visual = trimesh.visual.TextureVisuals(material=material)
+    return mesh
+
+
+def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
+    """The middle ray and some edge rays of a beam as thin tubes."""
+    rays = beam.vertices[[0, *(1 + k * RIM // 4 for k in range(4))]]
+    start, end = rays[:, :-1].reshape(-1, 3), rays[:, 1:].reshape(-1, 3)
+    along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
+    helper = np.where(np.abs(along[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    e1 = np.cross(along, helper)
+    e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
+    e2 = np.cross(along, e1)
+    t = 2.0 * np.pi * np.arange(TUBE_SIDES) / TUBE_SIDES
+    ring = radius * (np.cos(t)[:, None] * e1[:, None] + np.sin(t)[:, None] * e2[:, None])
+    vertices = np.concatenate([start[:, None] + ring, end[:, None] + ring], axis=1)
+    k = np.arange(TUBE_SIDES)
+    next_k = np.roll(k, -1)
+    sides = np.concatenate(
+        [np.stack([k, next_k, k + TUBE_SIDES], 1), np.stack([next_k, next_k + TUBE_SIDES, k + TUBE_SIDES], 1)]
+    )
+    faces = sides + 2 * TUBE_SIDES * np.arange(len(start))[:, None, None]
+    palette = MONITOR if beam.is_monitor else IMAGING
+    return _painted(trimesh.Trimesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), process=False), palette[camera % 2])

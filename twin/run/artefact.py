@@ -1,0 +1,208 @@
+"""Figures, tables and data of reports and run folders, and numbers as text."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from twin.run.data_files import csv_table
+
+MINUS = "\N{MINUS SIGN}"
+SAME = 1e-6
+"""Below this a number per unit motion (arcsec, um) is rounding and is shown as 0."""
+FAR = 3.0
+"""Residuals beyond this many sigma are marked."""
+
+
+def _typeset(text: str) -> str:
+    return text.replace("-", MINUS)
+
+
+def fixed(value: float, decimals: int, sign: bool = False) -> str:
+    """A fixed-point number; what rounds to zero has no sign."""
+    if not math.isfinite(value):
+        return "\N{EM DASH}"
+    rounded = round(value, decimals) + 0.0
+    return _typeset(f"{rounded:+.{decimals}f}" if sign and rounded else f"{rounded:.{decimals}f}")
+
+
+def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4) -> int:
+    """Decimals that show ``sigma`` with that many digits."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return default
+    return min(max(digits - 1 - math.floor(math.log10(sigma)), 0), most)
+
+
+def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool = False) -> str:
+    """A number with some significant digits, one less where a power of ten is written; below ``floor`` it is 0."""
+    if not math.isfinite(value):
+        return "\N{EM DASH}"
+    if value == 0.0 or abs(value) < floor:
+        return "0"
+    value = float(f"{value:.{digits - 1}e}")
+    size = math.floor(math.log10(abs(value)))
+    if size < -3 or size > 6:
+        mantissa, _, exponent = f"{value:{'+' if sign else ''}.{max(digits - 2, 0)}e}".partition("e")
+        return _typeset(f"{mantissa}e{int(exponent)}")
+    text = f"{value:{'+' if sign else ''}.{max(digits - 1 - size, 0)}f}"
+    return _typeset(text)
+
+
+def plain(value: float, digits: int = 5) -> str:
+    """A number that was given, without trailing zeros."""
+    return _typeset(f"{value:.{digits}g}")
+
+
+def residual(value: float, sigma: float) -> float | None:
+    """The ratio value / sigma, or None without noise."""
+    return value / sigma if sigma > 0 else None
+
+
+def tick_text(value: float) -> str:
+    """A whole number with its sign, for axes."""
+    return _typeset(f"{value:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}") if value else "0"
+
+
+def residual_text(ratio: float | None) -> str:
+    """A residual in sigma."""
+    if ratio is None:
+        return "\N{EM DASH}"
+    if abs(ratio) < 10:
+        return fixed(ratio, 1, sign=True)
+    return _typeset(f"{ratio:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
+_SVG_NAMESPACE = 'xmlns="http://www.w3.org/2000/svg"'
+
+Cell = str | float | int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Artefact:
+    """Something to show beside the checks.
+
+    Attributes:
+        name: of its file, without ending: small letters, digits, - and _; unique in its group.
+        title: heading in the report.
+        caption: what it shows, in sentences.
+    """
+
+    name: str
+    title: str
+    caption: str
+
+    def __post_init__(self) -> None:
+        """Refuse names that are no file names."""
+        if not _NAME.fullmatch(self.name):
+            raise ValueError(f"artefact name {self.name!r}: only small letters, digits, - and _ can be used")
+        self.content()
+
+    @property
+    def kind(self) -> str:
+        """``svg``, ``png``, ``csv`` or ``json``; also the ending of the file."""
+        raise NotImplementedError
+
+    def content(self) -> bytes:
+        """What the file holds."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class SvgFigure(Artefact):
+    """A drawing; ``svg`` is one <svg> element, as ``twin.run.svg.to_svg`` makes it."""
+
+    svg: str
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "svg"
+
+    def content(self) -> bytes:
+        """The drawing as a file of its own."""
+        if not self.svg.startswith("<svg"):
+            raise ValueError(f"artefact {self.name!r}: not an <svg> element")
+        head = self.svg[: self.svg.index(">")]
+        svg = self.svg if " xmlns=" in head else self.svg.replace("<svg", f"<svg {_SVG_NAMESPACE}", 1)
+        return f'<?xml version="1.0" encoding="utf-8"?>\n{svg}'.encode()
+
+
+@dataclass(frozen=True, eq=False)
+class PngFigure(Artefact):
+    """A picture; ``png`` is the file's content."""
+
+    png: bytes
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "png"
+
+    @property
+    def address(self) -> str:
+        """The picture as a data address, for a page that needs nothing else."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
+
+    def content(self) -> bytes:
+        """The picture."""
+        if not self.png.startswith(b"\x89PNG"):
+            raise ValueError(f"artefact {self.name!r}: not a PNG file")
+        return self.png
+
+
+@dataclass(frozen=True, eq=False)
+class Table(Artefact):
+    """A table for the report, and as CSV; heads carry the units.
+
+    ``decimals`` are those that the report shows of a column's numbers, None for six significant digits; the CSV holds
+    all digits.
+    """
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    decimals: Sequence[int | None] = ()
+
+    def shown(self) -> list[list[Cell]]:
+        """The rows as the report shows them."""
+        places = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
+        return [
+            [
+                fixed(cell, place) if isinstance(cell, float) and place is not None else cell
+                for cell, place in zip(row, places, strict=True)
+            ]
+            for row in self.rows
+        ]
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "csv"
+
+    def content(self) -> bytes:
+        """The table with all its digits."""
+        for row in self.rows:
+            if len(row) != len(self.heads):
+                raise ValueError(f"artefact {self.name!r}: a row of {len(row)} cells under {len(self.heads)} heads")
+        return csv_table([self.heads, *self.rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Data(Artefact):
+    """Plain data, kept as JSON and named in the report."""
+
+    data: Any
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "json"
+
+    def content(self) -> bytes:
+        """The data; NaN and infinities are refused."""
+        return (json.dumps(self.data, indent=2, allow_nan=False) + "\n").encode()

@@ -1,0 +1,112 @@
+"""What the commands share: exit codes, errors as one sentence, and an orderly end on signals."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from optics.numerics.backend import NAMES, BackendUnavailable
+from optics.numerics.llvm import LibraryMissing
+from scenes.yaml.errors import InputError
+from scenes.yaml.standard_output import FAILURE, print_error
+from twin.run.run_folder import RunFolderError
+
+BAD_INPUT, INTERRUPTED = 2, 128 + signal.SIGINT
+LARGEST_SEED = 2**63 - 1
+BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
+
+
+class InputErrorText(Exception):
+    """Bad input that has no file to point at."""
+
+
+def check_backend(name: str) -> None:
+    """Complain about an unknown backend before anything is started.
+
+    Raises:
+        InputErrorText: there is none of that name.
+    """
+    if name not in NAMES:
+        raise InputErrorText(f"unknown backend {name!r}; choose {' or '.join(NAMES)}")
+
+
+@contextmanager
+def explained(errors: Console) -> Iterator[None]:
+    """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code."""
+    try:
+        yield
+    except (InputError, InputErrorText, RunFolderError) as error:
+        print_error(errors, str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    except (BackendUnavailable, LibraryMissing) as error:
+        print_error(errors, str(error))
+        raise typer.Exit(FAILURE) from None
+    except KeyboardInterrupt:
+        errors.print("interrupted: nothing was kept", style="bold red")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def progress_columns(width: int) -> tuple[ProgressColumn, ...]:
+    """Columns of a progress display: what is done, in ``width`` letters, how far, since when and for how long."""
+    return (
+        SpinnerColumn(),
+        TextColumn(f"{{task.description:{width}}}", markup=False),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+
+
+def print_whole(console: Console, table: Table) -> None:
+    """A table with all its digits: a number that is cut is worse than a line that wraps."""
+    console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
+    console.print(table)
+
+
+def print_place(console: Console, target: Path) -> None:
+    """Where the run folder and its report are."""
+    console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """Signals that ask the program to end, Ctrl-C aside. SIGHUP does not when ``nohup`` has started it."""
+    asked = (signal.SIGTERM, signal.SIGHUP)
+    return tuple(number for number in asked if signal.getsignal(number) != signal.SIG_IGN)
+
+
+@contextmanager
+def exit_on_terminate() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the program as an exception, so that a half-written run folder is removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    got: list[int] = []
+
+    def leave(number: int, frame: object) -> None:
+        if not got:  # a second one must not break off the clearing up
+            got.append(number)
+            raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, leave) for number in ending_signals()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

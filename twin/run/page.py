@@ -1,0 +1,139 @@
+"""Templates of the reports, artefacts as they want them, and the run folder of a test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, plain, significant
+from twin.run.data_files import preview_png, tiff
+from twin.run.result import LabResult
+from twin.run.run_folder import MANIFEST, RunFolder
+from twin.run.versions import versions
+
+SHARED = "twin.run"
+"""Package of the style sheet and of the macros."""
+
+
+def environment(package: str) -> Environment:
+    """Environment that finds the templates of ``package`` and the shared ones."""
+    loader = FileSystemLoader([str(files(package)), str(files(SHARED))])
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
+    """An artefact, and the file that holds it, for the macro ``show``."""
+    out: dict[str, Any] = {
+        "title": artefact.title,
+        "caption": artefact.caption,
+        "file": file,
+        "svg": None,
+        "image": None,
+        "table": None,
+    }
+    if isinstance(artefact, SvgFigure):
+        # drawn by this program, not by a user
+        out["svg"] = Markup(artefact.svg)
+    elif isinstance(artefact, PngFigure):
+        out["image"] = artefact.address
+    elif isinstance(artefact, Table):
+        rows = [[cell_text(value) for value in row] for row in artefact.shown()]
+        texts = [all(isinstance(row[k], str) for row in artefact.rows) for k in range(len(artefact.heads))]
+        out["table"] = {"heads": artefact.heads, "rows": rows, "texts": texts}
+    elif not isinstance(artefact, Data):
+        raise TypeError(f"the report cannot show {type(artefact).__name__}")
+    return out
+
+
+def cell_text(value: Cell) -> str:
+    """A cell of a table, with at most six digits."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)
+
+
+TEMPLATE = "test.html.j2"
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """How a test was run.
+
+    Attributes:
+        config: the test with all it refers to, as YAML; it can be given in place of the test's file.
+        file: the test's file as the user gave it.
+        backend: where it was traced.
+        seed: of everything that is drawn.
+        started: seconds since the epoch.
+        seconds: that it took.
+        program: that ran it, as the user calls it.
+        command: its subcommand.
+    """
+
+    config: str
+    file: str
+    backend: str
+    seed: int
+    started: float
+    seconds: float
+    program: str
+    command: str
+
+
+def place(artefact: Artefact) -> str:
+    """File of an artefact in the run folder."""
+    return f"artefacts/{artefact.name}.{artefact.kind}"
+
+
+def render_report(result: LabResult, facts: RunFacts) -> str:
+    """``report.html`` as text."""
+    options = f"--seed {facts.seed} --backend {facts.backend} --out again"
+    return (
+        environment(__package__)
+        .get_template(TEMPLATE)
+        .render(
+            result=result,
+            summary=artefact_content(result.summary, place(result.summary)),
+            sections=[
+                {
+                    "title": section.title,
+                    "text": section.text,
+                    "artefacts": [artefact_content(a, place(a)) for a in section.artefacts],
+                }
+                for section in result.sections
+            ],
+            facts=facts,
+            command=f"python -m {facts.program} {facts.command} config.yaml {options}",
+            versions=versions(),
+        )
+    )
+
+
+def write_lab(result: LabResult, facts: RunFacts, folder: RunFolder) -> None:
+    """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest."""
+    folder.write_text("config.yaml", facts.config)
+    folder.write_json(f"{result.kind}.json", result.document)
+    for artefact in (result.summary, *(a for section in result.sections for a in section.artefacts)):
+        folder.write_bytes(place(artefact), artefact.content())
+    for name, frames in result.images.items():
+        folder.write_bytes(f"images/{name}.tiff", tiff(frames))
+        folder.write_bytes(f"images/{name}.png", preview_png(frames, stretch=None))
+    folder.write_text("report.html", render_report(result, facts))
+    manifest = {
+        "program": facts.program,
+        "test": result.kind,
+        "versions": versions(),
+        "backend": facts.backend,
+        "seed": facts.seed,
+        "started_unix_s": facts.started,
+        "wall_time_s": facts.seconds,
+        "warnings": list(result.warnings),
+        "sha256": folder.checksums(),
+    }
+    folder.write_json(MANIFEST, manifest)

@@ -1,0 +1,133 @@
+"""In which frames the numbers of a file are: stated in the file itself.
+
+Every JSON file of a run begins with ``schema``, its kind and version, and ``reference_frames``, what its positions,
+velocities, directions, angles and times refer to and, where a table or an image beside it cannot say so itself, what
+those refer to. netCDF files have the latter among their attributes. Axes and signs are those of docs/conventions.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from optics.numerics.frozen_map import FrozenMap
+
+__all__ = ["FRAMES", "SCHEMA", "described", "frames_text"]
+
+SCHEMA = 2
+"""Version of the files' keys; 1 had no statement of frames."""
+_CAMERA = (
+    "d_alpha, d_beta and d_gamma turn the camera about Y, X and Z of its own nominal axes (Z the line of sight toward "
+    "the scene, Y along the line CCD, X = Y x Z), right-handed; changes are perturbed minus nominal"
+)
+_ANGLE = "between the cameras' lines of sight, unsigned; its change is positive where they open"
+_SPOT = "row and column of the area CCD, (0, 0) the centre of the first pixel; columns along detector x, rows along y"
+_DETECTOR = "x and y from the centre of the area CCD's pixel grid, along its columns and rows"
+_ITRS = "ITRS, geocentric and Earth-fixed, metres"
+_GEODETIC = "geodetic on the WGS84 ellipsoid: latitude, longitude positive to the east, height above the ellipsoid"
+_SECONDS = "seconds from the epoch in UTC that stands beside them"
+_BODY = "X along the flight direction, Z toward the scene, Y = Z x X; true attitude = measured attitude times the bias"
+_FOCAL = "camera axes, x along the track, y along the line; the image is the real one, +y sees the scene at -Y"
+_CHANGES = {"cameras": _CAMERA, "intersection_angle": _ANGLE}
+_LOOK = (
+    "look: between the lines' central rays, unsigned; along the track: its part about the lines' mean direction, "
+    "positive where the first line looks ahead; planes: dihedral angle of the lines' planes"
+)
+
+FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
+    {
+        "truth": _CHANGES,
+        "recovered": {**_CHANGES, "spots": _SPOT},
+        "course": {**_CHANGES, "times_s": "seconds from the beginning of the course"},
+        "crosstalk": {"rows and columns": _CAMERA, "motions": "in the moved body's own nominal axes"},
+        "stray": {"sources": "shares of light, of no frame", "detector": "by the name of the channel"},
+        "quality": {"fields": "shares of half the line, +1 at its left end, +Y of the focal plane"},
+        "mtf": {
+            "along_mm": "along the line CCD from its centre, focal-plane Y",
+            "across_mm": "across it, focal-plane X",
+            "columns": "of the line CCD, the centre of the first pixel is 0",
+            "image_shift_um": "focal-plane Y and X, perturbed minus nominal",
+        },
+        "irradiance": {"x, y": _DETECTOR},
+        "focus": {
+            "defocus_um": "along the focal plane's Z, toward the scene positive",
+            "rotation_arcmin, shift_um": "of the focal-plane assembly about and along its own nominal axes",
+            "field": "along the line, focal-plane Y",
+        },
+        "distortion": {
+            "reading_deg": "of the turntable's circle, as it reads",
+            "field_deg": "about the turntable's axis, from the camera's zero that is in the estimate",
+            "position_mm": "along the line CCD in the image, from its centre",
+            "axis_tilt_arcsec": "of the turntable's axis against square to camera axes X and Z",
+        },
+        "turntable": {"angles": "readings of the turntable's circle about its axis; errors: reading minus true angle"},
+        "design": {"prescription": "vertex of M1; light enters toward +z, y in the symmetry plane, x along the line"},
+        "angle": {
+            "planes, look, along_track, truth": _LOOK,
+            "frames": "axes in which the planes are fitted: each row names its own",
+            "time_s": _SECONDS + " in config.yaml; of the exposure",
+        },
+        "calibration": {
+            "f, x, y": _FOCAL,
+            "roll, pitch, yaw": f"of the body, in this order Rx Ry Rz; {_BODY}",
+            "offset along, across, down": "true minus measured station in the field's mean body axes",
+            "latitude_rad": _GEODETIC,
+            "shift_east_north_up_m": "local horizon at the field's middle",
+            "orbit_third_difference_rms_m": _ITRS,
+            "attitude_third_difference_rms_rad": "measured body axes against the orbital frame: roll, pitch, yaw",
+            "plan_rms_m, height_rms_m": "local horizon of each check point: east and north together, and up",
+            "change of d_alpha": _CAMERA,
+            "rates": "of the bias in body axes, per second of UTC",
+        },
+        "monitor": {
+            "times_s, reference_time_s, monitored_times_s": "seconds from the epoch in UTC of the orbit in config.yaml",
+            "cameras": _CAMERA,
+            "intersection_angle": _ANGLE,
+            "height, plan": "local horizon of each point: up, and east and north together",
+        },
+        "simulate": {
+            "longitude_deg, latitude_deg": _GEODETIC,
+            "times": _SECONDS,
+            "line, pixel": "of each line CCD's image; pixel 0 and line 0 are the centres of the first; images begin at "
+            "first_line, first_pixel",
+            "orthophoto, dem": f"rows to the south, columns to the east; heights of the dem and degrees: {_GEODETIC}",
+            "artefacts/points.csv": f"degrees, height: {_GEODETIC}; x, y, z: {_ITRS}; line and pixel as here",
+        },
+        "camera": {
+            "camera_to_body": f"rotation of camera axes into body axes; body: {_BODY}",
+            "position_m": "of the projection centre in body axes from the body's origin",
+            "principal_point_m": _FOCAL,
+        },
+        "trajectory": {
+            "position_m": f"of the body's origin, {_ITRS}",
+            "velocity_m_per_s": "against the turning Earth, in axes of the ITRS: the derivative of position_m",
+            "inertial_velocity_m_per_s": "against the stars, in axes of the ITRS: with the Earth's rotation",
+            "quaternion": f"(x, y, z, w), x_itrs = R x_body; {_BODY}",
+            "orbit_s, attitude_s": _SECONDS,
+        },
+        "georeference": {"longitude, latitude": _GEODETIC, "rows, columns": "to the south, to the east"},
+        "simulate-truth": {
+            "itrs_m": _ITRS,
+            "camera, trajectory": "each states its own",
+            "line, pixel": "of the line CCD: the centre of the first is 0",
+            "east_m, north_m": "local horizon at the middle of the patch",
+        },
+        "study": {"truth, recovered": f"{_CAMERA}; {_ANGLE}", "responses": "as in the base's file that the key names"},
+        "gradient": {"responses": f"{_CAMERA}; {_ANGLE}", "factors": "motions in the moved body's own nominal axes"},
+    }
+)
+"""Kind of file -> quantity -> what it refers to."""
+
+
+def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
+    """The data of a file with its schema and its frames before them.
+
+    Raises:
+        KeyError: a kind without an entry in `FRAMES`.
+    """
+    return {"schema": f"{kind} {SCHEMA}", "reference_frames": dict(FRAMES[kind]), **data}
+
+
+def frames_text(kind: str) -> str:
+    """The statement in one line, for an attribute."""
+    return "; ".join(f"{quantity}: {frame}" for quantity, frame in FRAMES[kind].items())

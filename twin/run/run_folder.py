@@ -1,0 +1,361 @@
+"""A run folder: written under a temporary name beside its place and renamed when complete; none is ever half there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from types import TracebackType
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from twin.run.unfinished import OLD, PARTIAL, Unfinished, sweep
+
+MANIFEST = "manifest.json"
+STUDY_STATE = "study_state.json"
+"""Says which study a folder belongs to, from the beginning; the manifest is written at the end."""
+STUDY_LOCK = ".lock"
+"""File in the folder of a study that its command holds locked."""
+NAMED = 5
+"""Files that a message names at most."""
+
+
+class RunFolderError(Exception):
+    """A run folder cannot be made; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Numbered:
+    """The first of STEM-001, STEM-002, ... that is free when the folder is put in place.
+
+    Attributes:
+        folder: where it shall stand.
+        stem: of its name.
+    """
+
+    folder: Path
+    stem: str
+
+    def free(self) -> Path:
+        """The first that does not exist now.
+
+        Raises:
+            RunFolderError: a million of them do.
+        """
+        for number in range(1, 1_000_000):
+            candidate = self.folder / f"{self.stem}-{number:03d}"
+            if not (candidate.exists() or candidate.is_symlink()):
+                return candidate
+        raise RunFolderError(f"no free name {self.stem}-NNN in {self.folder}; choose one with --out")
+
+
+def chosen(out: Path | None, stem: str) -> Path | Numbered:
+    """The folder that the user chose, else the next free one of that name below ``runs``."""
+    return out if out is not None else Numbered(Path("runs"), stem)
+
+
+class RunFolder:
+    """Context manager that makes a run folder.
+
+    Inside the ``with`` block write files below ``path``; on success they appear as ``target`` in one rename, on any
+    error, and on an interrupt, nothing is left behind. What a killed run left beside the target is removed.
+
+    Args:
+        target: where the folder shall stand. Of several runs that start together with the same ``Numbered``, each gets
+            a number of its own when it is complete.
+        force: replace an existing run folder. Only a folder that is empty, or of which a run's manifest lists every
+            file, is ever replaced.
+
+    Raises:
+        RunFolderError: the target exists, or cannot be written.
+    """
+
+    def __init__(self, target: Path | Numbered, force: bool = False) -> None:
+        self._numbered = target if isinstance(target, Numbered) else None
+        self.target = target.free() if isinstance(target, Numbered) else Path(target)
+        self.force = force
+        self.path = self.target
+        self._unfinished: Unfinished | None = None
+        self._made_parents: list[Path] = []
+        try:
+            self._check_target()
+        except OSError as error:
+            raise RunFolderError(f"cannot look at the output folder {self.target}: {_reason(error)}") from error
+
+    def _check_target(self) -> None:
+        target = self.target
+        if not (target.exists() or target.is_symlink()):
+            return
+        if not target.is_dir() or target.is_symlink():
+            raise RunFolderError(f"output {target} exists and is not a folder; choose another with --out")
+        if not self.force:
+            raise RunFolderError(
+                f"output folder {target} exists; choose another with --out, or replace it with --force"
+            )
+        if any(target.iterdir()):
+            others = unlisted(target)
+            if others is None:
+                raise RunFolderError(
+                    f"output folder {target} is not a run folder (it has no {MANIFEST} of a run), so --force does not "
+                    "replace it; choose another with --out"
+                )
+            refuse_others(target, others)
+
+    def __enter__(self) -> RunFolder:
+        """Make the temporary folder."""
+        try:
+            self._make_parents()
+            sweep(self.target.parent, remove_replaced)
+            if self._numbered is None:
+                self._check_target()  # what a killed run had put aside may stand there again
+            self._unfinished = Unfinished(self.target)
+            self.path = self._unfinished.path(PARTIAL)
+            self.path.mkdir()
+        except OSError as error:
+            self._remove()
+            raise RunFolderError(f"cannot make the output folder {self.target}: {_reason(error)}") from error
+        except BaseException:
+            self._remove()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Rename when all went well, else remove."""
+        if error is None:
+            try:
+                self._publish()
+                return
+            except OSError as failure:
+                self._remove()
+                raise RunFolderError(
+                    f"cannot put the output folder {self.target} in place: {_reason(failure)}"
+                ) from failure
+            except BaseException:
+                self._remove()
+                raise
+        self._remove()
+        if isinstance(error, OSError):
+            raise RunFolderError(f"cannot write to {self.target}: {_reason(error)}; nothing was kept") from error
+
+    def _make_parents(self) -> None:
+        """Make the folders above the target, and remember which of them were not there."""
+        missing = [parent for parent in self.target.parents if not parent.exists()]
+        for parent in reversed(missing):
+            parent.mkdir(exist_ok=True)
+            self._made_parents.insert(0, parent)
+
+    def _remove(self) -> None:
+        """Take back everything that was made."""
+        if self._unfinished is not None:
+            shutil.rmtree(self._unfinished.path(PARTIAL), ignore_errors=True)
+            self._unfinished.close()
+        for parent in self._made_parents:
+            try:
+                parent.rmdir()
+            except OSError:  # somebody else has put something there
+                break
+
+    def _publish(self) -> None:
+        assert self._unfinished is not None
+        if self.force and self.target.exists():
+            old = self._unfinished.path(OLD)
+            os.rename(self.target, old)
+            try:
+                os.rename(self.path, self.target)
+            except BaseException:
+                os.rename(old, self.target)
+                raise
+            remove_run(old, self.target)
+        else:
+            self._claim()
+            try:
+                os.rename(self.path, self.target)
+            except BaseException:
+                self.target.rmdir()
+                raise
+        self._unfinished.close()
+
+    def _claim(self) -> None:
+        """Take the target's name with an empty folder, which the rename replaces; only one process can make it."""
+        while True:
+            try:
+                self.target.mkdir()
+                return
+            except FileExistsError:
+                if self._numbered is None:
+                    raise
+                self.target = self._numbered.free()
+
+    def write_json(self, name: str, data: Any) -> None:
+        """Write a JSON file; NaN and infinities are refused, since JSON has none."""
+        self.write_text(name, json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a UTF-8 text file."""
+        place = self._place(name)
+        place.write_text(text, encoding="utf-8")
+
+    def write_bytes(self, name: str, content: bytes | memoryview) -> None:
+        """Write a binary file."""
+        self._place(name).write_bytes(content)
+
+    def write_with(self, name: str, writer: Callable[[Path], None]) -> None:
+        """Let ``writer`` make the file of that name."""
+        writer(self._place(name))
+
+    def _place(self, name: str) -> Path:
+        place = self.path / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        return place
+
+    def checksums(self) -> dict[str, str]:
+        """SHA-256 of every file written so far, by path relative to the folder."""
+        out = {}
+        for file in sorted(self.path.rglob("*")):
+            if file.is_file():
+                out[file.relative_to(self.path).as_posix()] = hashlib.sha256(file.read_bytes()).hexdigest()
+        return out
+
+
+def _inside(name: str) -> str:
+    """A path relative to a folder that stays in it."""
+    path = PurePosixPath(name)
+    if path.is_absolute() or not path.parts or ".." in path.parts or path.as_posix() != name or "\0" in name:
+        raise ValueError("not the path of a file in the folder")
+    return name
+
+
+class Manifest(BaseModel):
+    """What all programs write into their manifest. Other people's programs call their files manifest.json as well.
+
+    Attributes:
+        program: that made the folder, ``twin.render``.
+        versions: of the twin and of what it uses.
+        started_unix_s: when, seconds since the epoch.
+        wall_time_s: that it took.
+        sha256: checksum of every file of the run but this one.
+    """
+
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
+
+    program: Annotated[str, Field(pattern=r"^twin\.[a-z_]+$")]
+    versions: Annotated[dict[str, str], AfterValidator(lambda found: _ours(found))]
+    started_unix_s: float
+    wall_time_s: float
+    sha256: dict[Annotated[str, AfterValidator(_inside)], Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
+
+
+def _ours(versions: dict[str, str]) -> dict[str, str]:
+    if "space-camera-twin" not in versions:
+        raise ValueError("made by another program")
+    return versions
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """The manifest of a run, None when the folder has none."""
+    try:
+        return Manifest.model_validate_json((folder / MANIFEST).read_bytes())
+    except (OSError, ValidationError):
+        return None
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Whether a folder holds the manifest of a run."""
+    return read_manifest(folder) is not None
+
+
+def every_file(folder: Path) -> list[str]:
+    """Paths of all that stands in a folder and is not a folder itself, relative to it, in order."""
+    out = []
+    for place, folders, files in os.walk(folder):
+        names = [*files, *(name for name in folders if os.path.islink(os.path.join(place, name)))]
+        out += [(Path(place) / name).relative_to(folder).as_posix() for name in names]
+    return sorted(out)
+
+
+def unlisted(folder: Path) -> list[str] | None:
+    """Files in the folder of a run or study that it did not write; None when it is the folder of neither."""
+    manifest, study = read_manifest(folder), _is_study(folder)
+    if manifest is None and not study:
+        return None
+    own = {MANIFEST, *manifest.sha256} if manifest is not None else set()
+    return [name for name in every_file(folder) if not (name in own or (study and _OF_STUDIES.fullmatch(name)))]
+
+
+_OF_STUDIES = re.compile(
+    "|".join(map(re.escape, (STUDY_STATE, STUDY_LOCK, "config.yaml", "report.html", "chunks/index.txt")))
+    + r"|study\.(nc|csv|parquet|json)|chunks/[0-9]+\.npz(\.corrupt)?|(chunks/)?\.[a-z0-9_.]+\.partial"
+)
+"""What a study writes into its folder, finished or not."""
+
+
+def _is_study(folder: Path) -> bool:
+    try:
+        state = json.loads((folder / STUDY_STATE).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(state, dict) and state.get("program") == "twin.study" and "fingerprint" in state
+
+
+def refuse_others(folder: Path, others: Sequence[str]) -> None:
+    """Refuse to replace a folder with files in it that no run put there.
+
+    Raises:
+        RunFolderError: there are some.
+    """
+    if not others:
+        return
+    named = ", ".join(others[:NAMED]) + (f" and {len(others) - NAMED} more" if len(others) > NAMED else "")
+    raise RunFolderError(
+        f"output folder {folder} also holds what the run did not write: {named}; --force removes only the run's own "
+        "files, so move these away or choose another folder with --out"
+    )
+
+
+def remove_run(old: Path, new: Path) -> None:
+    """Remove the replaced folder of a run; files that were put into it meanwhile move to the new one.
+
+    Args:
+        old: the replaced folder, under another name.
+        new: what stands in its place.
+    """
+    others = unlisted(old)
+    for name in every_file(old) if others is None else others:
+        place = new / name
+        while place.exists() or place.is_symlink():
+            place = place.with_name(f"{place.name}.kept")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        (old / name).rename(place)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def remove_study(folder: Path) -> None:
+    """Remove a study's files from its folder, and the folder if that was all."""
+    for name in every_file(folder):
+        if _OF_STUDIES.fullmatch(name):
+            (folder / name).unlink(missing_ok=True)
+    for place, _, _ in os.walk(folder, topdown=False):
+        with suppress(OSError):  # somebody else has put something there
+            os.rmdir(place)
+
+
+def remove_replaced(old: Path, new: Path) -> bool:
+    """Remove what a killed process had replaced, if what it had in its place is complete."""
+    if not is_run_folder(new):
+        return False
+    remove_run(old, new)
+    return True
+
+
+def _reason(error: OSError) -> str:
+    """In a few words; HDF5 puts a page into strerror."""
+    return os.strerror(error.errno) if error.errno else str(error)

@@ -1,0 +1,1 @@
+"""Detectors: photons in, recorded frames out."""

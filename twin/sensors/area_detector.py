@@ -1,0 +1,293 @@
+"""Area detector described by its EMVA 1288 data-sheet numbers: expected photons in, recorded frames out.
+
+The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, chapter 2, eq. 1-12):
+
+    n_e  = Poisson( QE * (1 + prnu) * photons + dark_current * exposure )         electrons, exact Poisson
+    n_e  = min(n_e, full_well)                                                    the well fills before the read-out
+    y    = K * (n_e + dsnu_offset + dark_noise * normal) + offset                 grey value, not yet digitised
+    y_DN = clip(rint(y), 0, 2**bit_depth - 1)                                     uint16
+
+PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. The
+Poisson numbers come from `numpy.random.Generator.poisson` (exact at every mean: multiplication below 10, Hoermann's
+PTRS rejection above); no normal approximation is made anywhere. Pixel coordinates are (row, column); arrays are (...,
+H, W).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
+
+from analysis.spots.noise import NoiseModel
+from optics.numerics.threads import cores
+from scenes.specs.detector import DetectorSpec
+from scenes.yaml.errors import Problem
+
+__all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
+
+Seed = int | np.random.SeedSequence
+
+# Beyond this the input is certainly in the wrong unit; the Poisson generator itself works up to 9e18.
+_MAX_PHOTONS = 1e12
+# A pixel counts as saturated from this many read-noise sigmas below the clipped level, because read noise is added
+# after the well is clipped: half of all full wells would otherwise read below "full".
+_SATURATION_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class FixedPattern:
+    """The pixel-to-pixel differences of one detector, the same in every frame it records.
+
+    gain: (..., H, W) relative response to light, 1 + prnu * normal, dimensionless, >= 0.
+    offset_e: (..., H, W) additive offset in electrons, dsnu_e * normal.
+    """
+
+    gain: NDArray[np.float64]
+    offset_e: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.gain.shape != self.offset_e.shape or self.gain.ndim < 2:
+            raise ValueError(
+                f"fixed pattern: gain {self.gain.shape} and offset_e {self.offset_e.shape}"
+                " must have one shape (..., H, W)"
+            )
+        if not (np.all(np.isfinite(self.gain)) and np.all(np.isfinite(self.offset_e)) and np.all(self.gain >= 0)):
+            raise ValueError("fixed pattern: gain must be finite and >= 0, offset_e finite")
+
+
+@dataclass(frozen=True, eq=False)
+class SaturationReport:
+    """Which images hold saturated pixels.
+
+    level_dn: grey value from which a pixel counts as saturated.
+    pixels: (...,) number of pixels per image that reach the level in at least one of its frames.
+    """
+
+    level_dn: float
+    pixels: NDArray[np.int64]
+
+    @property
+    def any(self) -> bool:
+        """True when at least one pixel of one image is saturated."""
+        return bool(np.any(self.pixels > 0))
+
+
+@dataclass(frozen=True)
+class EmvaDetector:
+    """A detector by the numbers of its EMVA 1288 data sheet. Raises ValueError, naming the field, for values outside
+    the limits of `scenes.specs.detector`.
+
+    quantum_efficiency: electrons per photon.
+    system_gain_dn_per_e: K, grey values per electron.
+    dark_noise_e: temporal read noise, electrons rms.
+    dark_current_e_per_s: electrons per pixel and second.
+    full_well_e: electrons at which the pixel saturates.
+    prnu: photo-response non-uniformity (PRNU_1288), rms fraction.
+    dsnu_e: dark-signal non-uniformity (DSNU_1288), electrons rms.
+    bit_depth: of the converter.
+    offset_dn: black level, grey values.
+    """
+
+    quantum_efficiency: float
+    system_gain_dn_per_e: float
+    dark_noise_e: float
+    dark_current_e_per_s: float
+    full_well_e: float
+    prnu: float
+    dsnu_e: float
+    bit_depth: int
+    offset_dn: float
+
+    def __post_init__(self) -> None:
+        try:
+            DetectorSpec.model_validate({"name": "detector", **self._numbers()})
+        except ValidationError as error:
+            first = error.errors()[0]
+            problem = first.get("ctx", {}).get("error")
+            where = problem.within if isinstance(problem, Problem) else first["loc"]
+            found = ", ".join(f"{name} {self._numbers()[str(name)]!r}" for name in where)
+            raise ValueError(f"detector: {found}: {first['msg']}") from None
+
+    @classmethod
+    def from_sheet(cls, sheet: DetectorSpec, exposure: float) -> EmvaDetector:
+        """The detector of a data sheet's file, for frames of that exposure, seconds.
+
+        Raises:
+            InputError: the dark current alone saturates the pixels.
+        """
+        sheet.check_exposure(exposure)
+        return cls(**{field.name: getattr(sheet, field.name) for field in fields(cls)})
+
+    def _numbers(self) -> dict[str, Any]:
+        """As plain numbers, not numpy's."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+
+    @property
+    def max_dn(self) -> int:
+        """Largest grey value of the converter."""
+        return (1 << int(self.bit_depth)) - 1
+
+    @property
+    def saturation_dn(self) -> float:
+        """Grey value where the response stops being linear: the converter's end or the full well, whichever comes
+        first.
+        """
+        return float(min(self.max_dn, self.offset_dn + self.system_gain_dn_per_e * self.full_well_e))
+
+    def noise_model(self, exposure_s: float) -> NoiseModel:
+        """The noise description that the analysis needs, for frames of exposure_s seconds."""
+        return NoiseModel(
+            gain_dn_per_e=self.system_gain_dn_per_e,
+            dark_noise_e=self.dark_noise_e,
+            dark_signal_e=self.dark_current_e_per_s * _exposure(exposure_s),
+            offset_dn=self.offset_dn,
+            prnu=self.prnu,
+            dsnu_e=self.dsnu_e,
+            saturation_dn=self.saturation_dn,
+        )
+
+    def fixed_pattern(self, shape: tuple[int, ...], seed: Seed) -> FixedPattern:
+        """Draw the fixed pattern of detectors of `shape` (..., H, W); the same seed and shape give the same bits."""
+        if len(shape) < 2 or any(int(n) != n or n < 1 for n in shape):
+            raise ValueError(f"fixed pattern: shape must be (..., H, W) of positive integers, found {shape!r}")
+        rng = np.random.Generator(np.random.SFC64(_sequence(seed)))
+        gain = np.maximum(1.0 + self.prnu * rng.standard_normal(shape), 0.0)
+        return FixedPattern(gain=gain, offset_e=self.dsnu_e * rng.standard_normal(shape))
+
+    def expected_dn(
+        self, photons: ArrayLike, exposure_s: float, pattern: FixedPattern | None = None
+    ) -> NDArray[np.float64]:
+        """Noise-free, unrounded grey values (..., H, W) for `photons` per pixel and frame, clipped at the well and
+        converter.
+
+        Without `pattern` the detector is taken as perfectly uniform. Close to saturation this is the clipped mean and
+        not the mean of clipped values.
+        """
+        light = _photons(photons)
+        gain: Any = 1.0 if pattern is None else pattern.gain
+        offset_e: Any = 0.0 if pattern is None else pattern.offset_e
+        electrons = self.quantum_efficiency * light * gain + self.dark_current_e_per_s * _exposure(exposure_s)
+        level = self.offset_dn + self.system_gain_dn_per_e * (np.minimum(electrons, self.full_well_e) + offset_e)
+        return np.asarray(np.clip(level, 0, self.max_dn), dtype=np.float64)
+
+    def expose(
+        self,
+        photons: ArrayLike,
+        pattern: FixedPattern,
+        frames: int,
+        exposure_s: float,
+        seed: Seed,
+        threads: int | None = None,
+    ) -> NDArray[np.uint16]:
+        """Record `frames` frames of each image.
+
+        photons: (..., H, W) expected photons per pixel and frame, >= 0.
+        pattern: fixed pattern whose shape broadcasts to that of photons, e.g. (4, H, W) for photons (states, 4, H, W).
+        frames: number of frames, >= 1.
+        exposure_s: exposure of one frame, s (it sets the dark signal; photons are given per frame).
+        seed: integer or SeedSequence. Each image draws from its own stream, numbered by its place in the flattened
+            leading axes, so the result does not depend on `threads`, and image i does not depend on how many follow
+            it.
+        threads: worker threads (numpy's generators release the GIL); default: the cores this process may use, at most
+            8.
+        Returns uint16 (..., frames, H, W) grey values. Raises ValueError for bad input.
+        """
+        light = _photons(photons)
+        if isinstance(frames, bool) or int(frames) != frames or frames < 1:
+            raise ValueError(f"detector: frames must be an integer >= 1, found {frames!r}")
+        dark_e = self.dark_current_e_per_s * _exposure(exposure_s)
+        lead, (height, width) = light.shape[:-2], light.shape[-2:]
+        try:
+            gain = np.broadcast_to(pattern.gain, light.shape)
+            offset_e = np.broadcast_to(pattern.offset_e, light.shape)
+        except ValueError as error:
+            raise ValueError(
+                f"detector: fixed pattern {pattern.gain.shape} does not fit photons {light.shape}"
+            ) from error
+        out = np.empty((*lead, int(frames), height, width), dtype=np.uint16)
+        root = _sequence(seed)
+        scale = self.system_gain_dn_per_e
+
+        def image(index: tuple[int, ...], number: int) -> None:
+            key = (*root.spawn_key, number)
+            stream = np.random.SeedSequence(root.entropy, spawn_key=key, pool_size=root.pool_size)
+            rng = np.random.Generator(np.random.SFC64(stream))
+            mean_e = light[index] * gain[index]
+            mean_e *= self.quantum_efficiency
+            mean_e += dark_e
+            size = (int(frames), height, width)
+            electrons = rng.poisson(mean_e, size=size)
+            level = np.minimum(electrons, self.full_well_e, dtype=np.float64)
+            if self.dark_noise_e > 0:
+                noise = rng.standard_normal(size)
+                noise *= self.dark_noise_e
+                level += noise
+            level += offset_e[index]
+            level *= scale
+            level += self.offset_dn
+            np.rint(level, out=level)
+            np.clip(level, 0, self.max_dn, out=level)
+            out[index] = level
+
+        _run(image, list(np.ndindex(*lead)), threads)
+        return out
+
+    def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
+        """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).
+
+        A pixel is saturated when it comes within 4 read-noise sigmas of the full well, or reaches the converter's end.
+        """
+        if frames.ndim < 3:
+            raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
+        well = self.offset_dn + self.system_gain_dn_per_e * (self.full_well_e - _SATURATION_SIGMAS * self.dark_noise_e)
+        level = float(min(self.max_dn, well))
+        return SaturationReport(level_dn=level, pixels=np.sum(np.any(frames >= level, axis=-3), axis=(-2, -1)))
+
+
+def _run(work: Callable[[tuple[int, ...], int], None], indices: list[tuple[int, ...]], threads: int | None) -> None:
+    """Call work(index, number) for all indices on `threads` threads; the first error is raised here."""
+    if threads is None:
+        threads = min(cores(), 8)
+    if threads < 1:
+        raise ValueError(f"detector: threads must be >= 1, found {threads!r}")
+    if threads == 1 or len(indices) == 1:
+        for number, index in enumerate(indices):
+            work(index, number)
+        return
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        for _ in pool.map(work, indices, range(len(indices))):
+            pass
+
+
+def _sequence(seed: Seed) -> np.random.SeedSequence:
+    if isinstance(seed, np.random.SeedSequence):
+        return seed
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"detector: seed must be an integer >= 0 or a SeedSequence, found {seed!r}")
+    return np.random.SeedSequence(int(seed))
+
+
+def _exposure(exposure_s: float) -> float:
+    if not (math.isfinite(exposure_s) and 0 <= exposure_s <= 1e6):
+        raise ValueError(f"detector: exposure_s must be in [0, 1e6] s, found {exposure_s!r}")
+    return float(exposure_s)
+
+
+def _photons(photons: ArrayLike) -> NDArray[np.float64]:
+    light = np.asarray(photons, dtype=np.float64)
+    if light.ndim < 2 or light.size == 0:
+        raise ValueError(f"detector: photons must be (..., H, W), found shape {light.shape}")
+    low, high = float(light.min()), float(light.max())
+    if not (low >= 0 and high <= _MAX_PHOTONS):  # also catches NaN and infinity
+        raise ValueError(
+            f"detector: photons must be finite, >= 0 and <= {_MAX_PHOTONS:g} per pixel and frame, found {low} to {high}"
+        )
+    return light

@@ -1,0 +1,230 @@
+"""From elementary motions to spots, lines of sight and the numbers of a run, with derivatives.
+
+A chief ray starts at a point of the line CCD and is turned so that it goes through the middle of the stop. By the
+implicit function theorem the turn per motion is -(d hit / d turn)^-1 (d hit / d motion); with it the ray is pushed
+forward to the object space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor.recovery import Recovery, angles, estimates
+from optics.geometry.tree import COMPLEX_STEP, FIGURE, Motion, State
+from optics.numerics.array_math import inverse, turned
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.aim import RayFan, aim, transverse_axes
+from optics.raytrace.derivatives import push_forward
+from optics.raytrace.system import SystemBatch, assemble
+from scenes.models.instrument_model import Instrument
+from scenes.specs.resolved import ResolvedJob
+from twin.monitor.monitor_derivative import hit_slopes
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.motions import ElementaryMotion
+from twin.monitor.truth import LINE_POINTS, line_in_world, trace_sight, truth_of_sight
+from twin.study.runs.render_base import monitor_results
+
+CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
+"""Largest steps of differences, SI: they move the beam on the mirrors by a few millimetres at most."""
+ROUNDING = 1e-9
+"""Of a motion's size per step: motions that are smaller come from rounding in a composition of motions."""
+
+Slopes = Mapping[ElementaryMotion, float]
+
+
+def motion_slopes(about: State, state: Callable[[float], State], step: float) -> Slopes | None:
+    """Derivative of a state's motions by a factor; None if the factor changes more than motions, figures and scales.
+
+    Args:
+        about: the state of the base.
+        state: change of the factor -> the state.
+        step: a change of the factor. Motions are linear in it, or nearly so where temperatures add to them.
+    """
+    at = [state(share * step) for share in SHARES]
+    slopes: dict[ElementaryMotion, float] = {}
+    for path in {path for one in at for path in one}:
+        base = about.get(path, Motion())
+        several = [one.get(path, base) for one in at]
+        if any(_rest(motion) != _rest(base) for motion in several):
+            return None
+        terms = sorted({j for motion in several for j in motion.figure})
+        kinds = [(kind, axis) for kind in ("rotate", "shift") for axis in range(3)]
+        for kind, axis in (*kinds, ("scale", 0), *(("figure", j) for j in terms)):
+            a, b, c, d = (_component(motion, kind, axis) for motion in several)
+            wide, narrow = (a - b) / (2.0 * step), (c - d) / step
+            slope = narrow + (narrow - wide) / 3.0
+            if abs(slope * step) > ROUNDING * max(abs(_component(base, kind, axis)), CAP[kind] * ROUNDING):
+                slopes[ElementaryMotion(path, kind, axis, base.pivot)] = slope
+    return slopes
+
+
+def _component(motion: Motion, kind: str, axis: int) -> float:
+    if kind == "figure":
+        return motion.figure.get(axis, 0.0)
+    return motion.scale if kind == "scale" else (motion.rotate if kind == "rotate" else motion.shift)[axis]
+
+
+def _rest(motion: Motion) -> Motion:
+    """What is no elementary motion: the pivot, and what temperatures do."""
+    nothing = (0.0, 0.0, 0.0)
+    return replace(motion, rotate=nothing, shift=nothing, scale=0.0, figure=FrozenMap({}))
+
+
+SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
+"""Steps of the derivative of the formulas, px and 1: so small that what is left of them after Richardson's
+extrapolation, to the fifth power, is below rounding, and so large that rounding is below 1e-11."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """One instrument and the formulas that its job applies to what is traced.
+
+    Spots are means of rays, which are the energy centroids of the images.
+
+    Attributes:
+        resolved: the job.
+        experiment: its instrument.
+    """
+
+    resolved: ResolvedJob
+    experiment: MonitorExperiment
+
+    def spots(self, states: Sequence[State]) -> np.ndarray:
+        """Positions (S, C, 2), row and column, px from the first pixel's centre. Raises AimError, BeamMissedError."""
+        path = self.experiment.path.coarse
+        mean = np.einsum("n,bnk->bk", path.nodes.share, path.rays(states).position[..., 1::-1]) / path.pitch
+        middle = 0.5 * (np.array(path.shape) - 1.0)
+        return np.swapaxes(mean.reshape(len(path.channels), len(states), 2), 0, 1) + middle
+
+    def sight(self, states: Sequence[State]) -> np.ndarray:
+        """Directions of the line CCDs' points, (S, cameras, points, 3). Raises AimError, BeamMissedError."""
+        return np.swapaxes(trace_sight(self.experiment.instrument, self.experiment.backend, states), 0, 1)
+
+    @cached_property
+    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Spots and directions of the unperturbed instrument, (1, ...)."""
+        return self.spots([{}]), self.sight([{}])
+
+    @cached_property
+    def _axes(self) -> dict[str, np.ndarray]:
+        return {name: self.experiment.instrument.camera_axes(name) for name in self.experiment.instrument.cameras}
+
+    def outcome(self, state: State, spots: np.ndarray, sight: np.ndarray) -> dict[str, Any]:
+        """``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3)."""
+        start, end = self.nominal[0], spots[None]
+        cameras = self.experiment.cameras
+        joint = np.zeros((1, len(cameras), 4, 4))
+        parameters = estimates(start, end, joint, cameras)
+        none = np.zeros_like(end)
+        recovery = Recovery(start, end, none, none, joint, parameters, angles(parameters, cameras))
+        truth = truth_of_sight(self.experiment.instrument, np.stack([self.nominal[1][0], sight], axis=1), self._axes)
+        exposures = self.resolved.frames, self.resolved.job.render.seed
+        return monitor_results(self.resolved, self.experiment, state, *exposures, truth, recovery)
+
+    def moved(
+        self, state: State, at: tuple[np.ndarray, np.ndarray], spots: np.ndarray, sight: np.ndarray
+    ) -> tuple[list[dict[str, Any]], float]:
+        """Four outcomes about a state along derivatives of its spots (C, 2) and directions (cameras, points, 3), for
+        ``extrapolated``, and the step; ``at``: the state's own spots and directions.
+        """
+        largest = max(np.abs(spots).max() / SPOT_REACH, np.abs(sight).max() / SIGHT_REACH)
+        step = 1.0 / float(largest) if largest > 0.0 else 1.0
+        place, line = at
+        return [
+            self.outcome(state, place + share * step * spots, line + share * step * sight) for share in SHARES
+        ], step
+
+
+SHARES = (1.0, -1.0, 0.5, -0.5)
+"""Of a step: where values for ``extrapolated`` are taken."""
+
+
+def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Central differences with a step and its half, extrapolated after Richardson, and how far that went.
+
+    Args:
+        values: (4, ...) at the base plus ``SHARES`` times the step.
+        step: of the whole step.
+    """
+    wide, narrow = (values[0] - values[1]) / (2.0 * step), (values[2] - values[3]) / step
+    return narrow + (narrow - wide) / 3.0, np.abs(narrow - wide) / 3.0
+
+
+def sight_gradient(
+    instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion], about: State
+) -> np.ndarray:
+    """Derivative of the directions of ``twin.monitor.truth.trace_sight``.
+
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
+        motions: M elementary motions, with the pivots that the bodies have in ``about``.
+        about: the state at which to differentiate.
+
+    Returns:
+        (cameras, M, LINE_POINTS, 3), world, per radian, metre or unit.
+
+    Raises:
+        AimError, BeamMissedError: the state moves the image off the mirrors.
+    """
+    assembly, names, m = instrument.assembly, list(instrument.cameras), len(motions)
+    states = [_named(motion, about) for motion in motions]
+    steps = [motion.step for motion in motions]
+    placed, stepped = assembly.place([about]), assembly.place(states, steps)
+    stop = assemble(assembly, [f"{name}/image_to_stop" for name in names], [about], placed=placed)
+    points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
+    guess = np.concatenate([instrument.toward_optics(placed, name) for name in names])[:, None]
+    start = np.broadcast_to(guess, points.shape)
+    fan = RayFan(points, start, transverse_axes(start, np.broadcast_to([0.0, 1.0, 0.0], start.shape)))
+    position, direction = fan.at(aim(backend, stop, fan, np.zeros(2))[0])
+    axes, slope = hit_slopes(backend, stop, position, direction)
+
+    moved = np.concatenate([line_in_world(instrument, name, stepped).imag for name in names]) / COMPLEX_STEP
+    place, heading = np.repeat(position, m, axis=0), np.repeat(direction, m, axis=0)
+
+    def systems(sequence: str) -> SystemBatch:
+        return assemble(assembly, [f"{name}/{sequence}" for name in names], states, steps, stepped)
+
+    drift = push_forward(backend, systems("image_to_stop"), place, heading, moved, 0.0).position[..., :2]
+    turn = -turned(np.repeat(inverse(slope), m, axis=0), drift)
+    to_object = systems("image_to_object")
+    heading_step = np.einsum("bnk,bnkx->bnx", turn, np.repeat(axes, m, axis=0))
+    pushed = push_forward(backend, to_object, place, heading, moved, heading_step)
+    local = pushed.traced.numpy()[1]
+    # from the frame of the last element, which moves too, to the world
+    assert to_object.tangents is not None
+    pose = _rotation(to_object.values[-1], to_object.count)
+    pose_step = _rotation(to_object.tangents[-1], to_object.count)
+    world = np.einsum("bij,bnj->bni", pose, pushed.direction) + np.einsum("bij,bnj->bni", pose_step, local)
+    return np.asarray(world).reshape(len(names), m, LINE_POINTS, 3)
+
+
+def _rotation(numbers: object, count: int) -> np.ndarray:
+    """World rotation of an element in B systems, or its derivative, (B, 3, 3)."""
+    assert isinstance(numbers, dict)
+    return np.stack([np.stack([numbers[f"W{a}{b}"] for b in range(3)], -1) for a in range(3)], -2).reshape(count, 3, 3)
+
+
+def _named(motion: ElementaryMotion, about: State) -> State:
+    """The state ``about`` in which the motion's body names its pivot and, with zero amplitude, its figure term."""
+    start = about.get(motion.body, Motion(pivot=motion.pivot))
+    figure = {motion.axis: 0.0, **start.figure} if motion.kind == FIGURE else start.figure
+    return {
+        **about,
+        motion.body: Motion(
+            start.rotate,
+            start.shift,
+            start.pivot,
+            start.scale,
+            figure,
+            start.stretch,
+            start.index,
+            start.index_gradient,
+        ),
+    }

@@ -1,0 +1,490 @@
+"""The Jacobian of a study's responses by its factors at the base's values.
+
+Spots and lines of sight are differentiated by automatic differentiation through the trace
+(``twin.monitor.spot_gradient`` backward, ``twin.study.gradient.gradient_chain`` forward); the estimators, formulas on
+these numbers, along the directions that come out of it. All else has differences only: traced ones, of everything that
+needs no image and so has no noise, or those of the whole job with the noise of the base's seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.specs.job import check_nodes
+from scenes.specs.resolved import ResolvedJob
+from scenes.specs.study import ResponseSpec
+from scenes.specs.study_factor import FactorSpec
+from scenes.yaml.errors import InputError, KeyPath, Problem, shown
+from scenes.yaml.units import split_quantity, unit_ratio
+from twin.monitor.image_quality import quality_dicts
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.spot_gradient import spot_gradient
+from twin.run.cli import InputErrorText
+from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient
+from twin.study.runs.base_job import Failure, Run
+from twin.study.runs.config_tree import leaf
+from twin.study.runs.perturbed_job import PERTURB, JobMaker
+from twin.study.runs.sampling import number_of, ratios, scaled
+from twin.study.runs.setup import StudySetup
+
+
+@dataclass(frozen=True, eq=False)
+class GradientFactor:
+    """One factor.
+
+    Attributes:
+        setup: the study.
+        name: of the factor.
+        unit: of its numbers, empty for pure ones.
+        value: in the base.
+        spread: sigma of a normal distribution, else half of the range of its values; in its unit.
+        spread_of: which of the two, in words.
+    """
+
+    setup: StudySetup
+    name: str
+    unit: str
+    value: float
+    spread: float
+    spread_of: str
+
+    @classmethod
+    def of(cls, setup: StudySetup, name: str) -> GradientFactor:
+        """The factor of that name.
+
+        Raises:
+            InputError: it has no numbers, or the base has none where it acts.
+        """
+        factor = setup.study.factors[name]
+        numbers = factor.numbers()
+        if not numbers.numeric:
+            found = shown(list(factor.scalars()))
+            problem = Problem("there is no derivative by what is not a number", found, "numbers or quantities")
+            raise setup.error(problem, ("factors", name, factor.kind))
+        unit = numbers.unit or ""
+        values = numbers.values
+        if factor.kind in ("normal", "truncated"):
+            spread, spread_of = values[1], "sigma"
+        else:
+            spread, spread_of = 0.5 * (max(values) - min(values)), "half of its range"
+        if spread == 0.0:
+            spread, spread_of = 1.0, "one unit"
+        return cls(setup, name, unit, _in_base(setup, name, factor, unit), spread, spread_of)
+
+    @property
+    def spec(self) -> FactorSpec:
+        """As the study describes it."""
+        return self.setup.study.factors[self.name]
+
+    def values(self, value: float) -> tuple[tuple[KeyPath, Any], ...]:
+        """(place, what stands there) of all that the factor changes when it has this value; others are as in the base.
+
+        Raises:
+            InputError: a value that follows the factor cannot be worked out.
+        """
+        cell = f"{value!r} {self.unit}" if self.unit else value
+        out: dict[KeyPath, Any] = dict.fromkeys(self.spec.places, cell)
+        if self.spec.scales:
+            tree = self.setup.tree
+            try:
+                found = ratios(self.spec, tree, np.array([value]), self.unit)
+                out.update({place: scaled(number_of(leaf(tree, place)), float(r[0])) for place, r in found.items()})
+            except Problem as problem:
+                raise self.setup.error(problem, ("factors", self.name)) from None
+        return tuple(out.items())
+
+
+def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> float:
+    """The factor's value in the base, in its own unit; 1 for one that only scales."""
+    found = [leaf(setup.tree, place) for place in factor.places]
+    if not found:
+        return 1.0
+    numbers: list[float] = []
+    for k, value in enumerate(found):
+        number = _number(value, unit)
+        if number is None:
+            what = shown(value) if value is not None else "nothing"
+            problem = Problem("the base has no number here to differentiate at", what, "a number of the factor's kind")
+            raise setup.error(problem, ("factors", name, *factor.key_of(k)))
+        numbers.append(number)
+        # values that are written in several units agree to rounding
+        if abs(number - numbers[0]) > 1e-12 * abs(numbers[0]):
+            text = "the places of the factor have different values in the base, so that it has none"
+            raise setup.error(Problem(text, shown(value), shown(found[0])), ("factors", name, *factor.key_of(k)))
+    return numbers[0]
+
+
+def _number(value: Any, unit: str) -> float | None:
+    parts = split_quantity(value)
+    if parts is not None and unit:
+        return parts[0] * unit_ratio(parts[1], unit)
+    if parts is None and not unit and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    return None
+
+
+MOVE = 2.0
+"""By how many pixels the step of a motion moves a spot; the CCDs have room for some ten."""
+PART = 0.5
+"""Step of other factors, in their spreads."""
+QUALITY_PART = 0.1
+"""Step for image quality, in spreads of the factor: it is far from linear (a wavefront error is a root of squares), and
+traced without noise."""
+TOGETHER = 8
+"""Motions of which differences are traced at once."""
+SMALL = 1e-3
+"""Entries below this share of a response's largest one, both per spread of their factor, are judged against that
+share: what is zero by symmetry has no digits. An entry of a response that is a difference counts as much as the larger
+of its two terms, for the digits that they have in common are lost."""
+AD, TRACED, WHOLE = "ad", "traced differences", "differences of the whole job"
+Advance = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """Jacobian of R responses by F factors, per unit of the factor.
+
+    Attributes:
+        factors: what was differentiated by.
+        responses: names.
+        units: of the responses, empty for pure numbers.
+        ad: (R, F) by automatic differentiation; NaN where there is none.
+        differences: (R, F) by central differences.
+        error: (R, F) how far Richardson's extrapolation took the differences.
+        scale: (R, F) size of the terms that an entry is the difference of; the entry's own where there is one term.
+        step: (R, F) of the differences, in the factor's unit.
+        method: (R, F) names: how the best value was found.
+    """
+
+    factors: tuple[GradientFactor, ...]
+    responses: tuple[str, ...]
+    units: tuple[str, ...]
+    ad: np.ndarray
+    differences: np.ndarray
+    error: np.ndarray
+    scale: np.ndarray
+    step: np.ndarray
+    method: np.ndarray
+
+    @property
+    def best(self) -> np.ndarray:
+        """(R, F): by automatic differentiation where it is known, else by differences."""
+        return np.where(np.isnan(self.ad), self.differences, self.ad)
+
+    @property
+    def change(self) -> np.ndarray:
+        """(R, F) change of a response when the factor changes by its spread."""
+        return np.asarray(self.best * np.array([factor.spread for factor in self.factors]))
+
+    @property
+    def relative(self) -> np.ndarray:
+        """(R, F) deviation of the differences from AD, NaN where there is no AD; see ``SMALL`` for small entries."""
+        spread = np.array([factor.spread for factor in self.factors])
+        size = self.scale * spread
+        largest = np.max(np.nan_to_num(size), axis=1, initial=0.0, keepdims=True)
+        against = np.maximum(size, SMALL * largest)
+        deviation = np.abs(self.differences - self.ad) * spread
+        return np.where(against > 0.0, deviation / np.where(against > 0.0, against, 1.0), deviation * 0.0)
+
+    @property
+    def worst(self) -> float | None:
+        """The largest of ``relative``, None without AD."""
+        return float(np.nanmax(self.relative)) if np.any(~np.isnan(self.ad)) else None
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A response: where its number stands, and what is subtracted.
+
+    Attributes:
+        name: of the response.
+        spec: its keys.
+    """
+
+    name: str
+    spec: ResponseSpec
+
+    def value(self, outcome: Any, setup: StudySetup) -> float:
+        """The number. Raises InputError."""
+        first, second = self.terms(outcome, setup)
+        return first - second
+
+    def terms(self, outcome: Any, setup: StudySetup) -> tuple[float, float]:
+        """The number and what is subtracted from it, 0 if nothing is. Raises InputError."""
+        out = []
+        for key, where in ((self.spec.key, "key"), (self.spec.minus, "minus")):
+            if key is None:
+                out.append(0.0)
+                continue
+            try:
+                found = leaf(outcome, key)
+            except Problem as problem:
+                raise setup.error(problem, ("responses", self.name, where)) from None
+            if isinstance(found, bool) or not isinstance(found, int | float):
+                text = "the response is not a number in the base, so that it has no derivative"
+                raise setup.error(text, ("responses", self.name, where), allowed="a key that leads to a number")
+            out.append(float(found))
+        return out[0], out[1]
+
+    @property
+    def roots(self) -> set[str]:
+        """Files of the results that it needs; those with a spread of noise need images."""
+        keys: list[KeyPath] = [key for key in (self.spec.key, self.spec.minus) if key is not None]
+        return {"image" if "sigma" in str(key[-1]) else str(key[0]) for key in keys}
+
+
+@dataclass(eq=False)
+class _Table:
+    """The Jacobian while it is filled."""
+
+    ad: np.ndarray
+    differences: np.ndarray
+    error: np.ndarray
+    scale: np.ndarray
+    step: np.ndarray
+    method: np.ndarray
+    slopes: dict[int, Slopes] = field(default_factory=dict)
+
+    def put(self, rows: Sequence[int], k: int, values: np.ndarray, step: float, method: str) -> None:
+        """Differences of factor k in some rows from their values (4, rows)."""
+        self.differences[rows, k], self.error[rows, k] = extrapolated(values, step)
+        self.step[rows, k] = step
+        self.method[rows, k] = method
+
+
+def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = lambda text: None) -> Gradient:
+    """Differentiate a study at its base.
+
+    Args:
+        setup: the study; its design plays no part.
+        backend: where to trace.
+        advance: told what is being done.
+
+    Raises:
+        InputError: a factor or response has no number, the base's schema refuses a value beside the base's, or a
+            factor's step loses the light.
+        InputErrorText: the base itself cannot be run.
+    """
+    factors = tuple(GradientFactor.of(setup, name) for name in setup.study.factors)
+    asked = [Asked(name, spec) for name, spec in setup.study.responses.items()]
+    maker = JobMaker(setup.tree) if setup.study.base.command == "render" else None
+    if maker is not None and maker.base.job.course is not None:
+        maker = None
+    if maker is not None:
+        asked = [*_spot_responses(maker.base), *asked]
+    shape = (len(asked), len(factors))
+    table = _Table(
+        ad=np.full(shape, np.nan),
+        differences=np.full(shape, np.nan),
+        error=np.full(shape, np.nan),
+        scale=np.full(shape, np.nan),
+        step=np.full(shape, np.nan),
+        method=np.full(shape, WHOLE, dtype=object),
+    )
+    known = {"truth", "recovered", "quality"} if maker is not None else set()
+    traced = [i for i, one in enumerate(asked) if one.roots <= known]
+    if maker is not None and traced:
+        _Traced(setup, maker, backend, factors, asked, traced, advance).fill(table)
+    rest = [i for i in range(len(asked)) if i not in traced]
+    if rest:
+        _whole(setup, backend, factors, [asked[i] for i in rest], rest, table, advance)
+    names, units = tuple(one.name for one in asked), tuple(one.spec.units for one in asked)
+    return Gradient(
+        factors,
+        names,
+        units,
+        table.ad,
+        table.differences,
+        table.error,
+        table.scale,
+        table.step,
+        table.method.astype(str),
+    )
+
+
+def _spot_responses(resolved: ResolvedJob) -> list[Asked]:
+    out = []
+    for camera in resolved.instrument.cameras:
+        for side in ("left", "right"):
+            for axis in ("row", "column"):
+                key = ("recovered", "spots", camera, side, "after", axis)
+                out.append(Asked(f"spots.{camera}.{side}.{axis}", ResponseSpec(key=key, unit="px")))
+    return out
+
+
+class _Traced:
+    """The part of the Jacobian that needs no image."""
+
+    def __init__(
+        self,
+        setup: StudySetup,
+        maker: JobMaker,
+        backend: Backend,
+        factors: Sequence[GradientFactor],
+        asked: Sequence[Asked],
+        rows: Sequence[int],
+        advance: Advance,
+    ) -> None:
+        self.setup, self.maker, self.backend, self.factors = setup, maker, backend, factors
+        self.asked, self.advance = asked, advance
+        self.exact = [i for i in rows if "quality" not in asked[i].roots]
+        self.quality = [i for i in rows if i not in self.exact]
+
+    def fill(self, table: _Table) -> None:
+        """AD and differences of all factors."""
+        chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
+        try:
+            check_nodes(self.maker.base.job, chain.experiment.instrument.nodes)
+            about = chain.experiment.state(self.maker.base.job)
+            chain.spots([about])
+        except (AimError, BeamMissedError) as error:
+            raise InputErrorText(f"the base cannot be differentiated, it loses its light: {error}") from error
+        except InputError as error:
+            raise self.setup.blamed(error) from None
+        for k, factor in enumerate(self.factors):
+            if all(place[:2] == PERTURB for place, _ in factor.values(factor.value)):
+                slopes = motion_slopes(about, self._state_of(chain, factor), PART * factor.spread)
+                if slopes is not None:
+                    table.slopes[k] = slopes
+        sizes = self._exact(chain, about, table) if table.slopes else {}
+        steps = {k: sizes.get(k, PART * factor.spread) for k, factor in enumerate(self.factors)}
+        self._differences(chain, table, self.exact, steps)
+        steps = {k: QUALITY_PART * factor.spread for k, factor in enumerate(self.factors)}
+        self._differences(chain, table, self.quality, steps)
+        for k in table.slopes:
+            table.method[self.exact, k] = AD
+
+    def _differences(self, chain: Chain, table: _Table, rows: Sequence[int], steps: Mapping[int, float]) -> None:
+        """Differences of some rows by all factors."""
+        if not rows:
+            return
+        moving = list(table.slopes)
+        done: dict[int, np.ndarray] = {}
+        for start in range(0, len(moving), TOGETHER):
+            some = moving[start : start + TOGETHER]
+            self.advance(f"differences by {self.factors[some[0]].name}")
+            jobs = [self._job(self.factors[k], share * steps[k]) for k in some for share in SHARES]
+            try:
+                outcomes = self._outcomes(chain, jobs, rows)
+            except (AimError, BeamMissedError, ValueError):
+                continue  # they are tried one by one, to name the one
+            for i, k in enumerate(some):
+                done[k] = self._numbers(outcomes[i * len(SHARES) : (i + 1) * len(SHARES)], rows)
+        for k, factor in enumerate(self.factors):
+            if k not in done:
+                self.advance(f"differences by {factor.name}")
+                done[k] = self._values(chain, factor, steps[k], rows)
+            table.put(rows, k, done[k], steps[k], TRACED)
+
+    def _numbers(self, outcomes: Sequence[Any], rows: Sequence[int]) -> np.ndarray:
+        return np.array([[self.asked[i].value(one, self.setup) for i in rows] for one in outcomes])
+
+    def _state_of(self, chain: Chain, factor: GradientFactor) -> Callable[[float], State]:
+        def state(change: float) -> State:
+            return chain.experiment.state(self._job(factor, change).job)
+
+        return state
+
+    def _job(self, factor: GradientFactor, change: float) -> ResolvedJob:
+        try:
+            return self.maker.job(factor.values(factor.value + change))
+        except InputError as error:
+            raise _refused(self.setup, factor, change, error) from None
+
+    def _exact(self, chain: Chain, about: State, table: _Table) -> dict[int, float]:
+        """Fill in what AD finds; the steps of the differences by these factors."""
+        self.advance("automatic differentiation")
+        motions = list(dict.fromkeys(motion for slopes in table.slopes.values() for motion in slopes))
+        spots: np.ndarray = np.zeros((*chain.nominal[0].shape[1:], 0))
+        sight: np.ndarray = np.zeros((*chain.nominal[1].shape[1:], 0))
+        if motions:
+            experiment = chain.experiment
+            spots = spot_gradient(experiment.path.coarse, motions, about)
+            sight = np.moveaxis(sight_gradient(experiment.instrument, self.backend, motions, about), 1, -1)
+        at = chain.spots([about])[0], chain.sight([about])[0]
+        sizes = {}
+        for k, slopes in table.slopes.items():
+            weight = np.array([slopes.get(motion, 0.0) for motion in motions])
+            moved, turned = spots @ weight, sight @ weight
+            outcomes, step = chain.moved(about, at, moved, turned)
+            numbers = [[self.asked[i].terms(one, self.setup) for i in self.exact] for one in outcomes]
+            terms = extrapolated(np.array(numbers).reshape(len(SHARES), -1, 2), step)[0]
+            table.ad[self.exact, k] = terms[:, 0] - terms[:, 1]
+            table.scale[self.exact, k] = np.abs(terms).max(axis=1)
+            limits = [CAP[motion.kind] / abs(slope) for motion, slope in slopes.items()]
+            sizes[k] = (
+                float(min([MOVE / max(np.abs(moved).max(), 1e-300), *limits]))
+                if slopes
+                else PART * self.factors[k].spread
+            )
+        return sizes
+
+    def _values(self, chain: Chain, factor: GradientFactor, step: float, rows: Sequence[int]) -> np.ndarray:
+        """Responses of the four jobs beside the base, (4, rows)."""
+        jobs = [self._job(factor, share * step) for share in SHARES]
+        same = all(place[:2] == PERTURB for place, _ in factor.values(factor.value))
+        try:
+            if same:
+                outcomes = self._outcomes(chain, jobs, rows)
+            else:
+                outcomes = []
+                for job in jobs:
+                    outcomes += self._outcomes(Chain(job, MonitorExperiment(job, self.backend)), [job], rows)
+        except (AimError, BeamMissedError, ValueError) as error:
+            text = f"{step:g} {factor.unit}".strip()
+            problem = f"the factor cannot be varied by {text} about the base: {error}"
+            raise self.setup.error(problem, ("factors", factor.name)) from error
+        except InputError as error:
+            raise _refused(self.setup, factor, step, error) from None
+        return self._numbers(outcomes, rows)
+
+    def _outcomes(self, chain: Chain, jobs: Sequence[ResolvedJob], rows: Sequence[int]) -> list[dict[str, Any]]:
+        states = [chain.experiment.state(job.job) for job in jobs]
+        spots, sight = chain.spots(states), chain.sight(states)
+        out = [chain.outcome(state, spots[s], sight[s]) for s, state in enumerate(states)]
+        if rows is self.quality:
+            found = quality_dicts(chain.experiment.instrument, self.backend, states, jobs[0].job.render.obstructed)
+            out = [{**one, "quality": quality} for one, quality in zip(out, found, strict=True)]
+        return out
+
+
+def _whole(
+    setup: StudySetup,
+    backend: Backend,
+    factors: Sequence[GradientFactor],
+    asked: Sequence[Asked],
+    rows: Sequence[int],
+    table: _Table,
+    advance: Advance,
+) -> None:
+    """Differences of the base command's own results; all runs have the noise of the base's seed."""
+    for k, factor in enumerate(factors):
+        advance(f"whole job, {factor.name}")
+        step = PART * factor.spread
+        runs = [Run(s, factor.values(factor.value + share * step), None) for s, share in enumerate(SHARES)]
+        try:
+            outcomes = setup.job.evaluate(setup.tree, runs, backend)
+        except InputError as error:
+            raise _refused(setup, factor, step, error) from None
+        for outcome in outcomes:
+            if isinstance(outcome, Failure):
+                text = f"the factor cannot be varied by {step:g} {factor.unit} about the base: {outcome.message}"
+                raise setup.error(text, ("factors", factor.name))
+        values = np.array([[one.value(outcome, setup) for one in asked] for outcome in outcomes])
+        table.put(list(rows), k, values, step, WHOLE)
+
+
+def _refused(setup: StudySetup, factor: GradientFactor, step: float, error: InputError) -> InputError:
+    issue = error.issues[0]
+    at = f"{factor.value:g} ± {abs(step):g} {factor.unit}".strip()
+    text = f"the base does not allow values beside its own, {at}, where differences are taken: {issue.problem}"
+    problem = Problem(text, issue.found, issue.allowed, issue.suggestion)
+    return setup.error(problem, ("factors", factor.name, factor.spec.kind))

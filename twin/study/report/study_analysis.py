@@ -1,0 +1,437 @@
+"""Everything that the report says of a study, as numbers."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
+from twin.study.report.linear_model import LinearModel, MainEffect, linear_model, main_effects
+from twin.study.report.sensitivity_indices import Indices, Untold, sensitivity_indices
+from twin.study.report.study_runs import Factor, Response, StudyRuns
+from twin.study.report.study_statistics import (
+    CONFIDENCE,
+    Description,
+    Estimate,
+    Interval,
+    describe,
+    mean_interval,
+    quantile_interval,
+    runs_for_quantile,
+    share_interval,
+    std_interval,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ParetoFront:
+    """Non-dominated runs of a pair.
+
+    Attributes:
+        spec: the pair, and which way each is better.
+        runs: (m,) numbers of the runs on the front, from the best x to the best y.
+        x: (m,) their x.
+        y: (m,) their y.
+        ranks: (n,) of all runs: 0 on the front, 1 when the front is taken away, ...; -1 without numbers.
+        knee: index into ``runs`` of the strongest bulge; None where the front has none.
+    """
+
+    spec: ParetoSpec
+    runs: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    ranks: np.ndarray
+    knee: int | None
+
+
+def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
+    """The front of (n,) ``x`` and ``y``."""
+    good = np.isfinite(x) & np.isfinite(y)
+    costs = np.stack([x if spec.best_x == "min" else -x, y if spec.best_y == "min" else -y], axis=-1)
+    ranks = np.full(len(x), -1)
+    ranks[good] = ranks_of(costs[good])
+    front = np.flatnonzero(ranks == 0)
+    front = front[np.lexsort((front, costs[front, 1], costs[front, 0]))]
+    return ParetoFront(spec, front, x[front], y[front], ranks, knee(costs[front]))
+
+
+def ranks_of(costs: np.ndarray) -> np.ndarray:
+    """Fronts of (n, 2) costs by non-dominated sorting: (n,) 0 for points that no other is better than or equal to in
+    both and better in one, 1 for those that only points of front 0 dominate, and so on. Equal points share a front.
+    """
+    order = np.lexsort((costs[:, 1], costs[:, 0]))
+    ranks = np.empty(len(costs), np.int64)
+    # smallest second cost of every front so far; it rises with the rank, so that bisection finds the front
+    lowest: list[float] = []
+    before: tuple[float, float] | None = None
+    rank = 0
+    for k in order:
+        point = (float(costs[k, 0]), float(costs[k, 1]))
+        if point != before:
+            # a front with a second cost that is not larger holds a point that dominates this one
+            rank = bisect_right(lowest, point[1])
+            if rank == len(lowest):
+                lowest.append(point[1])
+            else:
+                lowest[rank] = point[1]
+            before = point
+        ranks[k] = rank
+    return ranks
+
+
+def knee(costs: np.ndarray) -> int | None:
+    """Where a front (m, 2), in order of the first cost, lies farthest below the line through its ends.
+
+    Both costs are scaled to the front's range. None for fewer than three different points, or when no point lies below
+    the line by more than rounding.
+    """
+    if len(np.unique(costs, axis=0)) < 3:
+        return None
+    span = np.ptp(costs, axis=0)
+    scaled = (costs - costs.min(axis=0)) / span
+    # the ends are (0, 1) and (1, 0)
+    gain = 1.0 - scaled.sum(axis=1)
+    best = int(np.argmax(gain))
+    return best if gain[best] > 1e-9 else None
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What became of a requirement.
+
+    Attributes:
+        name: of the requirement; empty for all of them together.
+        text: in words.
+        met: runs that meet it.
+        count: runs that have a number.
+        interval: of the share, in a drawn design; None in a grid.
+        judged: statistics of what is judged: the response, or its size; None for all together.
+        unit: of it.
+    """
+
+    name: str
+    text: str
+    met: int
+    count: int
+    interval: tuple[float, float] | None
+    judged: Description | None
+    unit: str
+
+    @property
+    def share(self) -> float | None:
+        """Share of the runs with a number; None without any."""
+        return self.met / self.count if self.count else None
+
+
+def is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
+    """(n,) whether each value meets the requirement; NaN does not."""
+    judged = np.abs(values) if spec.magnitude else values
+    good = np.isfinite(judged)
+    if spec.at_most is not None:
+        good &= judged <= spec.at_most
+    if spec.at_least is not None:
+        good &= judged >= spec.at_least
+    return np.asarray(good)
+
+
+def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
+    """All requirements of a study, then, of several, all together."""
+    out = []
+    everything = np.ones(runs.count, bool)
+    judged = np.ones(runs.count, bool)
+    for name, spec in runs.study.report.thresholds.items():
+        response = runs.find(spec.response)
+        assert isinstance(response, Response)
+        good = is_met(spec, response.values)
+        everything &= good
+        judged &= response.good
+        values = np.abs(response.values) if spec.magnitude else response.values
+        out.append(_counted(runs, name, _text(spec), good, response.good, describe(values, runs.drawn), response.unit))
+    if len(out) > 1:
+        out.append(_counted(runs, "", "all of them", everything, judged, None, ""))
+    return tuple(out)
+
+
+def _counted(
+    runs: StudyRuns, name: str, text: str, good: np.ndarray, known: np.ndarray, judged: Description | None, unit: str
+) -> Requirement:
+    met, count = int(np.sum(good & known)), int(np.sum(known))
+    interval = share_interval(met, count) if runs.drawn and count else None
+    return Requirement(name, text, met, count, interval, judged, unit)
+
+
+def _text(spec: ThresholdSpec) -> str:
+    what = f"|{spec.response}|" if spec.magnitude else spec.response
+    low = f"{spec.at_least:g} ≤ " if spec.at_least is not None else ""
+    high = f" ≤ {spec.at_most:g}" if spec.at_most is not None else ""
+    return f"{low}{what}{high}"
+
+
+QUANTILES = {"p95": 0.95, "p99.7": 0.997}
+GOALS = {"mean": 0.1, "sigma": 0.1, "p95": 0.2, "p99.7": 0.2}
+"""Half of the 95% interval, in units of sigma, below which a statistic counts as known."""
+POINTS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A statistic of the first n runs.
+
+    Attributes:
+        name: mean, sigma, p95 or p99.7.
+        counts: (m,) numbers of runs.
+        values: (m,) the statistic.
+        low: (m,) lower end of its interval, NaN where there is none.
+        high: (m,) upper end.
+        relative: half the interval at the end, in units of sigma; None where it is open.
+        enough: whether that is below the goal.
+        needed: about how many runs would reach it; None where it cannot be told.
+    """
+
+    name: str
+    counts: np.ndarray
+    values: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    relative: float | None
+    enough: bool
+    needed: int | None
+
+
+def courses(values: np.ndarray) -> tuple[Course, ...]:
+    """Of (n,) finite values in the order of the runs; none for fewer than 20 and for constant values."""
+    n = len(values)
+    if n < 20 or np.ptp(values) == 0.0:
+        return ()
+    counts = np.unique(np.rint(np.geomspace(10, n, POINTS)).astype(int))
+    sigma = float(np.std(values, ddof=1))
+    rows: dict[str, list[tuple[float, Interval]]] = {name: [] for name in GOALS}
+    for count in counts:
+        part = values[:count]
+        ordered = np.sort(part)
+        rows["mean"].append((float(np.mean(part)), mean_interval(part)))
+        rows["sigma"].append((float(np.std(part, ddof=1)), std_interval(part)))
+        for name, q in QUANTILES.items():
+            rows[name].append((float(np.quantile(ordered, q)), quantile_interval(ordered, q)))
+    return tuple(_course(name, counts, row, sigma) for name, row in rows.items())
+
+
+def _course(name: str, counts: np.ndarray, row: list[tuple[float, Interval]], sigma: float) -> Course:
+    low = np.array([math.nan if ends[0] is None else ends[0] for _, ends in row])
+    high = np.array([math.nan if ends[1] is None else ends[1] for _, ends in row])
+    half = 0.5 * (high[-1] - low[-1]) / sigma
+    relative = float(half) if math.isfinite(half) else None
+    n, goal = int(counts[-1]), GOALS[name]
+    enough = relative is not None and relative <= goal
+    needed = n if enough else None if relative is None else math.ceil(n * (relative / goal) ** 2)
+    if relative is None and name in QUANTILES:
+        needed = runs_for_quantile(QUANTILES[name])
+    return Course(name, counts, np.array([value for value, _ in row]), low, high, relative, enough, needed)
+
+
+@dataclass(frozen=True, eq=False)
+class StudyAnalysis:
+    """What was found; mappings go by the name of the response.
+
+    Attributes:
+        runs: the study's.
+        descriptions: statistics of responses and of stated sigmas.
+        linear: None where no model can be fitted.
+        effects: main effects of a grid; empty in drawn designs.
+        indices: empty when the study does not ask for them.
+        courses: how the statistics settle; empty for grids.
+        requirements: in the study's order, then all together.
+        fronts: of the pairs that the study asks for and that are numbers.
+        not_numbers: pairs that are not.
+    """
+
+    runs: StudyRuns
+    descriptions: Mapping[str, Description]
+    linear: Mapping[str, LinearModel | None]
+    effects: Mapping[str, tuple[MainEffect, ...]]
+    indices: Mapping[str, Indices | Untold]
+    courses: Mapping[str, tuple[Course, ...]]
+    requirements: tuple[Requirement, ...]
+    fronts: tuple[ParetoFront, ...]
+    not_numbers: tuple[str, ...]
+
+    @classmethod
+    def of(cls, runs: StudyRuns) -> StudyAnalysis:
+        """Analyse all runs."""
+        everything = runs.everything
+        indexed = everything if runs.study.report.sobol else ()
+        fronts, wrong = [], []
+        for spec in runs.study.report.pareto:
+            x, y = runs.find(spec.x), runs.find(spec.y)
+            if any(isinstance(thing, Factor) and not thing.numeric for thing in (x, y)):
+                wrong.append(f"{spec.x} and {spec.y}")
+            else:
+                # a run without a response is no compromise
+                fronts.append(pareto_front(spec, x.values, y.values))
+        return cls(
+            runs=runs,
+            descriptions={r.name: describe(r.values, runs.drawn) for r in everything},
+            linear={r.name: linear_model(runs.factors, r) for r in everything},
+            effects={r.name: () if runs.drawn else main_effects(runs.factors, r) for r in everything},
+            indices={r.name: sensitivity_indices(runs, r) for r in indexed},
+            courses={r.name: courses(r.known) if runs.drawn and not r.constant else () for r in runs.responses},
+            requirements=requirements(runs),
+            fronts=tuple(fronts),
+            not_numbers=tuple(wrong),
+        )
+
+    def influence(self, response: str) -> dict[str, float]:
+        """Factor -> how much of the response's variance it moves, the largest first; for orders and choices only.
+
+        The total index where there is one, otherwise the squared standardised coefficient or the share of the main
+        effect.
+        """
+        found = self.indices.get(response)
+        out = {factor.name: 0.0 for factor in self.runs.factors}
+        std = self.descriptions[response].std
+        if isinstance(found, Indices):
+            out.update({name: index.total.value for index in found.axes for name in index.factors})
+        elif self.effects[response] and std is not None and std.value > 0.0:
+            out.update({effect.factor: float(np.var(effect.means)) / std.value**2 for effect in self.effects[response]})
+        else:
+            model = self.linear[response]
+            for effect in model.effects if model is not None else ():
+                # a swing over 90% of a text's values is some 3 sigma
+                size = effect.coefficient.value if effect.coefficient is not None else _swing_in_sigmas(effect, std)
+                out[effect.factor] = size**2
+        return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+
+def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
+    return float(effect.swing.value) / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
+
+
+def summary(dataset: xr.Dataset, study: StudySpec) -> dict[str, Any]:
+    """What the report says of a study, as plain data for JSON; intervals are those of 95%."""
+    return plain_data(StudyAnalysis.of(StudyRuns.of(dataset, study)))
+
+
+def plain_data(found: StudyAnalysis) -> dict[str, Any]:
+    """An analysis as plain data; null where the runs cannot tell a number."""
+    runs = found.runs
+    return {
+        "name": runs.study.name,
+        "design": runs.kind,
+        "runs": runs.count,
+        "failed": int(runs.failed.sum()),
+        "confidence": CONFIDENCE,
+        "responses": {
+            r.name: {
+                "unit": r.unit,
+                **({"sigma_of": r.of} if r.of else {}),
+                **_description(found.descriptions[r.name]),
+                "linear_model": _linear(found.linear[r.name]),
+                "main_effects": [
+                    {"factor": e.factor, "levels": e.levels.tolist(), "means": e.means.tolist(), "swing": e.swing}
+                    for e in found.effects[r.name]
+                ],
+                **({"sobol": _indices(found.indices[r.name])} if r.name in found.indices else {}),
+                "convergence": {c.name: _analysis_course(c) for c in found.courses.get(r.name, ())},
+            }
+            for r in runs.everything
+        },
+        "requirements": [
+            {
+                "name": r.name or "all",
+                "text": r.text,
+                "met": r.met,
+                "runs_with_a_number": r.count,
+                "share": r.share,
+                "interval": list(r.interval) if r.interval is not None else None,
+            }
+            for r in found.requirements
+        ],
+        "pareto": [
+            {
+                "x": f.spec.x,
+                "y": f.spec.y,
+                "best_x": f.spec.best_x,
+                "best_y": f.spec.best_y,
+                "runs": f.runs.tolist(),
+                "knee_run": None if f.knee is None else int(f.runs[f.knee]),
+            }
+            for f in found.fronts
+        ],
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _estimate(value: Estimate | None) -> dict[str, Any] | None:
+    if value is None:
+        return None
+    return {"value": _number(value.value), "interval": [_number(end) for end in value.interval]}
+
+
+def _description(d: Description) -> dict[str, Any]:
+    return {
+        "count": d.count,
+        **{name: _estimate(getattr(d, name)) for name in ("mean", "std", "median", "p95", "p997")},
+        "min": d.low,
+        "max": d.high,
+        "skewness": d.normality.skewness if d.normality else None,
+        "excess_kurtosis": d.normality.kurtosis if d.normality else None,
+        "normality_p": d.normality.p if d.normality else None,
+        "p0135": d.tails[0] if d.tails else None,
+        "p99865": d.tails[1] if d.tails else None,
+    }
+
+
+def _linear(model: LinearModel | None) -> dict[str, Any] | None:
+    if model is None:
+        return None
+    return {
+        "r2": model.r2,
+        "adjusted_r2": model.adjusted,
+        "effects": {
+            e.factor: {
+                "swing": _estimate(e.swing),
+                "standardised_coefficient": _estimate(e.coefficient),
+                "rank_correlation": _estimate(e.rank),
+            }
+            for e in model.effects
+        },
+        "not_separable": list(model.cannot),
+    }
+
+
+def _indices(found: Indices | Untold) -> dict[str, Any]:
+    if isinstance(found, Untold):
+        return {"method": None, "reason": found.reason}
+    return {
+        "method": found.method,
+        "degree": found.degree,
+        "terms": found.terms,
+        "held_out_r2": found.held_out,
+        "unexplained_share": found.rest,
+        "noise_share": found.noise,
+        "factors": {
+            index.name: {
+                "first": _estimate(index.first),
+                "total": _estimate(index.total),
+                "first_rbd_fast": index.check,
+            }
+            for index in found.axes
+        },
+    }
+
+
+def _analysis_course(course: Course) -> dict[str, Any]:
+    return {
+        "relative_half_width": course.relative,
+        "enough_runs": course.enough,
+        "runs_needed": course.needed,
+    }

@@ -1,0 +1,319 @@
+"""Distributions, curves, convergence and compromises of a study's responses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from twin.run.artefact import plain
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
+from twin.study.report.study_analysis import StudyAnalysis
+from twin.study.report.study_runs import Factor, Response, typeset
+from twin.study.report.study_statistics import Description, mean_interval
+
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
+MARKS = ("o", "s", "^", "D", "v", "P")
+MOST_POINTS = 500
+"""Of a scatter: more would make the page heavy and the picture black."""
+STEPS = (1, 2, 2.5, 5, 10)
+"""Ticks are these times a power of ten apart."""
+LONGEST = 18
+"""Characters of a text on an axis."""
+
+
+def panels(count: int, wide: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels, ``wide`` beside each other, each ``height`` inches high."""
+    rows = -(-count // wide)
+    figure = new_figure(height * rows)
+    grid = figure.subplots(rows, wide, squeeze=False).ravel()
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, list(grid[:count])
+
+
+def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
+    """The look of all panels; None leaves the ticks of an axis as they are."""
+    axes.grid(color=LIGHT, lw=0.5)
+    axes.set_axisbelow(True)
+    plain_axes(axes)
+    if x_ticks is not None:
+        axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
+        _plain_numbers(axes, "x")
+    if y_ticks is not None:
+        axes.yaxis.set_major_locator(MaxNLocator(y_ticks, steps=STEPS))
+        _plain_numbers(axes, "y")
+
+
+def _plain_numbers(axes: Axes, which: str) -> None:
+    """Whole numbers at the ticks, and not what is to be added to each, as long as they stay short."""
+    low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
+    short = abs(high - low) > 1e-4 * max(abs(low), abs(high))
+    axes.ticklabel_format(axis=which, style="sci", scilimits=(-3, 5), useOffset=not short)  # type: ignore[arg-type]
+
+
+def short(text: str) -> str:
+    """A text that fits on an axis."""
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+
+
+def positions(thing: Factor | Response) -> np.ndarray:
+    """(runs,) where the values stand on an axis: numbers where they are, texts at 0, 1, ..."""
+    if isinstance(thing, Factor) and not thing.numeric:
+        return np.array([np.flatnonzero(thing.levels == value)[0] for value in thing.values], np.float64)
+    return thing.values
+
+
+def name_texts(axes: Axes, thing: Factor | Response, which: str) -> None:
+    """Names of the texts at an axis with ``positions``; nothing for numbers."""
+    if not isinstance(thing, Factor) or thing.numeric:
+        return
+    places, names = np.arange(len(thing.levels)), [short(str(level)) for level in thing.levels]
+    if which == "x":
+        turned = sum(len(name) for name in names) > 34
+        axes.set_xticks(places, names, rotation=30 if turned else 0, ha="right" if turned else "center")
+        axes.set_xlim(-0.6, len(names) - 0.4)
+    else:
+        axes.set_yticks(places, names)
+        axes.set_ylim(-0.6, len(names) - 0.4)
+
+
+def some(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
+    """Numbers of up to ``most`` runs of (n,) ``good``, evenly through the study."""
+    found = np.flatnonzero(good)
+    return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(int)]
+
+
+def jitter(thing: Factor | Response, seed: int) -> np.ndarray:
+    """(runs,) what is added to ``positions`` so that points of one text do not hide each other."""
+    if isinstance(thing, Factor) and not thing.numeric:
+        return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(thing.values))
+    return np.zeros(len(thing.values))
+
+
+def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
+    """Runs of a numeric factor in groups of neighbours of equal size, or of equal value for few values."""
+    levels = np.unique(factor.values[good])
+    if len(levels) <= 12:
+        for level in levels:
+            yield np.flatnonzero(good & (factor.values == level))
+        return
+    order = np.flatnonzero(good)[np.argsort(factor.values[good], kind="stable")]
+    count = int(np.clip(len(order) // 10, 3, 15))
+    yield from np.array_split(order, count)
+
+
+def histogram_figure(found: StudyAnalysis, names: Sequence[str]) -> Figure:
+    """A panel for each of the named responses."""
+    things = [r for r in found.runs.responses if r.name in names]
+    figure, grid = panels(len(things), min(len(things), 2), 3.0)
+    for axes, response in zip(grid, things, strict=True):
+        _histogram(axes, response, found.descriptions[response.name], found.runs.drawn)
+    return figure
+
+
+def _histogram(axes: Axes, response: Response, about: Description, drawn: bool) -> None:
+    values = response.known
+    axes.set(xlabel=response.label, ylabel="runs")
+    if response.constant or about.mean is None or about.std is None:
+        text = "no run has a number" if len(values) == 0 else f"all {len(values)} runs: {values[0]:.6g}"
+        axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center")
+        finish(axes, None, None)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return
+    edges = np.histogram_bin_edges(values, bins=_bin_count(values))
+    axes.hist(values, bins=list(edges), color=SKY, edgecolor="white", linewidth=0.4)
+    mean, std = about.mean.value, about.std.value
+    axes.axvline(mean, color=INK, lw=1.3, label="mean")
+    if drawn:
+        for k, place in enumerate((mean - 3.0 * std, mean + 3.0 * std)):
+            axes.axvline(place, color=VERMILION, lw=1.2, ls="--", label="mean ± 3σ" if k == 0 else None)
+        normal = about.normality is None or about.normality.normal
+        if not normal and about.tails is not None:
+            for k, place in enumerate(about.tails):
+                axes.axvline(place, color=GREEN, lw=1.4, ls=":", label="0.135% and 99.865%" if k == 0 else None)
+        if normal and about.normality is not None:
+            x = np.linspace(mean - 3.5 * std, mean + 3.5 * std, 200)
+            bell = np.exp(-0.5 * ((x - mean) / std) ** 2) / (np.sqrt(2.0 * np.pi) * std)
+            axes.plot(x, bell * len(values) * (edges[1] - edges[0]), color=GREEN, lw=1.1, label="normal distribution")
+    finish(axes)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=7.5, columnspacing=1.0)
+
+
+def _bin_count(values: np.ndarray) -> int:
+    """Freedman and Diaconis' rule within 5 and 50."""
+    low, high = np.quantile(values, (0.25, 0.75))
+    width = 2.0 * (high - low) / len(values) ** (1.0 / 3.0)
+    return int(np.clip(np.ceil(np.ptp(values) / width), 5, 50)) if width > 0.0 else 10
+
+
+_TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile", "p99.7": "99.7% quantile"}
+
+
+def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
+    """Mean, sigma and the upper quantiles of the first n runs, each with its interval."""
+    courses = found.courses[response.name]
+    figure, grid = panels(len(courses), len(courses), 2.8)
+    for axes, course in zip(grid, courses, strict=True):
+        both = np.isfinite(course.low) & np.isfinite(course.high)
+        axes.fill_between(course.counts, course.low, course.high, where=both, color=SKY, alpha=0.4, lw=0)
+        axes.plot(course.counts, course.values, color=BLUE, lw=1.3)
+        axes.set_xscale("log")
+        axes.set(title=f"{_TITLES[course.name]} of {response.name}", xlabel="runs")
+        if not both.any():
+            axes.text(0.03, 0.04, f"no upper limit below {course.needed} runs", transform=axes.transAxes, fontsize=7.5)
+        finish(axes, None, 5)
+    grid[0].set_ylabel(typeset(response.unit) or response.name)
+    return figure
+
+
+MOST_LINES = 6
+MOST_PANELS = 6
+
+
+def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
+    """A panel for each of the factors that matter most, up to six."""
+    order = list(found.influence(response.name))
+    factors = sorted(found.runs.factors, key=lambda factor: order.index(factor.name))
+    factors = [factor for factor in factors if len(factor.levels) > 1][:MOST_PANELS]
+    if not factors:
+        factors = list(found.runs.factors[:1])
+    wide = min(len(factors), 3)
+    figure, grid = panels(len(factors), wide, 3.5 if wide < 3 else 3.0)
+    for k, (axes, factor) in enumerate(zip(grid, factors, strict=True)):
+        other = _partner(factor, factors) if not found.runs.drawn else None
+        if not factor.numeric:
+            _bars(axes, factor, other, response)
+        elif found.runs.drawn:
+            _binned(axes, factor, response)
+        else:
+            _lines(axes, factor, other, response)
+        axes.set_xlabel(factor.label)
+        if k % wide == 0:
+            axes.set_ylabel(response.label)
+        finish(axes, 5 if factor.numeric else None)
+        name_texts(axes, factor, "x")
+        # all panels of a drawn design have the same lines
+        if axes.get_legend_handles_labels()[0] and (k == 0 or not found.runs.drawn):
+            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), fontsize=7.5, ncols=3, columnspacing=0.9)
+    return figure
+
+
+def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
+    """The most important other factor that takes several values, for lines or groups."""
+    return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
+
+
+def _binned(axes: Axes, factor: Factor, response: Response) -> None:
+    """Mean of neighbouring runs, its interval, the middle 68% of the runs, and the runs."""
+    shown = some(response.good)
+    axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=2.0, alpha=0.5, zorder=1)
+    groups = list(bins(factor, response.good))
+    if len(groups) < 2 or min(len(group) for group in groups) < 3:
+        return
+    x = np.array([factor.values[group].mean() for group in groups])
+    parts = [response.values[group] for group in groups]
+    low, high = np.array([np.quantile(part, (0.1587, 0.8413)) for part in parts]).T
+    ends = np.array([mean_interval(part) for part in parts], np.float64)
+    mean = np.array([part.mean() for part in parts])
+    axes.fill_between(x, low, high, color=SKY, alpha=0.35, lw=0, label="middle 68%")
+    error = np.abs(ends.T - mean)
+    axes.errorbar(x, mean, error, fmt="o-", color=BLUE, ms=3, lw=1.2, capsize=2, label="mean, 95%")
+
+
+def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
+    """(label, runs) of each value of the other factor."""
+    if other is None:
+        return [("", response.good)]
+    number = (lambda level: plain(level, 4)) if other.numeric else (lambda level: short(str(level)))
+    head = f"{other.name} "
+    count = len(other.levels)
+    shown = other.levels[np.unique(np.linspace(0, count - 1, min(count, MOST_LINES)).round().astype(int))]
+    return [
+        (f"{head if k == 0 else ''}{number(level)}", response.good & (other.values == level))
+        for k, level in enumerate(shown)
+    ]
+
+
+def _lines(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
+    """Means at the values of a grid, a line for each value of the other factor."""
+    for k, (label, runs) in enumerate(_groups(other, response)):
+        means = [(v, response.values[runs & (factor.values == v)]) for v in factor.levels]
+        points = np.array([(v, part.mean()) for v, part in means if len(part)])
+        if len(points):
+            mark, colour = MARKS[k % len(MARKS)], COLOURS[k % len(COLOURS)]
+            axes.plot(*points.T, f"{mark}-", color=colour, ms=3.5, lw=1.2, label=label or None)
+
+
+def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
+    """Means for each text, with one standard deviation of the runs as whiskers; bars where zero is in sight, otherwise
+    points.
+    """
+    groups = _groups(other, response)
+    width = 0.8 / len(groups)
+    means = [[response.values[runs & (factor.values == level)] for level in factor.levels] for _, runs in groups]
+    every = np.array([part.mean() for row in means for part in row if len(part)])
+    spread = float(np.std(response.known)) if len(response.known) else 0.0
+    from_zero = len(every) > 0 and np.max(np.abs(every)) < 8.0 * max(spread, np.ptp(every))
+    for k, ((label, _), row) in enumerate(zip(groups, means, strict=True)):
+        x = np.array([j for j, part in enumerate(row) if len(part)], np.float64)
+        x += (k - 0.5 * (len(groups) - 1)) * width
+        y = np.array([part.mean() for part in row if len(part)])
+        whisker = [float(np.std(part, ddof=1)) if len(part) > 1 else 0.0 for part in row if len(part)]
+        colour = COLOURS[k % len(COLOURS)]
+        style = {"capsize": 2.5, "ecolor": "#1b1f24", "elinewidth": 0.9, "label": label or None}
+        if from_zero:
+            bar = {name: style[name] for name in ("capsize", "ecolor", "label")}
+            axes.bar(x, y, 0.92 * width, yerr=whisker, color=colour, alpha=0.85, **bar)  # type: ignore[arg-type]
+        else:
+            axes.errorbar(x, y, whisker, fmt=MARKS[k % len(MARKS)], color=colour, ms=5, **style)  # type: ignore[arg-type]
+
+
+def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
+    """The pairs that the study asks for."""
+    wide = min(len(pairs), 3)
+    figure, grid = panels(len(pairs), wide, 3.5)
+    for axes, (x_name, y_name) in zip(grid, pairs, strict=True):
+        x, y = found.runs.find(x_name), found.runs.find(y_name)
+        _points(axes, x, y, found.runs.study.design.seed)
+        axes.set(xlabel=x.label, ylabel=y.label)
+        finish(axes, 5, 5)
+        name_texts(axes, x, "x")
+        name_texts(axes, y, "y")
+    return figure
+
+
+def _points(axes: Axes, x: Factor | Response, y: Factor | Response, seed: int, size: float = 3.0) -> None:
+    places, heights = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
+    shown = some(np.isfinite(places) & np.isfinite(heights))
+    axes.plot(places[shown], heights[shown], ".", color=BLUE, ms=size, alpha=0.6)
+
+
+_WAYS = {"min": "small is good", "max": "large is good"}
+
+
+def pareto_figure(found: StudyAnalysis) -> Figure:
+    """A panel for each pair: all runs, the front, its knee."""
+    figure, grid = panels(len(found.fronts), min(len(found.fronts), 2), 3.9)
+    for axes, front in zip(grid, found.fronts, strict=True):
+        x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
+        shown = some(front.ranks > 0, 1000)
+        axes.plot(x.values[shown], y.values[shown], ".", color=GREY, ms=3.5, alpha=0.6, label="dominated runs")
+        if len(front.runs):
+            # between two runs of the front nothing is known: only steps are sure
+            axes.step(front.x, front.y, where="post", color=BLUE, lw=1.0)
+            axes.plot(front.x, front.y, "o", color=BLUE, ms=5, label=f"front, {len(front.runs)} runs")
+        if front.knee is not None:
+            place = (front.x[front.knee], front.y[front.knee])
+            label = f"knee, run {front.runs[front.knee]}"
+            axes.plot(*place, "D", color=VERMILION, ms=8, mfc="none", mew=1.6, label=label)
+        axes.set_xlabel(f"{x.label} ({_WAYS[front.spec.best_x]})")
+        axes.set_ylabel(f"{y.label} ({_WAYS[front.spec.best_y]})")
+        finish(axes)
+        if np.any(front.ranks >= 0):
+            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=3)
+    return figure

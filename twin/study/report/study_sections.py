@@ -1,0 +1,370 @@
+"""Sections of a study's report: texts, tables and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from scenes.specs.study_factor import FactorSpec
+from scenes.yaml.errors import key_text
+from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed, plain
+from twin.run.result import Section
+from twin.run.svg import look, to_svg
+from twin.study.report import conclusions
+from twin.study.report.influence_figures import (
+    chosen,
+    indices_figure,
+    matrix_figure,
+    tornado_figure,
+    with_indices,
+    with_tornado,
+)
+from twin.study.report.sensitivity_indices import Indices
+from twin.study.report.study_analysis import StudyAnalysis
+from twin.study.report.study_figures import (
+    MOST_PANELS,
+    convergence_figure,
+    curve_figure,
+    histogram_figure,
+    pareto_figure,
+    scatter_figure,
+)
+from twin.study.report.study_runs import Factor, StudyRuns, typeset
+from twin.study.report.study_statistics import Estimate
+from twin.study.report.study_wording import DASH, normality_text, number, percent, plural, share, span, with_limits
+
+MOST_NAMED = 6
+
+
+def factor_table(runs: StudyRuns) -> Table:
+    """Name, where it acts, distribution and the values that were run."""
+    rows: list[list[Cell]] = []
+    for factor in runs.factors:
+        places = [key_text(place) for place in factor.spec.places]
+        places += [f"{key_text(scale.key)} (power {scale.power:g})" for scale in factor.spec.scales]
+        rows.append([factor.name, typeset(factor.unit), "; ".join(places), _source(factor.spec), _values(factor)])
+    heads = ("factor", "unit", "in the base", "distribution", "values run")
+    return Table("factors", "Factors", "What was varied.", heads, rows)
+
+
+def _source(spec: FactorSpec) -> str:
+    if spec.kind == "table":
+        assert spec.table is not None
+        return f"table {spec.table.file}, column {spec.table.column}"
+    if spec.kind == "values":
+        return f"list of {plural(len(spec.scalars()), 'value')}"
+    values = [plain(value, 6) for value in spec.numbers().values]
+    if spec.kind == "normal":
+        return f"normal, mean {values[0]}, σ {values[1]}"
+    if spec.kind == "truncated":
+        return f"normal, mean {values[0]}, σ {values[1]}, cut to {values[2]} … {values[3]}"
+    return f"{spec.kind}, {values[0]} … {values[1]}"
+
+
+def _values(factor: Factor) -> str:
+    levels = factor.levels
+    if not factor.numeric:
+        named = [str(level) for level in levels[:MOST_NAMED]]
+        return ", ".join(named) + (f" and {len(levels) - MOST_NAMED} more" if len(levels) > MOST_NAMED else "")
+    if len(levels) <= MOST_NAMED:
+        return ", ".join(plain(float(level), 6) for level in levels)
+    return f"{plain(float(np.min(levels)), 5)} … {plain(float(np.max(levels)), 5)}"
+
+
+MOST_FIGURES = 12
+"""Responses that have figures of their own."""
+MOST_FRONT = 50
+"""Rows of a front in the report; its CSV holds all."""
+
+
+def sections(found: StudyAnalysis) -> list[Section]:
+    """All sections that have something to show, in the order of the page."""
+    made = (
+        _requirements(found),
+        _distributions(found),
+        _influences(found),
+        _indices(found),
+        _curves(found),
+        _pairs(found),
+        _fronts(found),
+        _convergence(found),
+    )
+    return [section for section in made if section is not None]
+
+
+def response_table(found: StudyAnalysis) -> Table:
+    """Statistics of the responses and of the stated sigmas."""
+    heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
+    rows: list[list[Cell]] = []
+    for r in found.runs.everything:
+        d = found.descriptions[r.name]
+        estimates = [with_limits(e) for e in (d.mean, d.std, d.median, d.p95, d.p997)]
+        rows.append([r.name, typeset(r.unit), d.count, *estimates, number(d.low), number(d.high)])
+    if found.runs.drawn:
+        how = (
+            "In brackets 95% confidence intervals: Student's for the mean, from the kurtosis for the standard "
+            "deviation, order statistics for the quantiles; a question mark stands for an end that so few runs cannot "
+            "tell, > for a quantile of which they tell nothing else."
+        )
+    else:
+        how = (
+            "Over the combinations of the grid, all counted alike; they are no sample, so that there are no intervals."
+        )
+    caption = f"Over the runs that have a number; 95% and 99.7% of the runs lie below those columns. {how}"
+    return Table(name="responses", title="Responses", caption=caption, heads=heads, rows=rows)
+
+
+WORDED = ("responses", "factors", "requirements", "linear-model", "sobol")
+"""Tables whose cells are texts: all digits stand in statistics.json, not in a file of their own."""
+
+
+def own_file(artefact: Artefact) -> bool:
+    """Whether an artefact is written to a file of its own."""
+    return artefact.name not in WORDED
+
+
+def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure:
+    with look(f"study-{name}"):
+        return SvgFigure(name, title, caption, to_svg(draw()))
+
+
+def _requirements(found: StudyAnalysis) -> Section | None:
+    if not found.requirements:
+        return None
+    failed = int(found.runs.failed.sum())
+    rows: list[list[Cell]] = [
+        [
+            r.name or "all",
+            r.text,
+            typeset(r.unit),
+            r.met,
+            r.count,
+            percent(r.share),
+            span(r.interval) if r.interval is not None else DASH,
+            number(r.judged.p95.value) if r.judged and r.judged.p95 else DASH,
+            number(r.judged.p997.value) if r.judged and r.judged.p997 else DASH,
+        ]
+        for r in found.requirements
+    ]
+    how = "The interval is Clopper and Pearson's, 95%." if found.runs.drawn else "A grid is no sample: no interval."
+    lost = f" {failed} failed runs are not counted." if failed else ""
+    return Section(
+        "Requirements",
+        (),
+        (
+            Table(
+                "requirements",
+                "Share of the runs that meet them",
+                f"Of the runs that have a number.{lost} {how} The last columns are quantiles of what is judged.",
+                ("requirement", "", "unit", "met", "of", "share", "interval", "95%", "99.7%"),
+                rows,
+            ),
+        ),
+    )
+
+
+def _distributions(found: StudyAnalysis) -> Section | None:
+    asked = found.runs.study.report.histograms
+    names = [r.name for r in found.runs.responses if asked is None or r.name in asked][:MOST_FIGURES]
+    names = [name for name in names if found.descriptions[name].count > 0]
+    if not names:
+        return None
+    texts = [normality_text(r, found.descriptions[r.name]) for r in found.runs.responses if r.name in names]
+    told = tuple(text for text in texts if text is not None)
+    if told:
+        told = (*told, "The test is D'Agostino and Pearson's; a normal distribution fails it in one of 100 studies.")
+    caption = "Number of runs by value."
+    if found.runs.drawn:
+        caption += (
+            " Dashed: three standard deviations from the mean. Where the distribution is not normal, dotted: what "
+        )
+        caption += "0.135% and 99.865% of the runs lie below, from 741 runs on."
+    figure = _figure("histograms", "Histograms", caption, lambda: histogram_figure(found, names))
+    return Section("Distributions", told, (figure,))
+
+
+def _influences(found: StudyAnalysis) -> Section | None:
+    things = with_tornado(found)
+    if not things:
+        return None
+    drawn = found.runs.drawn
+    if drawn:
+        caption = (
+            "Change of the response from a factor's 5% to its 95% quantile by the linear model, the others unchanged, "
+            "with 95% intervals (HC3). Blue: rises with the factor; red: falls; grey: of a text, between the values "
+            "with the smallest and the largest mean."
+        )
+    else:
+        caption = (
+            "From the smallest to the largest of the means that belong to a factor's values. Blue: the mean at the "
+            "last value is the larger one; red: the first; grey: texts."
+        )
+    figure = _figure("tornado", "Swings" if drawn else "Main effects", caption, lambda: tornado_figure(found))
+    rows: list[list[Cell]] = []
+    texts = []
+    for r in things:
+        model = found.linear[r.name]
+        if model is None:
+            continue
+        texts.append(f"{r.name} {percent(model.r2)}")
+        for e in model.effects:
+            ends = " … ".join(end if isinstance(end, str) else number(end, 3) for end in e.span)
+            rows.append(
+                [
+                    r.name,
+                    e.factor,
+                    ends,
+                    with_limits(e.swing) if drawn else number(e.swing.value),
+                    typeset(r.unit),
+                    _maybe(e.coefficient, drawn),
+                    _maybe(e.rank, drawn),
+                ]
+            )
+    table = Table(
+        "linear-model",
+        "Linear model and rank correlations",
+        "Swing between the factor's 5% and 95% quantiles (second column), standardised regression coefficient (sigmas "
+        "of the response per sigma of the factor) and Spearman's rank correlation"
+        + (", with 95% intervals. Where the last two differ much, the response is curved." if drawn else "."),
+        ("response", "factor", "from … to", "swing", "unit", "standardised", "rank correlation"),
+        rows,
+    )
+    cannot = sorted({name for r in things for m in [found.linear[r.name]] if m is not None for name in m.cannot})
+    told = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
+    if cannot:
+        told.append(f"Not told apart from the other factors, and left out of the model: {', '.join(cannot)}.")
+    return Section("What the factors do", tuple(told), (figure, table) if rows else (figure,))
+
+
+def _maybe(estimate: Estimate | None, drawn: bool) -> str:
+    if estimate is None:
+        return DASH
+    return with_limits(estimate) if drawn else number(estimate.value, 3)
+
+
+def _indices(found: StudyAnalysis) -> Section | None:
+    if not found.runs.study.report.sobol:
+        return None
+    told = conclusions.indices_texts(found)
+    things = with_indices(found)
+    if not things:
+        return Section("Sobol indices", tuple(told))
+    chaos = found.runs.drawn
+    rows: list[list[Cell]] = []
+    for r in things:
+        part = found.indices[r.name]
+        assert isinstance(part, Indices)
+        for index in part.axes:
+            check = DASH if index.check is None else fixed(index.check, 2)
+            rows.append([r.name, index.name, share(index.first), share(index.total), *([check] if chaos else [])])
+    heads = ("response", "factor", "first order", "total", *(("first order, RBD-FAST",) if chaos else ()))
+    caption = "First order: share of the variance that the factor explains alone; total: with all its interactions."
+    if chaos:
+        caption += " RBD-FAST (SALib) needs no model and checks the first order; its own error is some 0.03 to 0.1."
+    table = Table("sobol", "Indices", caption, heads, rows)
+    drawn = "with 95% intervals" if chaos else "exact for the grid"
+    figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {drawn}.",
+                     lambda: indices_figure(found))  # fmt: skip
+    return Section("Sobol indices", tuple(told), (figure, table))
+
+
+def _curves(found: StudyAnalysis) -> Section | None:
+    figures = []
+    if found.runs.drawn:
+        caption = (
+            "Points: runs. Line: means of neighbouring runs with 95% intervals. Band: the middle 68% of these runs."
+        )
+    else:
+        caption = "Means over all other factors; of a text with one standard deviation of the runs as whisker."
+        if len([f for f in found.runs.factors if len(f.levels) > 1]) > 1:
+            caption += " A line or group for each value of the other factor that matters most."
+    for k, response in enumerate(found.runs.everything[:MOST_FIGURES]):
+        if found.descriptions[response.name].count == 0 or response.constant:
+            continue
+        figures.append(_figure(f"curves-{k + 1}", response.label, caption, partial(curve_figure, found, response)))
+        caption = "As above."
+    if not figures:
+        return None
+    more = len(found.runs.factors) - MOST_PANELS
+    told = (f"The {MOST_PANELS} factors that matter most of {len(found.runs.factors)}.",) if more > 0 else ()
+    return Section("Response curves", told, tuple(figures))
+
+
+def _pairs(found: StudyAnalysis) -> Section | None:
+    figures = []
+    pairs = found.runs.study.report.scatter
+    if pairs:
+        figures.append(
+            _figure(
+                "scatter", "Pairs that were asked for", "Every point is a run.", lambda: scatter_figure(found, pairs)
+            )
+        )
+    things = chosen(found)
+    if len(things) > 2:
+        factors = sum(isinstance(thing, Factor) for thing in things)
+        caption = (
+            f"The {factors} factors that matter most and {len(things) - factors} responses. Below the diagonal up to "
+            "300 runs, above it Spearman's rank correlation, large and framed (green +, red −) beyond 0.3."
+        )
+        figures.append(_figure("matrix", "Scatter matrix", caption, lambda: matrix_figure(found)))
+    return Section("Pairs", (), tuple(figures)) if figures else None
+
+
+def _fronts(found: StudyAnalysis) -> Section | None:
+    told = tuple(f"{pair}: texts have no order, so that there is no front." for pair in found.not_numbers)
+    if not found.fronts:
+        return Section("Best compromises", told) if told else None
+    caption = "Blue: runs that no other run beats in both; the stairs bound what is known to be possible. "
+    caption += "Knee: where the front, scaled to its range, bulges farthest from the line through its ends."
+    parts: list[SvgFigure | Table] = [_figure("pareto", "Pareto fronts", caption, lambda: pareto_figure(found))]
+    for k, front in enumerate(found.fronts):
+        x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
+        others = [f for f in found.runs.factors if f not in (x, y) and len(f.levels) > 1]
+        rows: list[list[Cell]] = []
+        for j, run in enumerate(front.runs.tolist()):
+            own: list[Cell] = [_cell(f, run) for f in others]
+            rows.append([run, float(front.x[j]), float(front.y[j]), *own, "knee" if j == front.knee else ""])
+        shown = (
+            rows
+            if len(rows) <= MOST_FRONT
+            else [rows[round(i * (len(rows) - 1) / (MOST_FRONT - 1))] for i in range(MOST_FRONT)]
+        )
+        note = (
+            ""
+            if shown is rows
+            else f" {MOST_FRONT} of {len(rows)}, evenly through the front; study.csv holds all runs."
+        )
+        heads = ("run", x.label, y.label, *(f.label for f in others), "")
+        parts.append(
+            Table(
+                f"pareto-front-{k + 1}",
+                f"Front of {x.name} and {y.name}",
+                f"From the best {x.name} on.{note}",
+                heads,
+                shown,
+            )
+        )
+    return Section("Best compromises", told, tuple(parts))
+
+
+def _cell(factor: Factor, run: int) -> Cell:
+    """Value of a factor; whole numbers without decimals."""
+    value: Cell = factor.values[run].item()
+    whole = factor.numeric and bool(np.all(factor.levels == np.rint(factor.levels)))
+    return int(value) if whole and isinstance(value, float) else value
+
+
+def _convergence(found: StudyAnalysis) -> Section | None:
+    names = [name for name, courses in found.courses.items() if courses][:MOST_FIGURES]
+    if not names:
+        return None
+    caption = "Of the first n runs, with the 95% interval where both its ends can be told."
+    figures = []
+    things = [r for r in found.runs.responses if r.name in names]
+    for k, r in enumerate(things):
+        figures.append(_figure(f"convergence-{k + 1}", r.label, caption, partial(convergence_figure, found, r)))
+        caption = "As above."
+    return Section("Enough runs?", tuple(conclusions.convergence_texts(found, names)), tuple(figures))

@@ -1,0 +1,123 @@
+"""What a job is to a study, and those that run one test, one run after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+from optics.numerics.backend import Backend
+from scenes.yaml.errors import KeyPath
+from scenes.yaml.spec import Spec
+from twin.study.runs.config_tree import Tree
+from collections.abc import Callable, Sequence
+from typing import Any
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import YamlFile
+from twin.run.svg import undrawn
+from twin.study.runs.config_tree import Tree, with_values
+from twin.run.result import BenchError
+from twin.run.result import Advance, LabResult, silent
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a study.
+
+    Attributes:
+        number: from 0.
+        values: (place, value) of everything the factors change in the base's tree.
+        seed: of its noise; None for the base's own.
+    """
+
+    number: int
+    values: tuple[tuple[KeyPath, Any], ...]
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A run that cannot be: light is lost, or its values do not go together.
+
+    Attributes:
+        message: why, one line.
+    """
+
+    message: str
+
+
+Outcome = Mapping[str, Any] | Failure
+"""Results by file, as the run folder's JSON files without .json hold them; or why there are none."""
+
+
+class BaseJob(Protocol):
+    """A command that a study can vary."""
+
+    @property
+    def model(self) -> type[Spec]:
+        """What its config.yaml describes."""
+
+    @property
+    def block(self) -> int:
+        """Consecutive runs that are always evaluated together, whoever does it."""
+
+    def resolve(self, file: Path | str) -> Spec:
+        """Read its file, or the name of one in the library, with all it refers to. Raises InputError."""
+
+    def check(self, tree: Tree, backend: Backend) -> None:
+        """What can only be told with the job built; called once, in a worker, before the study. Raises InputError."""
+
+    def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
+        """Outcome of every run. The numbers may depend on which runs are done together, but on nothing else."""
+
+
+PHYSICS = (InputError, BenchError, AimError, BeamMissedError, ValueError, ArithmeticError)
+"""What says that a run cannot be. All errors of the analysis are ValueErrors."""
+
+
+@dataclass(frozen=True)
+class BenchBase:
+    """A test as ``twin.run.command.run_test`` runs it.
+
+    Attributes:
+        model: the set-up.
+        read: file -> set-up.
+        run: set-up, backend, seed and progress -> result.
+    """
+
+    model: type[Spec]
+    read: Callable[[Path | str], Spec]
+    run: Callable[[Any, Backend, int, Advance], LabResult]
+
+    @property
+    def block(self) -> int:
+        """One: nothing is gained by doing several together, and each is kept as soon as it is done."""
+        return 1
+
+    def resolve(self, file: Path | str) -> Spec:
+        """Read the test with all it refers to. Raises InputError."""
+        return self.read(file)
+
+    def check(self, tree: Tree, backend: Backend) -> None:
+        """Nothing more can be told before a run."""
+
+    def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
+        """Outcome of every run, one after the other."""
+        return [self._one(tree, run, backend) for run in runs]
+
+    def _one(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
+        try:
+            setup: Any = validate(self.model, YamlFile("", with_values(tree, run.values), {}))
+            with undrawn():
+                result = self.run(setup, backend, setup.test.seed if run.seed is None else run.seed, silent)
+        except PHYSICS as error:
+            return Failure(one_line(error))
+        return {result.kind: dict(result.data)}
+
+
+def one_line(error: Exception) -> str:
+    """What went wrong, on one line; an input error without the file it does not have."""
+    return "; ".join(line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip())

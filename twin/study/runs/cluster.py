@@ -1,0 +1,255 @@
+"""Worker processes: a local cluster that is made for the study and ends with it, or one that somebody else runs."""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import dask
+from distributed import Client, LocalCluster
+from distributed.scheduler import KilledWorker
+from distributed.security import Security
+
+from twin.run.cli import InputErrorText
+from twin.study.runs.task import ONE_THREAD
+from twin.run.versions import source_digest, versions
+
+REACH_SECONDS = 5.0
+"""How long a scheduler may take to answer before the user is told that it does not."""
+LOST_SECONDS = 10.0
+"""How long a scheduler may be away before the study is broken off."""
+WORKER_SECONDS = 60.0
+"""How long to wait for the first worker."""
+LEAST_MEMORY = 0.5e9
+"""Bytes that a worker process takes at least: interpreter, libraries, an instrument with its calibration."""
+RETRIES = 2
+"""How often a task is given to another worker after the one that had it died."""
+SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
+
+
+class ClusterError(Exception):
+    """The workers cannot be used any longer; the message says why."""
+
+
+@dataclass(eq=False)
+class Workers:
+    """Worker processes of a study.
+
+    Attributes:
+        client: of Dask.
+        local: whether they are this command's own.
+        warnings: what the user should know.
+    """
+
+    client: Client
+    local: bool
+    warnings: list[str] = field(default_factory=list)
+    _finished: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
+
+    @property
+    def count(self) -> int:
+        """Number of worker processes that the scheduler knows of now."""
+        return len(self.client.scheduler_info(n_workers=-1)["workers"])
+
+    def submit(self, work: Callable[[Any], Any], argument: Any) -> Any:
+        """Start a piece of work; ``next_finished`` hands it back when it is done."""
+        future = self.client.submit(work, argument, pure=False, retries=0)
+        future.add_done_callback(self._finished.put)
+        return future
+
+    def next_finished(self, tick: Callable[[], None] = lambda: None) -> Any:
+        """The next piece of work that is done, well or not.
+
+        Args:
+            tick: called about twice a second while waiting.
+
+        Raises:
+            ClusterError: the scheduler is gone.
+        """
+        lost: float | None = None
+        while True:
+            try:
+                future = self._finished.get(timeout=0.5)
+            except queue.Empty:
+                tick()
+            else:
+                if future.status != "cancelled":
+                    return future
+            if self.client.status == "running":
+                lost = None
+                continue
+            lost = time.monotonic() if lost is None else lost
+            if self.client.status in ("closing", "closed") or time.monotonic() - lost > LOST_SECONDS:
+                raise ClusterError("the scheduler is gone")
+
+
+def killed(error: BaseException) -> bool:
+    """Whether a task failed because the workers that had it died."""
+    return isinstance(error, KilledWorker)
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Workers]:
+    """Worker processes on this machine with one thread each; they, and what they leave on disk, end with the block.
+
+    Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
+    So all speak TLS with a key that is made for the study and kept in memory, and a peer without it is refused.
+    """
+    place = Path(tempfile.mkdtemp(prefix="twin-study-"))
+    settings = {
+        # set before the processes start: NumPy reads them when it is imported
+        "distributed.nanny.pre-spawn-environ": {**ONE_THREAD},
+        "distributed.scheduler.allowed-failures": RETRIES,
+        # what is computed is small and handed over at once; a worker is never to wait for memory
+        # nothing is told by HTTP, neither about the scheduler nor about the workers
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
+        "distributed.worker.memory.terminate": False,
+        "distributed.scheduler.worker-ttl": None,
+        "distributed.admin.large-graph-warning-threshold": "1GB",
+        "distributed.comm.timeouts.connect": "60s",
+        "temporary-directory": str(place),
+        "logging": {"distributed": "critical", "distributed.nanny": "critical", "tornado": "critical"},
+    }
+    _silence()
+    try:
+        with (
+            _kept_environment(ONE_THREAD),
+            dask.config.set(settings),
+            LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                protocol="tls",
+                security=Security.temporary(),
+                # no dashboard; the port for it cannot be left out, so it is a free one, seen by this machine only
+                dashboard_address="127.0.0.1:0",
+                worker_dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
+                local_directory=str(place),
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            yield Workers(client, True)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+@contextmanager
+def _kept_environment(names: Iterable[str]) -> Iterator[None]:
+    """Restore these variables of this process at the end: Dask's nannies set here what their workers are to inherit."""
+    before = {name: os.environ.get(name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Workers]:
+    """Workers of a running cluster.
+
+    Args:
+        address: of its scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS Dask is told the certificates by
+            its own configuration, ``distributed.comm.tls``.
+        tell: told that there are no workers yet.
+
+    Raises:
+        InputErrorText: it cannot be reached, or its workers do not have the twin.
+        ClusterError: it has no workers.
+    """
+    if not address.startswith(SCHEMES):
+        raise InputErrorText(f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786")
+    _silence()
+    settings = {
+        "distributed.comm.timeouts.connect": f"{REACH_SECONDS}s",
+        "logging": {"distributed": "critical"},
+        "distributed.comm.retry.count": 0,
+    }
+    with dask.config.set(settings):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                client = Client(address, timeout=REACH_SECONDS, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            text = f"the scheduler {address} cannot be reached ({reason}); start it with `dask scheduler`"
+            raise InputErrorText(text) from None
+        try:
+            workers = Workers(client, False)
+            _wait_for_worker(workers, address, tell)
+            workers.warnings += _differences(client)
+            yield workers
+        finally:
+            client.close(timeout=2)
+
+
+def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]) -> None:
+    end = time.monotonic() + WORKER_SECONDS
+    told = False
+    while not workers.count:
+        if not told:
+            tell(f"the scheduler {address} has no workers yet; waiting for `dask worker {address} --nthreads 1`")
+            told = True
+        if time.monotonic() > end:
+            raise ClusterError(f"the scheduler {address} had no workers for {WORKER_SECONDS:.0f} s")
+        time.sleep(0.2)
+
+
+def _differences(client: Client) -> list[str]:
+    """Versions of the workers that differ from ours: their numbers may differ in the last digits, or more.
+
+    Raises:
+        InputErrorText: they cannot import the twin, or have another one.
+    """
+    try:
+        theirs = client.run(_program, on_error="return")
+    except Exception as error:
+        raise ClusterError(f"the workers do not answer: {error}") from error
+    ours, source = _program()
+    out = []
+    for address, found in theirs.items():
+        if isinstance(found, BaseException):
+            text = f"the worker {address} cannot import the twin ({found}); start it from the twin's environment"
+            raise InputErrorText(text)
+        if found[1] != source:
+            text = f"the worker {address} has other source files of the twin than this command; install the same there"
+            raise InputErrorText(text)
+        different = [
+            f"{name} {found[0].get(name)} instead of {own}" for name, own in ours.items() if found[0].get(name) != own
+        ]
+        if different:
+            out.append(f"the worker {address} has other versions: {', '.join(different)}")
+    return out
+
+
+def _program() -> tuple[dict[str, str], str]:
+    """Versions of the packages, checksum of the program's own source files."""
+    return versions(), source_digest()
+
+
+def _silence() -> None:
+    """Dask tells of every lost connection on the terminal; what matters of it the command says itself."""
+    for name in ("distributed", "distributed.client", "distributed.core", "distributed.nanny", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")

@@ -1,0 +1,246 @@
+"""Runs the blocks of a study that are not there yet: a pilot first, then chunks, a few at a time on every worker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from scenes.yaml.errors import KeyPath, Problem
+from twin.run.cli import InputErrorText
+from twin.study.runs.block_result import check_response
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.cluster import ClusterError, Workers, killed
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import StudySetup
+from twin.study.runs.task import Pilot, Task, evaluate, pilot
+from twin.run.versions import source_digest
+
+CHUNK_SECONDS = 6.0
+"""How long a worker is to be busy with a chunk: what is lost when it dies, against what handing over costs."""
+LARGEST_CHUNK = 40
+"""Blocks in a chunk at most."""
+AHEAD = 2
+"""Chunks that are handed over for each worker: one being computed, the others waiting."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known before a study starts.
+
+    Attributes:
+        runs, blocks, chunks: how many are to be done, the pilot's among them.
+        there: runs that were there already.
+        seconds: that it will take, pilot excluded; None when nobody knows.
+        memory: that all processes will need, bytes.
+        workers: worker processes.
+        state_seconds: that a worker needs for a run.
+    """
+
+    runs: int
+    blocks: int
+    chunks: int
+    there: int
+    seconds: float | None
+    memory: float
+    workers: int
+    state_seconds: float
+
+
+@dataclass(eq=False)
+class Progress:
+    """What the engine tells while it works; every member may be replaced.
+
+    Attributes:
+        start: the estimate, once the pilot is done.
+        done: number of runs that are there, of how many.
+        warn: something the user should know.
+    """
+
+    start: Callable[[Estimate], None] = lambda estimate: None
+    done: Callable[[int, int], None] = lambda done, total: None
+    warn: Callable[[str], None] = lambda text: None
+
+
+class IncompleteError(Exception):
+    """Some runs could not be computed although everything else was; the message names them."""
+
+
+@dataclass(eq=False)
+class Engine:
+    """Runs a study.
+
+    Attributes:
+        plan: all its runs.
+        store: finished chunks.
+        backend: where to trace.
+        progress: what is told meanwhile.
+        chunk_blocks: blocks in a chunk, None to choose by the pilot's time.
+        computed: number of runs that this engine has computed.
+        seconds: that it took for them.
+    """
+
+    plan: Plan
+    store: ChunkStore
+    backend: str = "llvm"
+    progress: Progress = field(default_factory=Progress)
+    chunk_blocks: int | None = None
+    computed: int = 0
+    seconds: float = 0.0
+
+    def run(self, workers: Workers, own_memory: float = 0.0) -> None:
+        """Compute whatever is missing.
+
+        Args:
+            workers: who computes.
+            own_memory: of this process, bytes, for the estimate.
+
+        Raises:
+            InputError: the base cannot be run as it is, or a response's key leads nowhere in its results.
+            IncompleteError: workers died again and again in some runs, or the program failed in them; the others are
+                there.
+            ClusterError: the scheduler is gone.
+            OSError: a chunk cannot be written.
+        """
+        started = time.monotonic()
+        missing = self.store.missing
+        there = self.store.runs
+        config = self.plan.setup.to_yaml()
+        if not missing:
+            return
+        first = self._pilot(workers, config, missing[0])
+        left = missing[1:]
+        each = first.result.seconds / max(1, len(self.plan.block(missing[0])))
+        size = self.chunk_blocks or _chunk_size(len(left), first.result.seconds, workers.count)
+        chunks = list(_chunks(left, size))
+        count = max(1, workers.count)
+        runs = sum(len(self.plan.block(block)) for block in missing)
+        rest = runs - len(self.plan.block(missing[0]))
+        slowest = -(-len(chunks) // count) * size * first.result.seconds if chunks else 0.0
+        seconds = min(slowest, each * rest / count + first.result.seconds * size) + first.start_seconds * (count > 1)
+        memory, limit = own_memory + count * first.memory, self.plan.setup.study.limits
+        if memory > limit.bytes:
+            self.progress.warn(
+                f"the processes need about {1e-9 * memory:.1f} GB, more than the study's {limit.memory}; use fewer "
+                "--workers"
+            )
+        self.progress.start(Estimate(runs, len(missing), len(chunks) + 1, there, seconds, memory, count, each))
+        self.progress.done(self.store.runs, self.plan.runs)
+        self._all(workers, config, chunks)
+        self.seconds = time.monotonic() - started
+
+    def _pilot(self, workers: Workers, config: str, block: int) -> Pilot:
+        """Do the first block and see whether the results hold what is asked for."""
+        workers.submit(pilot, self._task(config, range(block, block + 1)))
+        future = workers.next_finished()
+        if future.status != "finished":
+            error = future.exception()
+            runs = _runs_text([self.plan.block(block)])
+            if killed(error):
+                raise IncompleteError(f"the workers died in the first block, {runs}")
+            raise IncompleteError(f"the program failed in the first block, {runs}: {_told(error)}") from error
+        first: Pilot = future.result()
+        if first.refusal is not None:
+            raise first.refusal
+        if first.sample is not None:
+            check_responses(self.plan.setup, first.sample)
+        else:
+            self.progress.warn(f"all runs of the first block fail: {first.result.messages[0]}")
+        self.store.write(block, [first.result])
+        self.computed += len(first.result.messages)
+        return first
+
+    def _all(self, workers: Workers, config: str, chunks: list[range]) -> None:
+        """Compute chunks, never more than a few ahead. One in which workers die is cut into blocks to find which."""
+        waiting = list(reversed(chunks))
+        running: dict[Any, tuple[range, Any]] = {}
+        bad: list[range] = []
+        reasons: list[str] = []
+        while waiting or running:
+            while waiting and len(running) < AHEAD * max(1, workers.count):
+                blocks = waiting.pop()
+                future = workers.submit(evaluate, self._task(config, blocks))
+                running[future.key] = (blocks, future)
+            future = workers.next_finished()
+            blocks, _ = running.pop(future.key, (range(0), None))
+            if not blocks:
+                continue
+            if future.status == "finished":
+                self.store.write(blocks.start, future.result())
+                self.computed += sum(len(self.plan.block(block)) for block in blocks)
+                self.progress.done(self.store.runs, self.plan.runs)
+                continue
+            error = future.exception()
+            if len(blocks) > 1:
+                waiting.extend(range(block, block + 1) for block in reversed(blocks))
+                continue
+            bad.append(self.plan.block(blocks.start))
+            reason = "the workers died" if killed(error) else f"the program failed: {_told(error)}"
+            if reason not in reasons:
+                reasons.append(reason)
+        if bad:
+            raise IncompleteError(f"not computed: {_runs_text(bad)} ({'; '.join(reasons)})")
+
+    def _task(self, config: str, blocks: range) -> Task:
+        return Task(
+            config,
+            source_digest(),
+            self.backend,
+            blocks.start,
+            tuple(tuple(runs) for runs in self.plan.runs_of(blocks)),
+        )
+
+
+def check_responses(setup: StudySetup, sample: Any) -> None:
+    """Check that the results hold every response of a study.
+
+    Raises:
+        InputError: one that they do not, with what there is.
+    """
+    for name, response in setup.study.responses.items():
+        for key, path in (("key", response.key), ("sigma", response.sigma), ("minus", response.minus)):
+            if path is None:
+                continue
+            try:
+                check_response(sample, path)
+            except Problem as problem:
+                place: KeyPath = ("responses", name, key)
+                text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
+                told = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
+                raise setup.error(told, place) from None
+
+
+def fit_workers(wanted: int, memory: float, least: float) -> int:
+    """As many workers as are wanted and fit into the memory, one at least."""
+    return max(1, min(wanted, int(memory // least)))
+
+
+def _chunk_size(blocks: int, block_seconds: float, workers: int) -> int:
+    """Blocks in a chunk: some seconds of work, but at least a few chunks for each worker."""
+    by_time = int(CHUNK_SECONDS / max(block_seconds, 1e-3))
+    by_share = blocks // (4 * max(1, workers))
+    return max(1, min(by_time, by_share, LARGEST_CHUNK))
+
+
+def _chunks(blocks: Sequence[int], size: int) -> list[range]:
+    """Consecutive blocks in pieces of at most ``size``."""
+    out: list[range] = []
+    for block in blocks:
+        if out and out[-1].stop == block and len(out[-1]) < size:
+            out[-1] = range(out[-1].start, block + 1)
+        else:
+            out.append(range(block, block + 1))
+    return out
+
+
+def _runs_text(parts: Sequence[range]) -> str:
+    return "runs " + ", ".join(f"{part.start}-{part.stop - 1}" for part in parts)
+
+
+def _told(error: BaseException) -> str:
+    notes = " ".join(getattr(error, "__notes__", ()))
+    return f"{type(error).__name__}: {error} {notes}".strip()
+
+
+__all__ = ["ClusterError", "Engine", "Estimate", "IncompleteError", "InputErrorText", "Progress"]

@@ -1,0 +1,362 @@
+"""The main job as the base of a study: states of one instrument are done together, all else run by run.
+
+A state's numbers differ in the last bits with the states it is done with; so a block is always the same runs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+import numpy as np
+from analysis.monitor.recovery import Recovery
+from optics.geometry.tree import State
+from scenes.specs.resolved import ResolvedJob
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.main_job.render_results import RenderRun
+from twin.monitor.truth import Truth
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+from analysis.monitor.intersection_angle import IntersectionAngleChange
+from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.recovery import Recovery, recover
+from analysis.spots.spot_positions import SpotError
+from optics.raytrace.aim import AimError
+from optics.numerics.threads import one_blas_thread
+from optics.raytrace.trace import BeamMissedError
+from twin.study.runs.base_job import Failure, Outcome
+from twin.monitor.truth import Truth, trace_truth
+import json
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from optics.numerics.backend import Backend
+from scenes.specs.job import check_nodes
+from scenes.specs.resolved import ResolvedJob, resolve
+from scenes.yaml.spec import Spec
+from twin.monitor.image_quality import quality_dicts
+from twin.main_job.render_results import quality_dict
+from twin.study.runs.base_job import Failure, Outcome, Run
+from twin.study.runs.base_job import PHYSICS, one_line
+from twin.study.runs.config_tree import Tree
+from twin.study.runs.perturbed_job import PERTURB, JobMaker, needs_more, read_job
+
+
+_NOTHING = np.empty(0)
+
+
+def monitor_results(
+    resolved: ResolvedJob,
+    experiment: MonitorExperiment,
+    state: State,
+    frames: int,
+    seed: int,
+    truth: Truth,
+    recovery: Recovery,
+) -> dict[str, Any]:
+    """``truth`` and ``recovered``: contents of truth.json and recovered.json, made by the code that makes the files.
+
+    Args:
+        resolved: the job.
+        experiment: its instrument.
+        state: what the job perturbs.
+        frames: of an exposure.
+        seed: of its noise.
+        truth: of this one state.
+        recovery: what its images or spots say.
+    """
+    run = RenderRun(
+        resolved=resolved,
+        experiment=experiment,
+        state=state,
+        frames=frames,
+        seed=seed,
+        truth=truth,
+        photons_before=_NOTHING,
+        photons_after=_NOTHING,
+        before=_NOTHING,
+        after=_NOTHING,
+        recovery=recovery,
+        crosstalk={},
+        warnings=(),
+    )
+    return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
+
+
+Given = TypeVar("Given")
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorRun:
+    """One run.
+
+    Attributes:
+        resolved: its job.
+        state: what its job perturbs.
+        frames, seed: of its exposures.
+    """
+
+    resolved: ResolvedJob
+    state: State
+    frames: int
+    seed: int
+
+
+def run_together(
+    experiment: MonitorExperiment, runs: Sequence[MonitorRun], before: Callable[[int, int], np.ndarray]
+) -> list[Outcome]:
+    """Results of runs of one instrument with one number of frames, as truth.json and recovered.json hold them.
+
+    Args:
+        experiment: the instrument.
+        runs: to be done at once.
+        before: number of frames and seed -> frames of the nominal state, (C, frames, rows, columns).
+
+    Returns:
+        For each run its results, or why it has none. When one run's light is lost, all runs of the group are tried
+        alone, and those that are good are done together without it.
+    """
+    out: list[Outcome | None] = [None] * len(runs)
+    left = list(range(len(runs)))
+    traced = _traced(experiment, [run.state for run in runs])
+    if traced is None:
+        for k in left:
+            try:
+                _trace(experiment, [runs[k].state])
+            except (AimError, BeamMissedError) as error:
+                out[k] = Failure(str(error))
+        left = [k for k in left if out[k] is None]
+        traced = _trace(experiment, [runs[k].state for k in left]) if left else None
+    if traced is None:
+        return [outcome for outcome in out if outcome is not None]
+    truth, photons = traced
+    # runs that share their noise have the same frames before, which are then measured once
+    shared = len({run.seed for run in runs}) == 1
+    first = (
+        before(runs[0].frames, runs[0].seed)
+        if shared
+        else np.stack([before(r.frames, r.seed) for r in _of(runs, left)])
+    )
+    after = np.empty((*photons.shape[:2], runs[0].frames, *photons.shape[2:]), np.uint16)
+    for i, run in enumerate(_of(runs, left)):
+        after[i : i + 1] = experiment.frames_after(photons[i : i + 1], run.frames, run.seed)
+    good = list(range(len(left)))
+    while good:
+        try:
+            with one_blas_thread():
+                start = first if shared else _of(first, good)
+                recovery = recover(start, _of(after, good), experiment.calibration, _centroid(runs[0]), threads=1)
+        except SpotError as error:
+            lost = _lost(error, experiment, good)
+            for i, reason in lost.items():
+                out[left[i]] = Failure(f"a spot cannot be measured ({reason})")
+            good = [i for i in good if i not in lost]
+            continue
+        for j, i in enumerate(good):
+            run, one = runs[left[i]], (_truth_of(truth, i), _recovery_of(recovery, j))
+            out[left[i]] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *one)
+        break
+    return [outcome for outcome in out if outcome is not None]
+
+
+def _of(things: Any, chosen: Sequence[int]) -> Any:
+    """Those of the given numbers; no copy of arrays when it is all of them."""
+    if len(chosen) == len(things):
+        return things
+    return things[list(chosen)] if isinstance(things, np.ndarray) else [things[k] for k in chosen]
+
+
+def _centroid(run: MonitorRun) -> str:
+    return run.resolved.job.analysis.centroid
+
+
+def _traced(experiment: MonitorExperiment, states: Sequence[State]) -> tuple[Truth, np.ndarray] | None:
+    try:
+        return _trace(experiment, states)
+    except (AimError, BeamMissedError):
+        return None
+
+
+def _trace(experiment: MonitorExperiment, states: Sequence[State]) -> tuple[Truth, np.ndarray]:
+    """Truth, and expected photons (S, C, rows, columns)."""
+    truth = trace_truth(experiment.instrument, experiment.backend, states)
+    return truth, experiment.path.expected_photons(states, chunk=len(states))
+
+
+def _lost(error: SpotError, experiment: MonitorExperiment, good: Sequence[int]) -> dict[int, str]:
+    """State -> why its spots, before or after, cannot be measured."""
+    channels = experiment.path.channels
+    out: dict[int, str] = {}
+    for index in error.indices:
+        state, spot = divmod(index, len(channels))
+        out.setdefault(good[state], f"{channels[spot].key}: {error.reasons[index]}")
+    return out
+
+
+def _truth_of(truth: Truth, i: int) -> Truth:
+    """The truth of one of the states."""
+    one = slice(i, i + 1)
+    cameras = {
+        name: replace(
+            change,
+            d_alpha=change.d_alpha[one],
+            d_beta=change.d_beta[one],
+            d_gamma=change.d_gamma[one],
+            principal_distance=change.principal_distance[one],
+            d_f=change.d_f[one],
+        )
+        for name, change in truth.cameras.items()
+    }
+    return replace(truth, cameras=cameras, angle_change=truth.angle_change[one])
+
+
+def _recovery_of(recovery: Recovery, i: int) -> Recovery:
+    """What the images of one of the states say."""
+    one = slice(i, i + 1)
+    return Recovery(
+        before=recovery.before[one],
+        after=recovery.after[one],
+        sigma_before=recovery.sigma_before[one],
+        sigma_after=recovery.sigma_after[one],
+        shift_covariance=recovery.shift_covariance[one],
+        parameters={
+            name: {
+                estimator: CameraParameters(
+                    p.d_alpha_rad[one], p.d_beta_rad[one], p.d_gamma_rad[one], p.d_f_m[one], p.covariance[one]
+                )
+                for estimator, p in estimators.items()
+            }
+            for name, estimators in recovery.parameters.items()
+        },
+        angle={e: IntersectionAngleChange(a.change_rad[one], a.sigma_rad[one]) for e, a in recovery.angle.items()},
+    )
+
+
+BLOCK = 25
+"""A run's last digits depend on those that it is traced with, its block; and not on the number of workers, the size
+of the chunks or where a study was interrupted.
+"""
+KEPT = 4
+"""Instruments with their calibration that a worker keeps."""
+
+
+class RenderBase:
+    """``python -m twin.render``, without the crosstalk tables. It keeps instruments from one block to the next."""
+
+    def __init__(self) -> None:
+        self._experiments: OrderedDict[str, MonitorExperiment] = OrderedDict()
+        self._before: OrderedDict[tuple[str, int, int], np.ndarray] = OrderedDict()
+        self._makers: OrderedDict[int, JobMaker] = OrderedDict()
+
+    @property
+    def model(self) -> type[Spec]:
+        """A job with all it refers to."""
+        return ResolvedJob
+
+    @property
+    def block(self) -> int:
+        """As many states as are done together."""
+        return BLOCK
+
+    def resolve(self, file: Path | str) -> Spec:
+        """Read a job with all it refers to. Raises InputError."""
+        return resolve(file)
+
+    def check(self, tree: Tree, backend: Backend) -> None:
+        """Whether the perturbed nodes are there and allow what is done to them. Raises InputError."""
+        resolved = read_job(tree)
+        check_nodes(resolved.job, self._experiment(resolved, backend)[1].instrument.nodes)
+
+    def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
+        """Outcome of every run: ``truth`` and ``recovered``; if asked for, also ``quality``, and with a course, stray
+        light or targets these.
+        """
+        maker = self._maker(tree)
+        out: list[Outcome | None] = [None] * len(runs)
+        groups: dict[tuple[Any, ...], list[tuple[int, MonitorRun]]] = {}
+        used: dict[str, MonitorExperiment] = {}
+        same = all(key[:2] == PERTURB for run in runs for key, _ in run.values)
+        shared = self._experiment(maker.base, backend) if same else None
+        for k, run in enumerate(runs):
+            try:
+                resolved = maker.job(run.values)
+                if run.seed is not None:
+                    resolved = resolved.with_render(resolved.frames, run.seed)
+                if needs_more(resolved.job):
+                    out[k] = _alone(resolved, backend)
+                    continue
+                name, experiment = shared or self._experiment(resolved, backend)
+                check_nodes(resolved.job, experiment.instrument.nodes)
+                state = experiment.state(resolved.job)
+            except PHYSICS as error:
+                out[k] = Failure(one_line(error))
+                continue
+            used[name] = experiment
+            work = MonitorRun(resolved, state, resolved.frames, resolved.job.render.seed)
+            groups.setdefault((name, work.frames, resolved.job.analysis.centroid), []).append((k, work))
+        for (name, *_), members in groups.items():
+            experiment = used[name]
+
+            def before(frames: int, seed: int, name: str = name, one: MonitorExperiment = experiment) -> np.ndarray:
+                return self._frames_before(name, one, frames, seed)
+
+            for (k, _), outcome in zip(members, run_together(experiment, [w for _, w in members], before), strict=True):
+                out[k] = outcome
+            renders = [(k, work.state, work.resolved.job.render) for k, work in members]
+            asked = [(k, state, render.obstructed) for k, state, render in renders if render.quality]
+            for obstructed in (True, False):
+                part = [(k, state) for k, state, own in asked if own == obstructed]
+                found = quality_dicts(experiment.instrument, backend, [state for _, state in part], obstructed)
+                for (k, _), quality in zip(part, found, strict=True):
+                    done = out[k]
+                    out[k] = done if isinstance(done, Failure) else {**(done or {}), "quality": quality}
+        return [outcome if outcome is not None else Failure("not done") for outcome in out]
+
+    def _maker(self, tree: Tree) -> JobMaker:
+        """The tree of a study is the same object from block to block."""
+        if id(tree) not in self._makers or self._makers[id(tree)].tree is not tree:
+            self._makers[id(tree)] = JobMaker(tree)
+            _forget(self._makers)
+        return self._makers[id(tree)]
+
+    def _experiment(self, resolved: ResolvedJob, backend: Backend) -> tuple[str, MonitorExperiment]:
+        """The instrument with its calibration, and what tells it from others."""
+        parts = (resolved.instrument, *resolved.cameras.values(), resolved.detector)
+        name = json.dumps([backend.name, *(part.plain() for part in parts)])
+        if name not in self._experiments:
+            self._experiments[name] = MonitorExperiment(resolved, backend)
+            _forget(self._experiments)
+        self._experiments.move_to_end(name)
+        return name, self._experiments[name]
+
+    def _frames_before(self, name: str, experiment: MonitorExperiment, frames: int, seed: int) -> np.ndarray:
+        """Kept, since runs that share their noise share these frames."""
+        key = (name, frames, seed)
+        if key not in self._before:
+            self._before[key] = experiment.frames_before(frames, seed)
+            _forget(self._before)
+        return self._before[key]
+
+
+def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
+    """A job that has more than one state, or more than spots."""
+    from twin.main_job.render_job import render_job
+
+    run = render_job(resolved, backend)
+    out: dict[str, Any] = {
+        "truth": run.truth_dict(),
+        "recovered": run.recovered_dict(),
+        "crosstalk": {name: table.to_dict() for name, table in run.crosstalk.items()},
+    }
+    for name, part in (("course", run.course), ("stray", run.stray), ("mtf", run.targets)):
+        if part is not None:
+            out[name] = part.to_dict()
+    if run.quality is not None:
+        out["quality"] = quality_dict(run.quality)
+    return out
+
+
+def _forget(kept: OrderedDict[Any, Any]) -> None:
+    """Drop what was used longest ago."""
+    while len(kept) > KEPT:
+        kept.popitem(last=False)

@@ -1,0 +1,196 @@
+"""Designs: which values of its factors every run gets, and values of the base that follow a factor."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+import numpy as np
+from scipy.special import ndtr, ndtri
+from scenes.specs.study import StudySpec
+from scenes.specs.study_factor import FactorSpec
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from scenes.yaml.errors import KeyPath, Problem, shown
+from scenes.yaml.units import split_quantity, unit_ratio
+from twin.study.runs.config_tree import Tree, leaf
+
+
+SMALLEST = 2.0**-53
+"""Draws lie in [SMALLEST, 1 - SMALLEST], where normal quantiles are finite (8.2 sigma)."""
+
+
+def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
+    """Factors that vary independently: each alone, but columns of one table together, row by row."""
+    groups: dict[str, list[str]] = {}
+    for name, factor in study.factors.items():
+        key = f"table {factor.table.file}" if factor.table is not None else f"factor {name}"
+        groups.setdefault(key, []).append(name)
+    return [tuple(names) for names in groups.values()]
+
+
+def levels(factor: FactorSpec) -> int:
+    """Number of values of a factor that can be counted; 0 for a distribution."""
+    return (factor.count or 0) if factor.kind == "range" else len(factor.scalars()) if factor.kind in _LISTS else 0
+
+
+_LISTS = ("values", "table")
+
+
+def run_count(study: StudySpec) -> int:
+    """Number of runs."""
+    if study.design.runs is not None:
+        return study.design.runs
+    count = 1
+    for axis in axes_of(study):
+        count *= levels(study.factors[axis[0]])
+    return count
+
+
+def draw(study: StudySpec) -> dict[str, np.ndarray]:
+    """What every run takes of each factor: (runs,) numbers in the factor's unit, or of lists the index of the value.
+
+    The last axis of a grid changes fastest. Distributions are reached by the inverse of their distribution function, so
+    that evenly spread designs stay so.
+    """
+    axes = axes_of(study)
+    if study.design.kind == "grid":
+        sizes = [levels(study.factors[axis[0]]) for axis in axes]
+        places = np.unravel_index(np.arange(run_count(study)), sizes)
+        return {
+            name: _level(study.factors[name], place) for axis, place in zip(axes, places, strict=True) for name in axis
+        }
+    cube = unit_cube(study.design.kind, run_count(study), len(axes), study.design.seed)
+    return {name: _quantile(study.factors[name], cube[:, k]) for k, axis in enumerate(axes) for name in axis}
+
+
+def unit_cube(kind: str, runs: int, dimensions: int, seed: int) -> np.ndarray:
+    """Points of a design in the unit cube, (runs, dimensions)."""
+    # takes a second to import, and a worker does not need it
+    from scipy.stats import qmc
+
+    generator = np.random.default_rng(np.random.SeedSequence(seed))
+    if kind == "latin_hypercube":
+        cube = qmc.LatinHypercube(dimensions, rng=generator).random(runs)
+    elif kind == "sobol":
+        with warnings.catch_warnings():
+            # the user chose the number of runs; the points are those of the sequence all the same
+            warnings.filterwarnings("ignore", message="The balance properties")
+            cube = qmc.Sobol(dimensions, scramble=True, rng=generator).random(runs)
+    else:
+        cube = generator.random((runs, dimensions))
+    return np.clip(np.asarray(cube, np.float64), SMALLEST, 1.0 - SMALLEST)
+
+
+def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
+    if factor.kind in _LISTS:
+        return place
+    low, high = factor.numbers().values
+    return np.asarray(np.linspace(low, high, factor.count or 2)[place])
+
+
+def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
+    """Values of a factor where its distribution function is ``u``."""
+    if factor.kind in _LISTS:
+        return np.minimum((u * levels(factor)).astype(np.int64), levels(factor) - 1)
+    numbers: Sequence[float] = factor.numbers().values
+    if factor.kind == "normal":
+        return np.asarray(numbers[0] + numbers[1] * ndtri(u))
+    if factor.kind == "truncated":
+        mean, sigma, low, high = numbers
+        # the inverse is taken in the nearer tail, where it has digits
+        a, b = (low - mean) / sigma, (high - mean) / sigma
+        flip = a > 0.0
+        first, last = (ndtr(-b), ndtr(-a)) if flip else (ndtr(a), ndtr(b))
+        z = -ndtri(last - u * (last - first)) if flip else ndtri(first + u * (last - first))
+        return np.asarray(np.clip(mean + sigma * z, low, high))
+    low, high = numbers
+    return np.asarray(low + u * (high - low))
+
+
+def extremes(factor: FactorSpec) -> list[float]:
+    """Numbers of a distribution at which the base's limits are tried; the plan's own values matter beside them."""
+    numbers = factor.numbers().values
+    return list(numbers[-2:]) if factor.kind in ("range", "uniform", "truncated") else []
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """All values of a study that are scaled; several factors may scale one of them.
+
+    Attributes:
+        base: place -> number and unit as the base has them; the number is whole where the base's is.
+        ratio: place -> (runs,) what the number is multiplied by.
+    """
+
+    base: Mapping[KeyPath, tuple[float | int, str]]
+    ratio: Mapping[KeyPath, np.ndarray]
+
+    def apply(self, values: dict[KeyPath, Any], run: int) -> None:
+        """Scale what factors have set in a run, and add what they have not, as it stands in the base's tree."""
+        for place, ratio in self.ratio.items():
+            number = number_of(values[place]) if place in values else self.base[place]
+            values[place] = scaled(number, float(ratio[run]))
+
+
+def scaled(number: tuple[float | int, str], ratio: float) -> Any:
+    """Number and unit, times a ratio, as they stand in a tree."""
+    value = number[0] * ratio
+    if number[1]:
+        return f"{value!r} {number[1]}"
+    # a count stays a whole number, or the schema refuses it
+    return int(value) if isinstance(number[0], int) and value == int(value) else value
+
+
+def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dict[KeyPath, np.ndarray]:
+    """What the values that follow a factor are multiplied by: place -> array like ``values``.
+
+    Args:
+        factor: with its ``scales``.
+        tree: of the base.
+        values: of the factor.
+        unit: of them, empty for pure numbers.
+
+    Raises:
+        Problem: the factor's value in the base is none that anything can be compared with, or a power does not exist.
+    """
+    out = {}
+    for k, scale in enumerate(factor.scales):
+        with np.errstate(all="ignore"):
+            found = np.power(np.asarray(values, np.float64) / _nominal(factor, tree, unit), scale.power)
+        if not np.all(np.isfinite(found)):
+            shortage = f"power {scale.power:g} of a ratio of {values[np.argmin(np.isfinite(found))]:g}"
+            raise Problem("no such number", shortage, "values greater than zero", within=("scales", k, "power"))
+        out[scale.key] = found
+    return out
+
+
+def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
+    """The factor's value in the base, in its own unit; 1 for a factor that is itself the ratio."""
+    if not factor.places:
+        return 1.0
+    value = leaf(tree, factor.places[0])
+    parts = split_quantity(value)
+    if parts is not None and unit:
+        number = parts[0] * unit_ratio(parts[1], unit)
+    elif parts is None and not unit and isinstance(value, int | float) and not isinstance(value, bool):
+        number = float(value)
+    else:
+        raise Problem("nothing to compare it with", f"{shown(value)} in the base", "a number like the factor's")
+    if number == 0.0:
+        raise Problem("nothing to compare it with", "zero in the base", "scales in a factor without a key")
+    return number
+
+
+def number_of(value: Any) -> tuple[float | int, str]:
+    """Number and unit of a value of the tree, the unit empty for a pure number.
+
+    Raises:
+        Problem: it has none.
+    """
+    parts = split_quantity(value)
+    if parts is not None:
+        return parts
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise Problem("not a number", shown(value), "a key that leads to a number or a quantity")
+    return value, ""

@@ -1,0 +1,266 @@
+"""A study together with all it refers to: its base job's resolved tree and the tables of its factors."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
+from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
+from scenes.yaml.spec import Source
+from scenes.specs.study import StudySpec
+from scenes.specs.study_factor import FactorSpec, Scalar
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
+from twin.study.runs.base_job import BaseJob
+from twin.study.runs.config_tree import Tree, with_place, with_values
+from twin.study.runs.jobs import base_job
+from twin.run.versions import source_digest, versions
+
+WHERE = {"render": EXAMPLES, "lab": SCENES / LAB, "orbit": SCENES / ORBIT}
+"""First word of a base's command -> folder of the library with its files."""
+DATA_ONLY = ("name", "description", "limits", "report")
+"""Keys of a study that change no number of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class StudySetup:
+    """A study with all it refers to.
+
+    Attributes:
+        study: as the user wrote it, with the tables' values.
+        tree: plain data of the resolved base, as its config.yaml holds them, with a place for every factor.
+    """
+
+    study: StudySpec
+    tree: Tree
+
+    @cached_property
+    def job(self) -> BaseJob:
+        """What runs the base."""
+        return base_job(self.study.base.command)
+
+    def to_yaml(self) -> str:
+        """Text of the study's config.yaml, which ``resolve_study`` reads back to the same values."""
+        return dump_yaml({"study": self.study.plain(), "base": self.tree})
+
+    @cached_property
+    def content(self) -> str:
+        """Checksum of everything in the study that a number depends on; the base's tree has all library files."""
+        study = {key: value for key, value in self.study.plain().items() if key not in DATA_ONLY}
+        study["base"] = {"command": self.study.base.command}
+        content = json.dumps([study, self.tree, self.job.block], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Tells studies with other numbers apart: the content, the program's source files and the versions of what it
+        uses.
+        """
+        return hashlib.sha256(json.dumps([self.content, versions(), source_digest()]).encode()).hexdigest()
+
+    def error(self, problem: Problem | str, key: KeyPath, allowed: str | None = None) -> InputError:
+        """Something wrong at ``key`` of the study."""
+        if isinstance(problem, str):
+            return self.study.error(problem, key, allowed=allowed)
+        source = self.study.source
+        full = (*key, *problem.within)
+        issue = Issue(problem.problem, source.file, source.line(full), (*source.prefix, *full))
+        return InputError(_with(issue, problem.found, problem.allowed, problem.suggestion))
+
+    def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
+        """Name of the factor that changes ``place`` of the base, or something around or below it, and its key."""
+        for name, factor in self.study.factors.items():
+            scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
+            for own, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
+                n = min(len(own), len(place))
+                if own[:n] == tuple(place)[:n]:
+                    return name, ("factors", name, *where)
+        return None
+
+    def blamed(self, error: InputError, prefix: KeyPath = ()) -> InputError:
+        """An error in the base's tree told at the factor that caused it; others as they are."""
+        issues = []
+        for issue in error.issues:
+            found = self.factor_at((*prefix, *issue.key))
+            if found is None:
+                issues.append(issue)
+                continue
+            source = self.study.source
+            text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
+            told = Issue(text, source.file, source.line(found[1]), (*source.prefix, *found[1]))
+            issues.append(_with(told, issue.found, issue.allowed, issue.suggestion))
+        return InputError(*issues)
+
+
+def _with(issue: Issue, found: str | None, allowed: str | None, suggestion: str | None) -> Issue:
+    return Issue(issue.problem, issue.file, issue.line, issue.key, found, allowed, suggestion)
+
+
+def resolve_study(path: str | Path) -> StudySetup:
+    """Read a study and all it refers to. The config.yaml of an earlier one can be given in its place.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid, or a factor's key leads nowhere in the base.
+    """
+    return _resolved(read_yaml(path))
+
+
+def study_from_text(text: str) -> StudySetup:
+    """The study that the text of a config.yaml holds, for a worker that shares no files."""
+    return _resolved(parse_yaml(text))
+
+
+def _resolved(yaml: YamlFile) -> StudySetup:
+    if isinstance(yaml.data, dict) and "study" in yaml.data:
+        return _again(yaml)
+    study = validate(StudySpec, yaml)
+    study = _with_tables(study)
+    job = base_job(study.base.command)
+    tree = job.resolve(_base_file(study)).plain()
+    setup = _placed(study, tree)
+    if len(setup.to_yaml().encode()) > LARGEST_BYTES:
+        raise study.error("the study with its tables is larger than 1 MB", ("factors",), allowed="smaller tables")
+    return setup
+
+
+def _again(yaml: YamlFile) -> StudySetup:
+    """From a config.yaml."""
+    known = ("study", "base")
+    for key in yaml.data:
+        if key not in known:
+            issue = Issue("unknown key", yaml.file, yaml.lines.get((key,)), (key,), None, names_text(known))
+            raise InputError(_with(issue, None, names_text(known), nearest(key, known)))
+    if not isinstance(yaml.data.get("base"), dict):
+        raise InputError(Issue("the resolved base is missing", yaml.file, 1, ("base",), None, "a study's config.yaml"))
+    lines = {key[1:]: line for key, line in yaml.lines.items() if key[:1] == ("study",)}
+    study = validate(StudySpec, YamlFile(yaml.file, yaml.data["study"], lines))
+    for name, factor in study.factors.items():
+        if factor.table is not None and factor.table.values is None:
+            raise study.error("the table's values are missing", ("factors", name, "table"))
+    placed = study.with_source(Source(yaml.file, yaml.lines, ("study",)))
+    assert isinstance(placed, StudySpec)
+    study = placed
+    model = base_job(study.base.command).model
+    below = {key[1:]: line for key, line in yaml.lines.items() if key[:1] == ("base",)}
+    validate(model, YamlFile(yaml.file, yaml.data["base"], below))
+    return _placed(study, yaml.data["base"])
+
+
+def _base_file(study: StudySpec) -> Path:
+    """The base's file: a path relative to the study's, or a name in the library."""
+    text, folder = study.base.file, WHERE[study.base.command.split()[0]]
+    if "/" in text or text.endswith((".yaml", ".yml")):
+        path = Path(study.source.file).parent / text
+        if not path.is_file():
+            raise study.error(f"no such file: {path}", ("base", "file"))
+        return path
+    names = sorted(path.stem for path in folder.glob("*.yaml"))
+    if text not in names:
+        allowed = f"{names_text(names)}, or the path of a .yaml file"
+        suggestion = nearest(text, names)
+        raise study.error(
+            "no such file in the library", ("base", "file"), found=text, allowed=allowed, suggestion=suggestion
+        )
+    return folder / f"{text}.yaml"
+
+
+def _placed(study: StudySpec, tree: Tree) -> StudySetup:
+    """The study, with a place for every factor in its base; the factors' extreme values are tried by the schema."""
+    setup = StudySetup(study, tree)
+    model = setup.job.model
+    for name, factor in study.factors.items():
+        for k, place in enumerate(factor.places):
+            try:
+                tree = with_place(tree, model, place)
+            except Problem as problem:
+                raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
+        for k, scale in enumerate(factor.scales):
+            try:
+                tree = with_place(tree, model, scale.key)
+            except Problem as problem:
+                raise setup.error(problem, ("factors", name, "scales", k, "key")) from None
+    # an entry that was made for one factor may need another factor's value to be valid
+    tree = with_values(tree, [(place, f.scalars()[-1]) for f in study.factors.values() for place in _unset(tree, f)])
+    return StudySetup(study, tree)
+
+
+def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
+    """Places of a factor that have no value yet."""
+    out = []
+    for place in factor.places:
+        node: Any = tree
+        for part in place:
+            node = node[part]
+        if node is None:
+            out.append(place)
+    return out
+
+
+def _with_tables(study: StudySpec) -> StudySpec:
+    """The study with the values of its tables' columns."""
+    factors = dict(study.factors)
+    tables: dict[str, dict[str, list[Any]]] = {}
+    for name, factor in study.factors.items():
+        if factor.table is None or factor.table.values is not None:
+            continue
+        key: KeyPath = ("factors", name, "table")
+        table = factor.table
+        if table.file not in tables:
+            tables[table.file] = _read_table(study, Path(study.source.file).parent / table.file, key)
+        columns = tables[table.file]
+        if table.column not in columns:
+            suggestion = nearest(table.column, columns)
+            raise study.error(
+                "no such column",
+                (*key, "column"),
+                found=table.column,
+                allowed=names_text(columns),
+                suggestion=suggestion,
+            )
+        new = factor.model_copy(update={"table": table.model_copy(update={"values": tuple(columns[table.column])})})
+        try:
+            new.numbers()
+        except Problem as problem:
+            raise StudySetup(study, {}).error(problem, key) from None
+        factors[name] = new
+    out = study.model_copy(update={"factors": FrozenMap(factors)}).with_source(study.source)
+    assert isinstance(out, StudySpec)
+    return out
+
+
+def _read_table(study: StudySpec, path: Path, key: KeyPath) -> dict[str, list[Any]]:
+    """Columns of a CSV file."""
+    try:
+        rows = [row for row in csv.reader(io.StringIO(path.read_text("utf-8-sig"), newline="")) if row]
+    except (OSError, ValueError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise study.error(f"the table {path} cannot be read: {reason}", (*key, "file")) from None
+    if len(rows) < 2:
+        raise study.error(f"the table {path} has no rows", (*key, "file"), allowed="names, then a row or more")
+    ragged = next((k for k, row in enumerate(rows) if len(row) != len(rows[0])), None)
+    if ragged is not None:
+        text = f"row {ragged + 1} of the table {path} has {len(rows[ragged])} cells, the first {len(rows[0])}"
+        raise study.error(text, (*key, "file"))
+    return {head.strip(): [_cell(row[k]) for row in rows[1:]] for k, head in enumerate(rows[0])}
+
+
+_SCALAR: TypeAdapter[Any] = TypeAdapter(Scalar)
+
+
+def _cell(text: str) -> Any:
+    """A cell as YAML would read it: number, true, false or text."""
+    try:
+        data = parse_yaml(f"- {json.dumps(text) if ':' in text or '#' in text else text}").data[0]
+        return _SCALAR.validate_python(data)
+    except (InputError, ValidationError):
+        return text

@@ -1,0 +1,202 @@
+"""What ``python -m twin.study`` does between its options and its files."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from optics.numerics.threads import cores
+from twin.run.cli import InputErrorText, check_backend, ending_signals
+from twin.run.run_folder import RunFolderError, chosen
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.cluster import LEAST_MEMORY, Workers, local_workers, remote_workers
+from twin.study.runs.engine import Engine, Progress, fit_workers
+from twin.study.runs.plan import Plan
+from twin.study.runs.sampling import run_count
+from twin.study.runs.setup import StudySetup, resolve_study
+from twin.study.runs.study_folder import StudyFolder
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """What the user chose.
+
+    Attributes:
+        out: folder of the study, None for the next free one.
+        workers: number of local processes, None for one per core.
+        scheduler: address of a running cluster, None for local processes.
+        resume: go on with what is there.
+        force: replace what is there.
+        confirmed: run more than the study's limit.
+        backend: where to trace.
+    """
+
+    out: Path | None = None
+    workers: int | None = None
+    scheduler: str | None = None
+    resume: bool = False
+    force: bool = False
+    confirmed: bool = False
+    backend: str = "llvm"
+
+
+class Broken(Exception):
+    """The study was broken off by a signal; what is done stays.
+
+    Attributes:
+        code: exit code.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__("interrupted" if number == signal.SIGINT else "terminated")
+        self.code = 128 + number
+
+
+@dataclass(frozen=True, eq=False)
+class StudyRun:
+    """A finished study.
+
+    Attributes:
+        numbers: contents of study.json.
+        folder: where it is.
+        plan: all its runs.
+        warnings: what the user should know.
+    """
+
+    numbers: dict[str, Any]
+    folder: Path
+    plan: Plan
+    warnings: tuple[str, ...]
+
+
+def run_study(
+    file: Path, options: StudyOptions, progress: Progress, opened: Callable[[Path], None] = lambda path: None
+) -> StudyRun:
+    """Read a study, run what is missing of it, write its results.
+
+    Args:
+        file: of the study, or a config.yaml.
+        options: what the user chose.
+        progress: what is told meanwhile.
+        opened: told the folder, once something in it is worth resuming.
+
+    Raises:
+        InputError, InputErrorText, RunFolderError: bad input; nothing that was there is lost.
+        IncompleteError, ClusterError: not all runs could be done; the others stay for --resume.
+        Broken: SIGINT, SIGTERM or SIGHUP; what is done stays.
+    """
+    check_backend(options.backend)
+    if options.workers is not None and options.scheduler is not None:
+        raise InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
+    if options.resume and options.force:
+        raise InputErrorText("--resume goes on with a folder, --force replaces it; choose one of them")
+    if options.resume and options.out is None:
+        raise InputErrorText("--resume needs the folder to go on with: --out DIR")
+    setup = resolve_study(file)
+    _check_size(setup, options.confirmed)
+    plan = Plan.of(setup)
+    warnings: list[str] = []
+    warn = progress.warn
+
+    def remember(text: str) -> None:
+        warnings.append(text)
+        warn(text)
+
+    progress.warn = remember
+    started = time.time()
+    with broken_by_signals():
+        # a scheduler that cannot be reached is told before anything is written
+        with (
+            _workers(options, setup, remember) as start,
+            StudyFolder(chosen(options.out, file.stem), setup, options.resume, options.force) as folder,
+        ):
+            store = ChunkStore(folder.path, plan)
+            store.open()
+            for text in store.corrupt:
+                remember(text)
+            opened(folder.path)
+            engine = Engine(plan, store, options.backend, progress)
+            count = 0
+            if store.missing:
+                with start() as workers:
+                    for text in workers.warnings:
+                        remember(text)
+                    engine.run(workers, _own_memory())
+                    count = workers.count
+            else:
+                progress.done(store.runs, plan.runs)
+            # drawing libraries and the like are not needed before
+            from twin.study.study_files import StudyFacts, write_study
+
+            facts = StudyFacts(options.backend, started, engine.seconds, engine.computed, count, tuple(warnings))
+            numbers = write_study(plan, store.result(), facts, folder)
+    return StudyRun(numbers, folder.path, plan, tuple(warnings))
+
+
+def _check_size(setup: StudySetup, confirmed: bool) -> None:
+    limit = setup.study.limits.runs
+    runs = run_count(setup.study)
+    if runs > limit and not confirmed:
+        raise setup.error(
+            f"the study has {runs} runs, more than its limit of {limit}",
+            ("limits", "runs"),
+            allowed="a larger limit, or the option --yes",
+        )
+
+
+@contextmanager
+def _workers(
+    options: StudyOptions, setup: StudySetup, warn: Callable[[str], None]
+) -> Iterator[Callable[[], AbstractContextManager[Workers]]]:
+    """What starts the workers. Those of others are reached at once, own ones only when there is something to do."""
+    if options.scheduler is not None:
+        with remote_workers(options.scheduler, warn) as workers:
+
+            @contextmanager
+            def given() -> Iterator[Workers]:
+                yield workers
+
+            yield given
+        return
+    wanted = options.workers if options.workers is not None else cores()
+    count = fit_workers(wanted, setup.study.limits.bytes, LEAST_MEMORY)
+    if count < wanted:
+        warn(f"{count} workers instead of {wanted}: no more fit into the study's {setup.study.limits.memory}")
+    yield lambda: local_workers(count)
+
+
+def _own_memory() -> float:
+    """Of this process and the scheduler in it, bytes."""
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+@contextmanager
+def broken_by_signals() -> Iterator[None]:
+    """Let SIGTERM, SIGHUP and Ctrl-C end the block as Broken, whatever the libraries in between make of them."""
+    got: list[int] = []
+
+    def leave(number: int, frame: object) -> None:
+        if not got:  # a second one while the workers are being stopped must not leave them behind
+            got.append(number)
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, leave) for number in (*ending_signals(), signal.SIGINT)}
+    try:
+        yield
+    except BaseException:
+        if not got:
+            raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if got:
+        raise Broken(got[0])
+
+
+__all__ = ["Broken", "RunFolderError", "StudyOptions", "StudyRun", "run_study"]

@@ -1,0 +1,209 @@
+"""The result of a study as a data set with one dimension, ``run``, and the files of its folder."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from twin.run.data_files import csv_table, netcdf
+from twin.run.reference_frames import described, frames_text
+from twin.run.run_folder import MANIFEST
+from twin.run.versions import versions
+from twin.study.report.study_report import write_report
+from twin.study.runs.block_result import BlockResult
+from twin.study.runs.plan import Plan
+from twin.study.runs.study_folder import PROGRAM, StudyFolder
+
+RUN = "run"
+FAILED, MESSAGE, SEED = "failed", "message", "seed"
+ROLE = "role"
+"""Attribute of every variable: factor, response, sigma or bookkeeping."""
+
+
+def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
+    """Factors, responses, their sigmas, and which runs failed, by run.
+
+    Nothing in it depends on when, where or by how many it was computed. Every variable has the attributes ``units``
+    (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, where it stands in the base
+    or in the results.
+
+    Args:
+        plan: the study.
+        result: of all its runs.
+    """
+    study = plan.setup.study
+    data: dict[str, Any] = {}
+    for column in plan.columns:
+        factor = study.factors[column.name]
+        scaled = [f"{_path(scale.key)} ~ power {scale.power:g}" for scale in factor.scales]
+        key = "; ".join([" = ".join(_path(place) for place in factor.places)] * bool(factor.places) + scaled)
+        values = column.values.astype(object) if column.values.dtype.kind == "U" else column.values
+        values = values.astype(np.int8) if values.dtype.kind == "b" else values
+        data[column.name] = (RUN, values, {"units": column.unit, ROLE: "factor", "key": key})
+    for r, (name, response) in enumerate(study.responses.items()):
+        minus = f" - {_path(response.minus)}" if response.minus is not None else ""
+        about = {"units": response.units, ROLE: "response", "key": f"{_path(response.key)}{minus}"}
+        data[name] = (RUN, result.values[:, r], about)
+        if response.sigma is not None:
+            about = {"units": response.units, ROLE: "sigma", "key": _path(response.sigma), "of": name}
+            data[f"{name}_sigma"] = (RUN, result.sigmas[:, r], about)
+    data[FAILED] = (RUN, result.failed.astype(np.int8), {"units": "", ROLE: "bookkeeping", "long_name": "1: failed"})
+    data[MESSAGE] = (RUN, np.array(result.messages, object), {"units": "", ROLE: "bookkeeping"})
+    if plan.seeds is not None:
+        data[SEED] = (RUN, plan.seeds, {"units": "", ROLE: "bookkeeping", "long_name": "seed of the run's noise"})
+    attributes = {
+        "title": study.name,
+        "study": plan.setup.to_yaml(),
+        "fingerprint": plan.setup.fingerprint,
+        "design": study.design.kind,
+        "seed": study.design.seed,
+        "reference_frames": frames_text("study"),
+    }
+    return xr.Dataset(data, coords={RUN: (RUN, np.arange(plan.runs), {"units": ""})}, attrs=attributes)
+
+
+def _path(key: tuple[str | int, ...]) -> str:
+    return " ".join(str(part) for part in key)
+
+
+def table(data: xr.Dataset) -> bytes:
+    """The data set as CSV, a line for each run; heads are the names, with the unit in brackets."""
+    names = [RUN, *(str(name) for name in data.data_vars)]
+    rows = zip(*(_cells(data[name].values) for name in names), strict=True)
+    return csv_table([[_head(data, name) for name in names], *rows])
+
+
+def _head(data: xr.Dataset, name: str) -> str:
+    units = data[name].attrs.get("units", "")
+    return f"{name} [{units}]" if units else name
+
+
+def _cells(values: np.ndarray) -> list[Any]:
+    """All digits; an empty cell where there is no number."""
+    return ["" if isinstance(value, float) and math.isnan(value) else value for value in values.tolist()]
+
+
+def parquet(data: xr.Dataset) -> bytes | None:
+    """The data set as a Parquet file; None when pyarrow is not installed."""
+    if importlib.util.find_spec("pyarrow") is None:
+        return None
+    out = io.BytesIO()
+    data.to_dataframe().reset_index().to_parquet(out, index=False, engine="pyarrow")
+    return out.getvalue()
+
+
+def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
+    """Contents of study.json, but for the times: of each response mean, standard deviation and quantiles of the runs
+    that did not fail; null where there are none.
+    """
+    study = plan.setup.study
+    failed = data[FAILED].values.astype(bool)
+    return {
+        "name": study.name,
+        "runs": plan.runs,
+        "failed": int(failed.sum()),
+        "seed": study.design.seed,
+        "design": study.design.kind,
+        "factors": {
+            column.name: {
+                "unit": column.unit,
+                "keys": [list(place) for place in study.factors[column.name].places],
+                "scaled_keys": [list(scale.key) for scale in study.factors[column.name].scales],
+                **_span(column.values),
+            }
+            for column in plan.columns
+        },
+        "responses": {
+            name: {**_statistics(data[name].values), "unit": response.units}
+            for name, response in study.responses.items()
+        },
+    }
+
+
+def _span(values: np.ndarray) -> dict[str, Any]:
+    if values.dtype.kind in "UO":
+        return {"values": sorted(set(values.tolist()))}
+    return {"min": values.min().item(), "max": values.max().item()}
+
+
+def _statistics(values: np.ndarray) -> dict[str, Any]:
+    """Over the finite values; std with n - 1; p95 and p997: 95 and 99.7 of 100 runs lie below."""
+    good = values[np.isfinite(values)]
+    n = len(good)
+    return {
+        "count": n,
+        "mean": float(np.mean(good)) if n else None,
+        "std": float(np.std(good, ddof=1)) if n > 1 else None,
+        "p95": float(np.quantile(good, 0.95)) if n else None,
+        "p997": float(np.quantile(good, 0.997)) if n else None,
+    }
+
+
+@dataclass(frozen=True)
+class StudyFacts:
+    """How a study was run; the only things in its folder that are not the same each time.
+
+    Attributes:
+        backend: where it was traced.
+        started: seconds since the epoch.
+        seconds: that this command took for the runs it computed.
+        computed: number of these.
+        workers: processes.
+        warnings: what the user was told.
+    """
+
+    backend: str
+    started: float
+    seconds: float
+    computed: int
+    workers: int
+    warnings: tuple[str, ...]
+
+
+def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: StudyFolder) -> dict[str, Any]:
+    """Write study.nc, study.csv, study.parquet, study.json, report.html and, last, the manifest.
+
+    Returns:
+        Contents of study.json.
+    """
+    data = make_dataset(plan, result)
+    numbers = described(
+        "study",
+        {
+            **summary(data, plan),
+            "seconds": facts.seconds,
+            "runs_computed": facts.computed,
+            "states_per_second": facts.computed / facts.seconds if facts.computed else None,
+            "worker_seconds": result.seconds,
+        },
+    )
+    (folder.path / MANIFEST).unlink(missing_ok=True)
+    folder.write("config.yaml", plan.setup.to_yaml().encode())
+    folder.write("study.nc", netcdf(data))
+    folder.write("study.csv", table(data))
+    content = parquet(data)
+    if content is not None:
+        folder.write("study.parquet", content)
+    folder.write_json("study.json", numbers)
+    write_report(data, plan, folder.path)
+    manifest = {
+        "program": PROGRAM,
+        "versions": versions(),
+        "backend": facts.backend,
+        "seed": plan.setup.study.design.seed,
+        "runs": plan.runs,
+        "failed": int(result.failed.sum()),
+        "started_unix_s": facts.started,
+        "wall_time_s": facts.seconds,
+        "workers": facts.workers,
+        "warnings": list(facts.warnings),
+        "sha256": folder.checksums(),
+    }
+    folder.write_json(MANIFEST, manifest)
+    return numbers

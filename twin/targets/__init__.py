@@ -1,0 +1,1 @@
+"""Cameras that look at test targets, and what is measured in the images."""

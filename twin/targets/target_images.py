@@ -1,0 +1,237 @@
+"""Images of test targets at infinity on the cameras' line CCDs, before and after a perturbation.
+
+A target stands still in the direction that a place on the line sees in the nominal state. Coordinates in an image are
+(along, across) = (Y', X') of the focal plane: columns run along the line, rows along the track. The window that is
+recorded follows the image by whole pixels, so that the image lies on the pixels as it does in the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from optics.geometry.tree import State
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from optics.targets.target_image import target_image
+from optics.targets.target_shapes import Target, bar_group, pinhole, siemens_star
+from optics.waves.diffraction import Grid
+from optics.waves.pupil_function import PupilFunction
+from optics.waves.transfer import TransferTable, polychromatic_transfer
+from scenes.specs.band import BandSpec
+from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.targets.edge_images import ALONG, EdgeImager, EdgeOptics, knife_edge
+from twin.targets.target_path import LocalMap, TargetPath
+
+PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
+"""Places on the line by their share of its usable half; left is the +Y' end."""
+
+MARGIN = 0.02
+"""Share of the line's pixels kept between each end and the nominal windows, so that an image may move."""
+
+BAR_TILT = float(np.radians(7.0))
+"""Of the bars' normal from the axis: within the group every sampling phase occurs four times, even in 112 pixels."""
+
+BAR_SHARE = 0.45
+"""Side of the bar group, as a share of the region's."""
+
+CLEARANCE = 6.0
+"""Pixels of the group about the part that is measured."""
+
+SPOKES = 36
+STAR_SHARE = 0.9
+"""The star's radius, as a share of half the region. The Nyquist frequency lies 11.5 pixels from its middle."""
+
+PINHOLE = 1.0
+"""Diameter of the pinhole's image, pixels."""
+
+_FOCUS = 1e-6
+"""Defocus to which the tables of the edges reach, metres; they are used at 0 only."""
+
+
+class TargetLostError(Exception):
+    """A target cannot be imaged in this state; the message says where and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One place of a camera's line in one state.
+
+    Attributes:
+        ccd: the line CCD.
+        pupil: of the image.
+        local: mapping from target coordinates (metres on the nominal image scale) to the image, about the chief ray.
+        shift: of the chief ray's place on the focal plane against the nominal state, (along, across), metres.
+        column: first column of the window on the line.
+        offset: of the chief ray from the middle of the window, (along, across), metres.
+        region: side of the window, pixels.
+    """
+
+    ccd: LineCcd
+    pupil: PupilFunction
+    local: LocalMap
+    shift: np.ndarray
+    column: int
+    offset: np.ndarray
+    region: int
+
+    @property
+    def band(self) -> BandSpec:
+        """Of the line CCD."""
+        return self.ccd.band
+
+    def transfer(self, frequency: np.ndarray) -> np.ndarray:
+        """Transfer function of the traced pupil and the detector at frequencies (M, 2), cycles/m, complex (M,)."""
+        wavelengths, weights = band_wavelengths(self.band)
+        optics = polychromatic_transfer(self.pupil, frequency, wavelengths, weights, np.zeros(1))[0]
+        return np.asarray(optics * self.ccd.transfer(frequency[:, 0], frequency[:, 1]))
+
+    def edge(self, direction: str, angle: float) -> EdgeImager:
+        """Images of the knife edge that measures in a direction and is turned by ``angle``, radians."""
+        normal = knife_edge(direction, angle).mapped(self.local).normal
+        optics = EdgeOptics.build(self.pupil, self.band, normal, _FOCUS)
+        return EdgeImager(optics, self.ccd, self.region)
+
+    def edge_image(self, imager: EdgeImager) -> np.ndarray:
+        """Share of the white signal in every pixel, (region, region)."""
+        return imager.image(0.0, float(self.offset @ imager.optics.normal))
+
+    def image(self, target: Target) -> np.ndarray:
+        """Share of the white signal in every pixel of a target of finite shapes, (region, region)."""
+        half = 0.5 * (self.region - 1) * self.band.pitch
+        x, y = (Grid(float(-half - shift), self.band.pitch, self.region) for shift in self.offset)
+        # rounding and the series' guard leave up to 1e-6 below zero
+        return np.maximum(target_image(target.mapped(self.local), self._transfer, self._cutoff, x, y), 0.0)
+
+    def _transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+        return np.asarray(self._table(fx, fy) * self.ccd.transfer(fx, fy))
+
+    @cached_property
+    def _table(self) -> TransferTable:
+        return TransferTable.build(self.pupil, *band_wavelengths(self.band))
+
+    @cached_property
+    def _cutoff(self) -> float:
+        angle = np.linspace(0.0, np.pi, 64, endpoint=False)
+        ways = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        # between the directions the cut-off of a smooth pupil is higher by less than 1e-3
+        return 1.001 * float(np.max(self.pupil.cutoff(ways, self.band.spectrum[0])))
+
+
+@dataclass(frozen=True, eq=False)
+class BarDesign:
+    """Bars in a window's middle that have the Nyquist frequency on the nominal image, and what is measured of them.
+
+    Attributes:
+        target: the bars.
+        frequency: on the target, (2,), cycles/m.
+        nominal: on the nominal image, (2,), cycles/m.
+        group: (rows, columns) of the window that lie well inside the group.
+    """
+
+    target: Target
+    frequency: np.ndarray
+    nominal: np.ndarray
+    group: tuple[slice, slice]
+
+    @classmethod
+    def build(cls, view: View, direction: str) -> BarDesign:
+        """For the nominal view of a place."""
+        pitch, jacobian = view.band.pitch, view.local.jacobian
+        turn = BAR_TILT if direction == ALONG else BAR_TILT + 0.5 * np.pi
+        nominal = view.band.nyquist * np.array([np.cos(turn), np.sin(turn)])
+        # phases agree on target and image: f_target . q = f_image . (J q)
+        frequency = jacobian.T @ nominal
+        size, angle = float(np.hypot(*frequency)), float(np.arctan2(frequency[1], frequency[0]))
+        bars = round(BAR_SHARE * view.region * pitch * view.band.nyquist)
+        # as long on the image as the group is wide there
+        stretch = float(np.hypot(*(jacobian @ np.array([-np.sin(angle), np.cos(angle)]))))
+        target = bar_group(size, bars, bars / (view.band.nyquist * stretch), angle)
+        # the upright square in a tilted one; the image lies up to half a pixel beside the middle
+        inside = bars - CLEARANCE - 0.5
+        half = int(inside / (np.cos(BAR_TILT) + np.sin(BAR_TILT)))
+        sides = slice(view.region // 2 - half, view.region - view.region // 2 + half)
+        return cls(target, frequency, nominal, (sides, sides))
+
+    def seen(self, view: View) -> np.ndarray:
+        """Frequency on the image of a view, (2,), cycles/m."""
+        return np.asarray(np.linalg.solve(view.local.jacobian.T, self.frequency))
+
+    @property
+    def per_pixel(self) -> tuple[float, float]:
+        """Nominal frequency over the Nyquist frequency's 0.5 cycles/pixel: (down the column, along the row)."""
+        along, across = 0.5 * self.nominal / float(np.hypot(*self.nominal))
+        return float(across), float(along)
+
+
+def star_target(pitch: float, region: int) -> Target:
+    """The Siemens star of a region."""
+    return siemens_star(SPOKES, 0.5 * STAR_SHARE * region * pitch)
+
+
+def pinhole_target(pitch: float) -> Target:
+    """The pinhole."""
+    return pinhole(PINHOLE * pitch)
+
+
+def usable_pixels(pixels: int, region: int) -> float:
+    """How far the windows' middles may spread on a line, pixels; not positive where they do not fit."""
+    return (1.0 - 2.0 * MARGIN) * pixels - region
+
+
+class TargetCamera:
+    """A camera before targets at infinity.
+
+    Args:
+        path: of its light.
+        ccd: the line CCD.
+        region: side of the windows, pixels.
+
+    Raises:
+        ValueError: the line is too short for the windows.
+    """
+
+    def __init__(self, path: TargetPath, ccd: LineCcd, region: int) -> None:
+        band = ccd.band
+        usable = usable_pixels(band.pixels, region)
+        if usable <= 0.0:
+            raise ValueError(f"windows of {region} pixels do not fit a line of {band.pixels} pixels")
+        self.path = path
+        self.ccd = ccd
+        self.region = region
+        along = 0.5 * usable * band.pitch * np.array(list(PLACES.values()))
+        self.places = np.stack([along, np.full(len(along), band.offset)], axis=-1)
+        """Nominal (along, across) of PLACES, metres."""
+        self.directions = path.directions(self.places)
+
+    def views(self, state: State) -> dict[str, View]:
+        """Every place in a state.
+
+        Raises:
+            TargetLostError: light is lost, or an image moves off the line.
+        """
+        try:
+            hits = self.path.places(state, self.directions)
+            pupils = self.path.pupils(state, self.directions, hits)
+            reach = self.region * self.ccd.band.pitch
+            maps = [self.path.local_map(state, direction, reach) for direction in self.directions]
+        except (AimError, BeamMissedError, ValueError) as error:
+            raise TargetLostError(f"the line CCD of camera {self.path.name}: {error}") from error
+        return {name: self._view(name, hits[i], self.places[i], pupils[i], maps[i]) for i, name in enumerate(PLACES)}
+
+    def _view(self, name: str, hit: np.ndarray, nominal: np.ndarray, pupil: PupilFunction, local: LocalMap) -> View:
+        band, shift = self.ccd.band, hit - nominal
+        half = 0.5 * (self.region - 1)
+        middle = hit[0] / band.pitch + 0.5 * (band.pixels - 1)
+        column = round(float(middle) - half)
+        if column < 0 or column + self.region > band.pixels:
+            raise TargetLostError(
+                f"the target image at the {name} of camera {self.path.name} moves by {1e3 * shift[0]:.3g} mm along the "
+                "line, beyond its end"
+            )
+        # rows are counted from the nominal image, columns from the line's first pixel
+        rows = round(float(shift[1]) / band.pitch)
+        offset = np.array([(middle - column - half) * band.pitch, shift[1] - rows * band.pitch])
+        return View(self.ccd, pupil, local, shift, column, offset, self.region)

@@ -1,0 +1,206 @@
+"""Test targets in the main job: rendered, exposed and measured for every camera, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
+from analysis.mtf.slanted_edge import EdgeError, EdgeMtf, measure_edge
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from scenes.models.instrument_model import Instrument
+from scenes.models.shadow import imaging_shadows
+from scenes.specs.channel import BASE
+from scenes.specs.job import TargetsSpec
+from scenes.specs.resolved import ResolvedJob, target_band
+from twin.sensors.area_detector import FixedPattern
+from twin.sensors.line_ccd import LineCcd
+from twin.targets.edge_images import DIRECTIONS
+from twin.targets.target_images import PLACES, BarDesign, TargetCamera, View, pinhole_target, star_target, usable_pixels
+from twin.targets.target_path import TargetPath
+from twin.targets.target_result import (
+    NYQUIST,
+    BarReading,
+    CameraTargets,
+    EdgeReading,
+    PlaceTargets,
+    TargetRun,
+    TargetShots,
+)
+
+CURVE = np.linspace(0.0, 1.0, 65)
+"""Frequencies of the measured curves, cycles/pixel: to twice the Nyquist frequency."""
+
+LARGEST_FRAMES = 400_000_000
+"""Pixels of all frames together, which are kept: 0.8 GB."""
+
+EVEN_FIELDS = {"dark": 0.0, "bright": 1.0}
+"""Recorded with bars: share of the white signal."""
+
+_PATTERN, _EXPOSURE = 3, 4
+"""Random streams of the job's seed, beside those of the monitor."""
+
+
+def check_targets(resolved: ResolvedJob) -> None:
+    """See before any work whether the targets can be recorded as the job says.
+
+    Raises:
+        InputError: the windows do not fit the line, or there are too many frames.
+    """
+    job, settings = resolved.job, resolved.targets
+    names = job.render.target_images
+    if not names:
+        return
+    kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
+    each = len(resolved.instrument.cameras) * len(PLACES) * 2 * kinds * settings.region**2
+    if each * (settings.frames or 1) > LARGEST_FRAMES:
+        raise job.error(
+            "the frames of the test targets do not fit into memory",
+            ("render", "targets", "frames"),
+            found=str(settings.frames),
+            allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
+        )
+    for mounted in resolved.instrument.cameras.values():
+        camera = resolved.cameras[mounted.camera]
+        name = target_band(camera)
+        pixels = camera.bands[name].pixels
+        if usable_pixels(pixels, settings.region) <= 0.0:
+            raise job.error(
+                f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
+                ("render", "targets", "region"),
+                found=f"{settings.region} pixels on a line of {pixels}",
+                allowed="a smaller region or a longer line",
+            )
+
+
+def render_targets(
+    resolved: ResolvedJob,
+    instrument: Instrument,
+    backend: Backend,
+    state: State,
+    seed: int,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+) -> TargetRun:
+    """Render, expose and measure the job's test targets.
+
+    Args:
+        resolved: the job, with targets among its images, as ``check_targets`` lets it pass.
+        instrument: as built from it.
+        backend: where to trace.
+        state: after the perturbation.
+        seed: of the noise.
+        advance: told how many of how many windows are done.
+
+    Raises:
+        TargetLostError: the perturbation moves the light off.
+    """
+    settings, images = resolved.targets, resolved.job.render.target_images
+    frames, obstructed = settings.frames or 1, resolved.job.render.obstructed
+    total = len(instrument.cameras) * len(PLACES) * 2
+    cameras, done = {}, 0
+    for number, (name, model) in enumerate(instrument.cameras.items()):
+        reference = resolved.instrument.cameras[name].camera
+        band = target_band(resolved.cameras[reference])
+        assert resolved.line_detectors is not None
+        ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
+        shadows = imaging_shadows(instrument, name, backend) if obstructed else None
+        path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend, shadows=shadows)
+        camera = TargetCamera(path, ccd, settings.region)
+        before = camera.views({})
+        after = camera.views(state) if state else before
+        pattern = ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN, number)))
+        places = {}
+        for k, place in enumerate(PLACES):
+            shooter = _Shooter(settings, frames, images, before[place], pattern)
+            shots = []
+            for when, view in enumerate((before[place], after[place])):
+                advance(done, total)
+                shots.append(shooter.shoot(view, np.random.SeedSequence(seed, spawn_key=(_EXPOSURE, number, k, when))))
+                done += 1
+            places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
+        cameras[name] = CameraTargets(band, ccd.band.pitch, places)
+    advance(done, total)
+    return TargetRun(cameras, frames, obstructed)
+
+
+class _Shooter:
+    """Takes the images of all targets at one place."""
+
+    def __init__(
+        self, settings: TargetsSpec, frames: int, images: tuple[str, ...], nominal: View, pattern: FixedPattern
+    ) -> None:
+        self.settings = settings
+        self.count = frames
+        self.images = images
+        self.pattern = pattern
+        self.bars = {d: BarDesign.build(nominal, d) for d in DIRECTIONS} if "bars" in images else {}
+
+    def shoot(self, view: View, seed: np.random.SeedSequence) -> TargetShots:
+        """Expose and measure every target in one state."""
+        frames: dict[str, np.ndarray] = {}
+        edges: dict[str, EdgeReading] = {}
+        bars: dict[str, BarReading] = {}
+
+        def expose(name: str, share: np.ndarray) -> np.ndarray:
+            photons = view.ccd.white_photons(self.settings.white) * view.pupil.light * share
+            frames[name] = view.ccd.expose(photons, view.column, self.pattern, self.count, seed.spawn(1)[0])
+            return np.asarray(frames[name].mean(axis=0))
+
+        if "knife_edge" in self.images:
+            for direction in DIRECTIONS:
+                imager = view.edge(direction, self.settings.angle)
+                mean = expose(f"knife_edge_{direction}", view.edge_image(imager))
+                edges[direction] = read_edge(view, imager.optics.normal, mean, self.count)
+        if self.bars:
+            means = {d: expose(f"bars_{d}", view.image(design.target)) for d, design in self.bars.items()}
+            # the levels as a bench takes them: shutter closed, and the source without a target
+            even = np.ones((view.region, view.region))
+            dark, bright = (expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items())
+            bars = {d: read_bars(view, design, means[d], dark, bright, self.count) for d, design in self.bars.items()}
+        if "star" in self.images:
+            expose("star", view.image(star_target(view.band.pitch, view.region)))
+        if "pinhole" in self.images:
+            expose("pinhole", view.image(pinhole_target(view.band.pitch)))
+        return TargetShots(frames, view.column, edges, bars, 1.0 - view.pupil.light)
+
+
+def read_edge(view: View, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
+    """Measure the mean (H, W) of some frames of a knife edge with this normal, and trace the truth."""
+    frequency = CURVE / view.band.pitch
+    wanted = np.append(frequency, NYQUIST / view.band.pitch)
+    true = np.abs(view.transfer(wanted[:, None] * normal))
+    found: EdgeMtf | None = None
+    reason = ""
+    try:
+        found = measure_edge(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE)
+    except EdgeError as error:
+        reason = str(error)
+    return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]))
+
+
+def read_bars(
+    view: View, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
+) -> BarReading:
+    """Measure the mean (H, W) of some frames of a bar target, and trace the truth.
+
+    Args:
+        view: the place.
+        design: the bars.
+        mean: (H, W) of their frames, grey values.
+        dark: (H, W) of as many frames with the shutter closed.
+        bright: (H, W) of as many frames of an even field, as bright as the bars.
+        frames: how many.
+    """
+    true = float(np.abs(view.transfer(design.seen(view)[None]))[0])
+    found: BarMtf | None = None
+    reason = ""
+    try:
+        found = measure_bars(
+            mean[design.group], dark[design.group], bright[design.group], design.per_pixel,
+            noise=view.ccd.noise, frames=frames,
+        )  # fmt: skip
+    except BarError as error:
+        reason = str(error)
+    return BarReading(found, reason, true)

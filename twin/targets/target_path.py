@@ -1,0 +1,224 @@
+"""From a target in front of a camera to its image: pupils and the exact mapping of the field, by ray tracing.
+
+Image coordinates are (along, across) = (Y', X') of the focal-plane frame, metres: columns of an image run along the
+line CCD, rows along the track. A target stands in the collimator's focal plane with its own coordinates in the same
+sense, so that its image is ``f / focal_length`` times its size and upright in these coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.aperture import Circle
+from optics.geometry.tree import PlacedBodies, State
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import transverse_axes
+from optics.raytrace.assembly import Assembly, points_to_world
+from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import make_rays, require_some, trace
+from optics.targets.collimator import Collimator
+from optics.waves.diffraction import PupilField
+from optics.waves.imaging import aim_collimated, imaging_rays, pupil_field
+from optics.waves.pupil_function import PupilFunction, fit_pupils
+from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel
+from scenes.models.shadow import ImagingShadows, TracedBeams
+
+RINGS = 14
+"""Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
+
+MAP_POINTS = 7
+MAP_ORDER = 4
+"""Chief rays per axis, and order of the polynomial through them, of the local mapping from angles to the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMap:
+    """Exact chief-ray mapping near one field direction: target coordinates to image coordinates.
+
+    Attributes:
+        scale: largest target coordinate, metres; coordinates are divided by it.
+        coefficients: (terms, 2), of the monomials of ``_monomials``.
+        residual: largest distance of the traced chief rays from the polynomial, metres.
+    """
+
+    scale: float
+    coefficients: np.ndarray
+    residual: float
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Image coordinates (N, 2) relative to the middle's chief ray, of target coordinates (N, 2), metres."""
+        return np.asarray(_monomials(points / self.scale) @ self.coefficients)
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """d(along, across)/d(target coordinates) in the middle, (2, 2)."""
+        return np.asarray(self.coefficients[1:3].T / self.scale)
+
+
+def _monomials(q: np.ndarray) -> np.ndarray:
+    powers = [(a - b, b) for a in range(MAP_ORDER + 1) for b in range(a + 1)]
+    return np.stack([q[..., 0] ** a * q[..., 1] ** b for a, b in powers], axis=-1)
+
+
+class TargetPath:
+    """A camera that looks at targets.
+
+    Args:
+        assembly: that holds the camera.
+        name: prefix of its sequences ``NAME/imaging``, ``NAME/to_stop``, ``NAME/image_to_stop`` ...
+        root: path of its body.
+        model: its derived numbers.
+        backend: where to trace.
+        collimator: what it looks into; None for a far scene.
+        shadows: what stands in its beams; None for a camera alone, or to ignore it.
+    """
+
+    def __init__(
+        self,
+        assembly: Assembly,
+        name: str,
+        root: str,
+        model: CameraModel,
+        backend: Backend,
+        collimator: Collimator | None = None,
+        shadows: ImagingShadows | None = None,
+    ) -> None:
+        self.assembly = assembly
+        self.name = name
+        self.root = root
+        self.model = model
+        self.backend = backend
+        self.collimator = collimator
+        self.shadows = shadows
+        stop = assembly.elements[f"{name}/{model.spec.stop}"].aperture
+        assert isinstance(stop, Circle)
+        self.stop = stop
+        self.nodes = quadrature.disk(RINGS)
+        self._axes = assembly.nominal_pose(root).rotation
+
+    @property
+    def target_distance(self) -> float:
+        """Divides target coordinates into angles: the collimator's focal length, or that of the camera along its line,
+        so that a far target is measured on the image.
+        """
+        return self.model.line_focal_length if self.collimator is None else self.collimator.focal_length
+
+    def directions(self, places: np.ndarray) -> np.ndarray:
+        """Directions of the light, world, (F, 3), that the unperturbed camera images at places (F, 2), (along, across),
+        metres, of its line CCD.
+        """
+        placed = self.assembly.place()
+        body = line_body(self.root)
+        local = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        guess = self.model.toward_optics(placed.rotation[:, placed.index[body]].real)
+        sight = chief_directions(
+            self.backend,
+            assemble(self.assembly, [f"{self.name}/image_to_stop"], placed=placed),
+            assemble(self.assembly, [f"{self.name}/image_to_object"], placed=placed),
+            points_to_world(placed, body, local).real,
+            guess[:, None],
+            self._axes[:, 1],
+        )
+        return np.asarray(-sight[0])
+
+    def places(self, state: State, directions: np.ndarray) -> np.ndarray:
+        """Where chief rays of directions (F, 3) meet the line CCD, (F, 2) (along, across).
+
+        In metres of the nominal CCD: its pixels keep their pitch in these coordinates when it grows.
+
+        Raises:
+            BeamMissedError: a chief ray does not reach the line CCD.
+        """
+        systems, to_stop = self._systems(state, len(directions))
+        launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), self._stop_centre)
+        traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]))
+        position, _, _, valid = traced.numpy()
+        require_some(valid, "the imaging path")
+        return np.asarray(position[:, 0, 1::-1] / systems.size[:, None])
+
+    def pupils(
+        self, state: State, directions: np.ndarray, places: np.ndarray, target_shift: float = 0.0
+    ) -> tuple[PupilFunction, ...]:
+        """Pupil of the image of each direction (F, 3), about its own place (F, 2) on the line CCD.
+
+        Its lengths are those of ``places``.
+
+        Args:
+            state: of the assembly.
+            directions: of the light, world.
+            places: as ``places`` gives them for the same state.
+            target_shift: of the collimator's target, see ``Collimator.path``.
+
+        Raises:
+            BeamMissedError, AimError: the beam does not get through.
+            ValueError: it is vignetted.
+        """
+        placed = self.assembly.place([state])
+        systems, to_stop = self._systems(state, len(directions), placed)
+        origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        collimator = self.collimator
+        # the collimator's own axes: the first along the line, the second along the flight direction
+        rays = imaging_rays(
+            self.backend,
+            systems,
+            to_stop,
+            directions,
+            self._launch(directions),
+            self.stop,
+            self.nodes,
+            self._axes[:, 1],
+        )
+        incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
+        field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
+        turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
+        taken = None
+        if self.shadows is not None:
+            owner = np.zeros(len(directions), dtype=int)
+            beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
+            taken = self.shadows.cast(beams).pieces
+        return fit_pupils(turned.in_lengths_of(systems.size), self.nodes, shadows=taken)
+
+    def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
+        """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
+        along, across = self._target_axes(direction)
+        step = np.linspace(-reach, reach, MAP_POINTS)
+        points = np.stack([a.ravel() for a in np.meshgrid(step, step)], axis=-1)
+        around = direction + (points[:, :1] * along + points[:, 1:] * across) / self.target_distance
+        around = around / np.linalg.norm(around, axis=-1, keepdims=True)
+        places = self.places(state, np.concatenate([direction[None], around]))
+        design, wanted = _monomials(points / reach), places[1:] - places[0]
+        terms, *_ = np.linalg.lstsq(design, wanted, rcond=None)
+        residual = float(np.max(np.linalg.norm(design @ terms - wanted, axis=-1)))
+        return LocalMap(reach, terms, residual)
+
+    def _target_axes(self, direction: np.ndarray) -> np.ndarray:
+        """Directions in which light turns when its image moves along +Y' and +X', (2, 3).
+
+        With the camera's Z toward the scene, light that travels along -Z + t has its image at +f t; the second axis,
+        direction x Y, is then near the camera's X.
+        """
+        return transverse_axes(direction, self._axes[:, 1])
+
+    def _launch(self, directions: np.ndarray) -> np.ndarray:
+        """Points of the beams before the first mirror, world, (F, 3)."""
+        first = self.assembly.nominal_pose(f"{self.root}/{self.model.mirrors[0]}").translation
+        return np.asarray(first - LAUNCH_DISTANCE * directions)
+
+    @property
+    def _stop_centre(self) -> np.ndarray:
+        return np.array(self.stop.centre)[None]
+
+    def _systems(self, state: State, count: int, placed: PlacedBodies | None = None) -> tuple[SystemBatch, SystemBatch]:
+        """The way to the line CCD and the way to the stop, once for every direction."""
+        placed = self.assembly.place([state]) if placed is None else placed
+        every = np.zeros(count, dtype=int)
+        systems, to_stop = (
+            assemble(self.assembly, [f"{self.name}/{way}"], [state], placed=placed).take(every)
+            for way in ("imaging", "to_stop")
+        )
+        return systems, to_stop

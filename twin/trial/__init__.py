@@ -1,1 +1,0 @@
-"""What commands that run one test share: options, progress, result, report and run folder."""

@@ -1,0 +1,1 @@
+"""What a check of a paper is, and how it is judged."""

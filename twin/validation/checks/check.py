@@ -1,0 +1,361 @@
+"""One check of a paper: its statement, what the simulation gives, and the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.validation.checks.chosen import Chosen, InputRange, Supposed
+
+
+def mean_of(values: NDArray[Any]) -> tuple[float, float]:
+    """Mean of (n,) independent measurements, n > 1, and its standard deviation from their scatter."""
+    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def median_of(values: NDArray[Any]) -> tuple[float, float]:
+    """Median of (n,) independent measurements, n > 1, and its standard deviation from their scatter, were it normal."""
+    return float(np.median(values)), float(np.sqrt(0.5 * np.pi / len(values)) * np.std(values, ddof=1))
+
+
+Verdict = Literal[
+    "confirmed", "reproduced", "consistent", "confirmed with correction", "refuted", "undecided", "not checkable",
+    "failed",
+]  # fmt: skip
+CONFIRMED: Verdict = "confirmed"
+REPRODUCED: Verdict = "reproduced"
+CONSISTENT: Verdict = "consistent"
+CORRECTED: Verdict = "confirmed with correction"
+REFUTED: Verdict = "refuted"
+UNDECIDED: Verdict = "undecided"
+NOT_CHECKABLE: Verdict = "not checkable"
+FAILED: Verdict = "failed"
+VERDICTS: dict[Verdict, str] = {
+    CONFIRMED: "The simulation gives the printed value or finds the printed statement to hold, within the check's "
+    "tolerance plus three sigma, with inputs that were not chosen for it: it could have failed.",
+    REPRODUCED: "It gives the printed value or finds the statement to hold with inputs that the paper does not print "
+    "and that were chosen here. They stand beside it, with how far each may move before the row fails.",
+    CONSISTENT: "The paper prints nothing of it: the simulation agrees with the theory that the row names.",
+    CORRECTED: "It does not agree, and it does give the value that follows when a named fault, gap or ambiguity of "
+    "what is printed is put right; the correction stands beside it.",
+    REFUTED: "It does not agree, and no correction of the print would make it do so: the statement does not hold for "
+    "the simulated instrument, or the cause is not known. What was found stands beside it.",
+    UNDECIDED: "It agrees, but tolerance plus three sigma is more than what the row is to tell: a wrong statement "
+    "would have passed as well.",
+    NOT_CHECKABLE: "The text does not print what a comparison needs; the reason stands beside it.",
+    FAILED: "The check could not be computed; this says nothing about the paper.",
+}
+"""The verdicts and what they mean."""
+
+SIGMAS = 3.0
+"""The noise allowance of a comparison, in standard deviations of the measured value."""
+
+PAPERS = {
+    "000": "Liu and Huang, Infrared and Laser Engineering 43(10) (2014)",
+    "001": "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001",
+    "003": "Mo et al. (2015), doi 10.3969/J.ISSN.1672-7274.2015.06.003",
+    "004": "Li et al., Infrared and Laser Engineering, doi 10.3788/IRLA20200143",
+}
+"""The source papers by the number that the ids begin with."""
+
+Comparison = Literal["equal", "at most", "at least"]
+Basis = Literal["printed", "chosen", "theory"]
+AGREED: dict[Basis, Verdict] = {"printed": CONFIRMED, "chosen": REPRODUCED, "theory": CONSISTENT}
+"""What a row rests on -> its verdict where simulation and claim agree: a print that could have failed, a print with
+inputs chosen here, or a theory beside which nothing is printed.
+"""
+OF_AGREEMENT = cast(Verdict, "")
+"""What a check expects by default: the verdict of agreement."""
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What a check found; exactly these are the keys in JSON.
+
+    Attributes:
+        id: dotted, beginning with the paper's number.
+        also: further ids of the same row.
+        paper: the paper's number.
+        equation: where it is printed: equation, table or section.
+        statement: what the paper says, in one sentence.
+        printed: the paper's number; None where it prints none.
+        implied: what the statement implies, where no number is printed.
+        measured: the simulation's number; None when it failed or nothing can be compared.
+        sigma: standard deviation of ``measured``; None where there is no noise.
+        unit: of all these numbers; "1" for a ratio.
+        tolerance: how far apart claim and measurement may be, without the noise.
+        because: why that tolerance, a phrase.
+        power: tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error just so
+            large is found half the time, one of 3 sigma more practically always. None where nothing is compared.
+        tells: how far away the other statement is that the row is to tell from the printed one.
+        against: that other statement, a phrase.
+        theory: with what it agrees, where nothing is printed; else empty.
+        inputs: chosen here, and how far each may move.
+        verdict: one of VERDICTS.
+        how: lines: how it was measured; the reason, unless it is confirmed; the comparison that makes the verdict.
+        seconds: computing time since the group's result before; the first one holds the work that all share.
+    """
+
+    id: str
+    also: tuple[str, ...]
+    paper: str
+    equation: str
+    statement: str
+    printed: float | None
+    implied: float | None
+    measured: float | None
+    sigma: float | None
+    unit: str
+    tolerance: float
+    because: str
+    power: float | None
+    tells: float | None
+    against: str
+    theory: str
+    inputs: tuple[InputRange, ...]
+    verdict: Verdict
+    how: str
+    seconds: float
+
+    def __post_init__(self) -> None:
+        """Check that a reader, and JSON, can take it."""
+        if self.verdict not in VERDICTS:
+            raise ValueError(f"{self.id}: no verdict {self.verdict!r}; there are {', '.join(VERDICTS)}")
+        for name in ("printed", "implied", "measured", "sigma", "tolerance", "power", "tells", "seconds"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if not math.isfinite(value):
+                raise ValueError(f"{self.id}: {name} must be finite, found {value!r}")
+            object.__setattr__(self, name, float(value))
+        if (self.sigma is not None and self.sigma < 0) or self.seconds < 0:
+            raise ValueError(f"{self.id}: sigma and seconds cannot be negative")
+        if (self.measured is None) != (self.verdict in (FAILED, NOT_CHECKABLE)):
+            raise ValueError(
+                f"{self.id}: a measured value goes with every verdict but {FAILED!r} and {NOT_CHECKABLE!r}, and with "
+                "no other"
+            )
+
+    @property
+    def claim(self) -> float | None:
+        """What was compared with: the printed or the implied number."""
+        return self.implied if self.printed is None else self.printed
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return asdict(self) | {"also": list(self.also), "inputs": [asdict(i) for i in self.inputs]}
+
+    def timed(self, seconds: float) -> CheckResult:
+        """The same with its computing time."""
+        return replace(self, seconds=seconds)
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A value that the check would give for a known reason other than the printed one.
+
+    Attributes:
+        value: what the measurement should then be, in the check's unit.
+        verdict: CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
+        text: the reason, a sentence.
+    """
+
+    value: float
+    verdict: Verdict
+    text: str
+
+    def __post_init__(self) -> None:
+        """Only these two can be explained."""
+        if self.verdict not in (CORRECTED, REFUTED):
+            raise ValueError(f"an explanation is of {CORRECTED!r} or {REFUTED!r}, not of {self.verdict!r}")
+
+
+@dataclass(frozen=True)
+class Check:
+    """What is to be checked, known before anything is computed, so that no tolerance can follow its result.
+
+    Attributes:
+        id: dotted, beginning with the paper's number, for instance ``001.table3.centroid``.
+        equation: where it is printed, for instance ``eq. (5)``.
+        statement: what the paper says, in one sentence.
+        unit: of printed, measured and tolerance; "1" for a ratio.
+        printed: the paper's number; None where it prints none.
+        tolerance: how far apart printed and measured may be and still agree, without the noise.
+        because: why that tolerance.
+        comparison: ``equal``, or what the paper claims of the measured value: ``at most`` or ``at least`` the printed.
+        expected: the verdict that is known from earlier work; any other one is reported and fails the command. By
+            default that of agreement.
+        tells: how far away the nearest other statement is that the row is to tell from this one, in its unit; with a
+            tolerance plus noise above that it confirms nothing. None only where nothing can be compared.
+        against: that other statement, a phrase that goes on "told from".
+        basis: what agreement rests on, see AGREED; the inputs of ``chosen`` are given to judge().
+        theory: for the basis ``theory``: which one, a phrase.
+        also: further ids of the same row, where one comparison is of two equations.
+    """
+
+    id: str
+    equation: str
+    statement: str
+    unit: str
+    printed: float | None
+    tolerance: float
+    because: str
+    comparison: Comparison = "equal"
+    expected: Verdict = OF_AGREEMENT
+    tells: float | None = None
+    against: str = ""
+    basis: Basis = "printed"
+    theory: str = ""
+    also: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse ids that nobody can select, tolerances that are none, and rows that cannot tell what they are for."""
+        for name in self.names:
+            parts = name.split(".")
+            if parts[0] not in PAPERS or len(parts) < 2 or not all(p and p.replace("_", "").isalnum() for p in parts):
+                raise ValueError(f"check id {name!r} must be a paper ({', '.join(PAPERS)}) and names, joined by dots")
+        if self.expected == OF_AGREEMENT:
+            object.__setattr__(self, "expected", self.agreed)
+        if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
+            raise ValueError(f"{self.id}: the tolerance must be finite and >= 0, found {self.tolerance!r}")
+        if self.expected not in VERDICTS or self.expected == FAILED:
+            raise ValueError(f"{self.id}: {self.expected!r} is no verdict to expect")
+        if self.expected == NOT_CHECKABLE:
+            return
+        if self.tells is None or not (math.isfinite(self.tells) and self.tells > 0) or not self.against:
+            raise ValueError(f"{self.id}: say what the row tells from what: `tells` > 0 and `against`")
+        if self.tolerance > self.tells:
+            raise ValueError(f"{self.id}: a tolerance of {self.tolerance:g} can never tell {self.tells:g}")
+        if (self.basis == "theory") != bool(self.theory) or (self.theory and self.printed is not None):
+            raise ValueError(f"{self.id}: a theory is named where the row rests on it and nothing is printed")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All ids of the row, its own first."""
+        return (self.id, *self.also)
+
+    @property
+    def agreed(self) -> Verdict:
+        """The verdict where simulation and claim agree."""
+        return AGREED[self.basis]
+
+    @property
+    def paper(self) -> str:
+        """The paper's number."""
+        return self.id.partition(".")[0]
+
+    def judge(
+        self,
+        measured: float,
+        sigma: float | None,
+        how: str,
+        implied: float | None = None,
+        explanations: Sequence[Explanation] = (),
+        inputs: Sequence[Chosen | Supposed] = (),
+        otherwise: str = "",
+    ) -> CheckResult:
+        """The result, with the verdict that the numbers give.
+
+        It agrees if ``measured`` is the claimed value within ``tolerance`` + 3 ``sigma``; else the first explanation
+        whose value it is within the same limit gives verdict and reason; else it is refuted. A limit above ``tells``
+        makes of either agreement ``undecided``.
+
+        Args:
+            measured: the simulation's number.
+            sigma: its standard deviation, None without noise.
+            how: how it was measured and what else was found, in sentences.
+            implied: what the paper's statement implies, where it prints no number.
+            explanations: values that known reasons would give, the likeliest first.
+            inputs: chosen here; needed where the row's basis is ``chosen``.
+            otherwise: what can be said where neither claim nor explanation agrees.
+
+        Raises:
+            ValueError: a number is not finite, there is nothing to compare with, or inputs are missing.
+        """
+        measured, noise = float(measured), SIGMAS * float(sigma or 0.0)
+        goal = self.printed if self.printed is not None else implied
+        if goal is None:
+            raise ValueError(f"{self.id}: the paper prints no number, so judge() needs `implied`")
+        if not (math.isfinite(measured) and math.isfinite(noise) and math.isfinite(goal)):
+            raise ValueError(f"{self.id}: {measured!r} with sigma {sigma!r} against {goal!r} is no comparison")
+        if self.tells is None or (self.basis == "chosen") != bool(inputs):
+            raise ValueError(f"{self.id}: it must say what it tells, and its inputs just where they are chosen")
+        goal, allowed = float(goal), self.tolerance + noise
+        verdict, reason = self._verdict(measured, goal, allowed, explanations, otherwise)
+        agrees = verdict == self.agreed
+        ranges = tuple(i.range(lambda value: self._outside(value, goal) <= allowed, agrees) for i in inputs)
+        chosen = f"Chosen here: {'; '.join(r.text for r in ranges)}." if ranges else ""
+        name = "printed" if self.printed is not None else f"implied ({goal:.6g})"
+        sign = {"equal": "±", "at most": "up to +", "at least": "down to -"}[self.comparison]
+        limit = f"Measured minus {name}: {measured - goal:+.3g}; allowed {sign}{allowed:.3g}, that is "
+        limit += f"{self.tolerance:.3g} ({self.because})" + (" + 3 sigma." if noise else ".")
+        limit += f" To be told from {self.against}, {self.tells:.3g} away."
+        text = "\n".join(part for part in (how, chosen, reason, limit) if part)
+        found = self._result(measured, sigma, verdict, text)
+        return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
+
+    def worse(self, *results: CheckResult) -> CheckResult:
+        """Of one statement in several forms: the first result that is not the expected one, or else the first."""
+        return next((r for r in results if r.verdict != self.expected), results[0])
+
+    def failed(self, why: str) -> CheckResult:
+        """The result when it could not be computed."""
+        return self._result(None, None, FAILED, f"Could not be computed: {why}")
+
+    def not_checkable(self, why: str) -> CheckResult:
+        """The result where the text does not print what a comparison needs."""
+        return self._result(None, None, NOT_CHECKABLE, why)
+
+    def _outside(self, measured: float, goal: float) -> float:
+        """By how much a value is not what is claimed, on the claim's side."""
+        distance = measured - goal
+        return {"equal": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
+
+    def _verdict(
+        self, measured: float, goal: float, allowed: float, explanations: Sequence[Explanation], otherwise: str
+    ) -> tuple[Verdict, str]:
+        assert self.tells is not None
+        weak = (
+            f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.against} is "
+            f"{self.tells:.3g} away and would have passed as well."
+        )
+        if self._outside(measured, goal) <= allowed:
+            return (self.agreed, "") if allowed <= self.tells else (UNDECIDED, f"It agrees, but {weak}")
+        for reason in explanations:
+            if abs(measured - reason.value) <= allowed:
+                text = f"{reason.text} That gives {reason.value:.6g}."
+                if reason.verdict == CORRECTED and allowed > self.tells:
+                    return UNDECIDED, f"{text} But {weak}"
+                return reason.verdict, text
+        tried = ", ".join(f"{e.value:.6g}" for e in explanations)
+        unknown = f"The cause is not known{f'; what was thought of gives {tried}' if tried else ''}."
+        return REFUTED, otherwise or unknown
+
+    def _result(self, measured: float | None, sigma: float | None, verdict: Verdict, how: str) -> CheckResult:
+        return CheckResult(
+            id=self.id,
+            also=self.also,
+            paper=self.paper,
+            equation=self.equation,
+            statement=self.statement,
+            printed=self.printed,
+            implied=None,
+            measured=measured,
+            sigma=sigma,
+            unit=self.unit,
+            tolerance=self.tolerance,
+            because=self.because,
+            power=None,
+            tells=self.tells,
+            against=self.against,
+            theory=self.theory,
+            inputs=(),
+            verdict=verdict,
+            how=how,
+            seconds=0.0,
+        )

@@ -1,0 +1,316 @@
+"""Paper 001's principle experiment (section 3.1) on its bench, and Table 2 from its images.
+
+The bench's errors are motions of bodies. They are drawn from the seed and applied to the scene alone: the analysis
+reads the frames with the calibration of the ideal autocollimator and the angles that the turntable and the mirrors
+*should* have. Each series begins with a reading at zero that is taken off all others, as the paper's did (its first row
+reads 0.03 to 0.15 arcsec, so that it is a second reading at zero).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor.autocollimator import (
+    AXES,
+    ReadingMap,
+    column_component,
+    exact_reading,
+    mean_difference,
+    reading_of_normal,
+    relation_factor,
+)
+from analysis.spots.centroid import energy_centroid, mean_frames
+from analysis.spots.spot_positions import SpotPositions
+from analysis.units import ARCSEC
+from optics.geometry.pose import rotation_matrix
+from optics.geometry.tree import Motion, State
+from optics.numerics.backend import Backend
+from scenes.models.principle_model import UNITS, autocollimator_body, axis_body, build_bench, ccd_body, mirror_body
+from scenes.specs.principle_experiment import PrincipleExperimentSpec, PrincipleSetup
+from twin.sensors.area_detector import EmvaDetector
+from twin.validation.paper_001.principle_images import AutocollimatorPath, SpotWindows, window_pattern
+
+
+@dataclass(frozen=True)
+class Series:
+    """One series: axis X, Y or Z of system 1-XYZ, half angle theta between the mirrors and step, radians, and number of
+    steps after the first reading at zero.
+    """
+
+    axis: str
+    half_angle: float
+    step: float
+    steps: int
+
+    @property
+    def angles(self) -> np.ndarray:
+        """Turns of the table as commanded, (steps + 1,), radians."""
+        return self.step * np.arange(self.steps + 1)
+
+    @property
+    def stream(self) -> tuple[int, int, int]:
+        """Number of its random streams: a series draws the same whichever others are run with it."""
+        return AXES.index(self.axis), round(self.half_angle / ARCSEC), round(1e3 * self.step / ARCSEC)
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesResult:
+    """Readings of one series.
+
+    Attributes:
+        series: what was turned.
+        readings: (2 mirrors, rows, 2) turns about each autocollimator's own X and Y against its reading at zero,
+            radians.
+        sigma: (2, rows, 2) their standard deviations by the noise of the images alone, radians.
+    """
+
+    series: Series
+    readings: np.ndarray
+    sigma: np.ndarray
+
+    @property
+    def scale(self) -> float:
+        """What mirror 2 is multiplied with: 1 (X), 1 / cos b (Y), 1 / sin b (Z)."""
+        return 1.0 / relation_factor(self.series.axis, 2, 2.0 * self.series.half_angle)
+
+    @property
+    def columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mirror 1 and scaled mirror 2 as in Table 2, (rows,) each, radians."""
+        component = column_component(self.series.axis)
+        return self.readings[0, :, component], self.scale * self.readings[1, :, component]
+
+    @property
+    def mean_difference(self) -> float:
+        """Last line of Table 2, radians: X and Y mirror 1 - scaled mirror 2, Z the turntable - scaled mirror 2."""
+        first, second = self.columns
+        return mean_difference(self.series.angles if self.series.axis == "Z" else first, second)
+
+    @property
+    def from_exact(self) -> np.ndarray:
+        """Readings minus those of ideal mirrors, lens and turntable to all orders, (2, rows, 2), radians."""
+        args = self.series.axis, self.series.angles
+        return self.readings - np.stack([exact_reading(*args, u, 2.0 * self.series.half_angle) for u in UNITS])
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipleTable:
+    """All series of one run of the experiment, and the seed that its errors and noise come from."""
+
+    results: tuple[SeriesResult, ...]
+    seed: int
+
+    def __getitem__(self, axis: str) -> SeriesResult:
+        """The first series about that axis. Raises KeyError if there is none."""
+        for result in self.results:
+            if result.series.axis == axis:
+                return result
+        raise KeyError(axis)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: every number in the unit that its key ends in."""
+        out = []
+        for result in self.results:
+            first, second = result.columns
+            out.append(
+                {
+                    "axis": result.series.axis,
+                    "theta_deg": float(np.degrees(result.series.half_angle)),
+                    "step_arcsec": result.series.step / ARCSEC,
+                    "mirror_2_scale": result.scale,
+                    "rows": [
+                        {"angle_arcsec": a, "mirror_1_arcsec": m1, "scaled_mirror_2_arcsec": m2}
+                        for a, m1, m2 in (np.stack([result.series.angles, first, second], -1) / ARCSEC).tolist()
+                    ],
+                    "image_sigma_arcsec": float(np.max(result.sigma) / ARCSEC),
+                    "mean_difference_arcsec": result.mean_difference / ARCSEC,
+                }
+            )
+        return {"seed": self.seed, "series": out}
+
+    def text(self) -> str:
+        """The table as the paper prints it, arcsec; all series need the same number of steps."""
+        heads = [f"{r.series.axis}: mirror 1 {r.scale:9.6f}*mirror 2" for r in self.results]
+        lines = [f"{'angle':>9} " + " ".join(f"{head:>29}" for head in heads)]
+        for i in range(len(self.results[0].series.angles)):
+            cells = ["{:>12.4f} {:>16.4f}".format(*(c[i] / ARCSEC for c in r.columns)) for r in self.results]
+            lines.append(f"{self.results[0].series.angles[i] / ARCSEC:9.1f} " + " ".join(cells))
+        cells = [f"{r.mean_difference / ARCSEC:29.6f}" for r in self.results]
+        return "\n".join([*lines, f"{'mean |d|':>9} " + " ".join(cells)])
+
+
+AIRY_RADII = 4.0
+"""Radius of the centroid's window in radii of the first dark ring."""
+CALIBRATION_POINTS = 9
+"""Turns about each axis at which an autocollimator is calibrated."""
+_BENCH, _PATTERN, _READINGS, _FRAMES = range(4)
+"""Numbers of the seed's random streams."""
+
+
+def table_2(spec: PrincipleExperimentSpec) -> tuple[Series, ...]:
+    """The three series that the paper prints."""
+    p = spec.programme
+    return tuple(Series(axis, getattr(p.stands, axis), p.table, p.steps) for axis in AXES)
+
+
+def whole_programme(spec: PrincipleExperimentSpec) -> tuple[Series, ...]:
+    """All series that the paper reports to have measured: three axes, two half angles, three steps."""
+    p = spec.programme
+    return tuple(
+        Series(axis, half_angle, step, p.steps)
+        for axis in AXES
+        for half_angle in (p.narrow, p.wide)
+        for step in (p.small, p.table, p.large)
+    )
+
+
+def run_principle_experiment(
+    setup: PrincipleSetup,
+    backend: Backend,
+    series: Sequence[Series] | None = None,
+    seed: int = 0,
+    ideal: bool = False,
+    reader: Reader | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> PrincipleTable:
+    """Render and read the experiment.
+
+    Args:
+        setup: the experiment with its detector.
+        backend: where to trace.
+        series: what to turn; by default Table 2. Those of one half angle are traced together.
+        seed: of the bench's errors and the detectors' noise.
+        ideal: no errors of the bench, and images without noise or rounding.
+        reader: of an earlier run of the same setup, to save the calibration.
+        progress: told what is being done.
+
+    Raises:
+        BeamMissedError: a turn takes a spot off its area CCD.
+    """
+    wanted = tuple(table_2(setup.spec) if series is None else series)
+    say = progress or (lambda text: None)
+    if reader is None:
+        say("calibrate the autocollimators")
+        reader = Reader(setup, backend)
+    done: dict[Series, SeriesResult] = {}
+    for half_angle in dict.fromkeys(s.half_angle for s in wanted):
+        say(f"mirrors {2.0 * np.degrees(half_angle):.4g} deg apart")
+        group = [s for s in wanted if s.half_angle == half_angle]
+        states = [state for s in group for state in states_of(setup.spec, s, None if ideal else seed)]
+        windows = reader.path(half_angle).windows(states)
+        first = 0
+        for s in group:
+            part = slice(first, first + s.steps + 2)
+            first = part.stop
+            own = SpotWindows(windows.photons[:, part], windows.corner[:, part])
+            done[s] = reader.read(s, own, None if ideal else seed)
+    return PrincipleTable(tuple(done[s] for s in wanted), seed)
+
+
+def states_of(spec: PrincipleExperimentSpec, series: Series, seed: int | None) -> list[State]:
+    """The reading at zero and all rows of a series as states of the bench, with errors drawn from the seed.
+
+    Errors of the bench are the same in all series of a seed, except how the mirrors are mounted: they are set anew for
+    every half angle. ``seed`` None is the ideal bench.
+    """
+    e = spec.errors
+    on = 0.0 if seed is None else 1.0
+    bench, mounts, readings = (
+        np.random.default_rng(np.random.SeedSequence(seed or 0, spawn_key=key))
+        for key in ((_BENCH,), (_BENCH, series.stream[1]), (_READINGS, *series.stream))
+    )
+    growth = on * e.focal_length * bench.standard_normal(2)
+    roll = on * e.ccd_rotation * bench.standard_normal(2)
+    tilts = on * e.axis_tilt * bench.standard_normal((3, 3))
+    mount = on * e.mirror_mount * mounts.standard_normal((2, 2))
+    # the table does not move between the reading at zero and the first row
+    angles = np.concatenate([[0.0], series.angles])
+    angles[2:] += on * e.turntable_step * readings.standard_normal(series.steps)
+    unrest = on * e.reading * readings.standard_normal((len(angles), 2, 2))
+    k = AXES.index(series.axis)
+    axis = np.where(np.arange(3) == k, 1.0, tilts[k])
+    axis = axis / np.linalg.norm(axis)
+    out: list[State] = []
+    for i, angle in enumerate(angles):
+        state = {axis_body(series.axis): Motion(rotate=_triple(angle * axis))}
+        for n, unit in enumerate(UNITS):
+            turn = _triple((*unrest[i, n], 0.0))
+            state[autocollimator_body(unit)] = Motion(rotate=turn, scale=float(growth[n]))
+            state[ccd_body(unit)] = Motion(rotate=(0.0, 0.0, float(roll[n])))
+            state[mirror_body(unit)] = Motion(rotate=_triple((*mount[n], 0.0)))
+        out.append(state)
+    return out
+
+
+def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])
+
+
+class Reader:
+    """Detectors and calibration of the two autocollimators, which are alike.
+
+    Args:
+        setup: the experiment with its detector.
+        backend: where to trace.
+
+    Attributes:
+        map: the calibration, from the place of a spot to the turn of the mirror.
+    """
+
+    def __init__(self, setup: PrincipleSetup, backend: Backend) -> None:
+        self.spec = setup.spec
+        self.backend = backend
+        self.exposure: float = setup.spec.autocollimator.area_ccd.exposure
+        self.detector = EmvaDetector.from_sheet(setup.detector, self.exposure)
+        self._paths: dict[float, AutocollimatorPath] = {}
+        self.map = self._calibrate()
+
+    def path(self, half_angle: float) -> AutocollimatorPath:
+        """Light path with the mirrors 2 theta apart."""
+        if half_angle not in self._paths:
+            self._paths[half_angle] = AutocollimatorPath(build_bench(self.spec, half_angle), self.backend)
+        return self._paths[half_angle]
+
+    def _calibrate(self) -> ReadingMap:
+        """Calibration of the ideal autocollimator by noise-free images of known turns about X and Y together."""
+        p = self.spec.programme
+        reach = 1.02 * max(p.small, p.table, p.large) * p.steps
+        turns = np.linspace(-reach, reach, CALIBRATION_POINTS)
+        known = np.stack([*np.meshgrid(turns, turns, indexing="ij"), np.zeros((len(turns),) * 2)], -1).reshape(-1, 3)
+        windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=_triple(turn))} for turn in known])
+        photons, corner = windows.photons[0], windows.corner[0]
+        place, _ = self.place(self.detector.expected_dn(photons, self.exposure), corner)
+        return ReadingMap.fit(place, reading_of_normal(rotation_matrix(known) @ np.array([0.0, 0.0, -1.0])))
+
+    def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
+        """Spots (B, 2) on the whole CCD, (row, column) px, from mean windows (B, H, W) and their corners (B, 2)."""
+        bench = self.path(self.spec.programme.narrow).bench
+        airy = 0.61 * self.spec.autocollimator.wavelength / bench.numerical_aperture
+        noise = self.detector.noise_model(self.exposure)
+        radius = min(AIRY_RADII * airy / self.spec.autocollimator.area_ccd.pitch, 0.4 * mean.shape[-1])
+        spots = energy_centroid(mean, self.spec.autocollimator.frames, noise, radius, keep_maps=False)
+        return spots.position + corner, spots
+
+    def expose(self, windows: SpotWindows, stream: tuple[int, ...], seed: int) -> np.ndarray:
+        """Frames of both CCDs, uint16 (2, S, frames, window, window)."""
+        out = []
+        for n, (photons, corner) in enumerate(zip(windows.photons, windows.corner, strict=True)):
+            pattern = window_pattern(self.detector, corner, photons.shape[-1], seed, (_PATTERN, n))
+            noise = np.random.SeedSequence(seed, spawn_key=(_FRAMES, n, *stream))
+            out.append(self.detector.expose(photons, pattern, self.spec.autocollimator.frames, self.exposure, noise))
+        return np.stack(out)
+
+    def read(self, series: Series, windows: SpotWindows, seed: int | None) -> SeriesResult:
+        """Read the mirrors' turns from the images of a series that begins with the reading at zero."""
+        if seed is None:
+            mean = self.detector.expected_dn(windows.photons, self.exposure)
+        else:
+            mean = mean_frames(self.expose(windows, series.stream, seed))
+        place, spots = self.place(mean.reshape(-1, *mean.shape[2:]), windows.corner.reshape(-1, 2))
+        shape = windows.corner.shape
+        turns = self.map(place).reshape(shape)
+        variance = np.einsum("bkk->bk", self.map.covariance(place, spots.covariance)).reshape(shape)
+        return SeriesResult(series, turns[:, 1:] - turns[:, :1], np.sqrt(variance[:, 1:] + variance[:, :1]))

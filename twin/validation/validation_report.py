@@ -1,0 +1,289 @@
+"""The report of the checks, their summary, and the files of a run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from twin.run.artefact import PngFigure, SvgFigure, decimals_for, fixed, plain, significant
+from twin.run.page import artefact_content, environment
+from twin.run.run_folder import MANIFEST, RunFolder
+from twin.run.versions import versions
+from twin.validation.checks.check import (
+    AGREED,
+    CONFIRMED,
+    CONSISTENT,
+    CORRECTED,
+    FAILED,
+    NOT_CHECKABLE,
+    PAPERS,
+    REFUTED,
+    REPRODUCED,
+    SIGMAS,
+    UNDECIDED,
+    VERDICTS,
+    CheckResult,
+    Verdict,
+)
+from twin.validation.runner import GroupRun, Validation
+
+SUMMARY = "summary"
+"""Folder of the summary in the run folder."""
+PAGE = "README.md"
+"""So that a code host shows it when the folder is opened."""
+
+
+def summary_files(validation: Validation) -> dict[str, bytes]:
+    """Name -> content: the page and the figures that it shows."""
+    figures = {
+        f"{run.group.prefix}-{a.name}.{a.kind}": a
+        for run in validation.runs
+        for a in run.artefacts
+        if isinstance(a, SvgFigure | PngFigure)
+    }
+    lines = [*_head(validation), *_tables(validation), *_chosen(validation), *_corrections(validation)]
+    if figures:
+        lines += ["## Figures", ""]
+    for name, artefact in figures.items():
+        lines += [f"### {artefact.title}", "", f"![{artefact.title}]({name})", "", artefact.caption, ""]
+    page = "\n".join(lines).rstrip() + "\n"
+    return {PAGE: page.encode(), **{name: a.content() for name, a in figures.items()}}
+
+
+def _head(validation: Validation) -> Iterator[str]:
+    yield "# What the simulation says of the papers"
+    yield ""
+    took = duration_text(validation.seconds)
+    yield f"Made by `{command(validation)}` in {took}; its validation.html has every row in full."
+    yield ""
+    yield "| verdict | checks | meaning |"
+    yield "|---|---:|---|"
+    for verdict, meaning in VERDICTS.items():
+        if validation.counts[verdict]:
+            yield f"| {verdict} | {validation.counts[verdict]} | {meaning} |"
+    yield ""
+    yield (
+        "**Claim**: what the paper prints, or in brackets what its statement implies. **Tolerance**: how far claim and "
+        "measurement may be apart without the noise, and why. **Finds**: the smallest error of the statement that the "
+        "row would have found, tolerance plus three sigma, and its share of the claim; an error just so large is found "
+        "half the time. **To be told from**: the nearest other statement and how far away it is; a row that finds less "
+        "than that is undecided."
+    )
+    yield ""
+
+
+def _tables(validation: Validation) -> Iterator[str]:
+    for number, title in PAPERS.items():
+        rows = [result for result in validation.results if result.paper == number]
+        if not rows:
+            continue
+        yield f"## Paper {number}: {title}"
+        yield ""
+        yield "| check | what is compared | claim | measured | tolerance | finds | to be told from | verdict |"
+        yield "|---|---|---:|---:|---|---|---|---|"
+        for r in rows:
+            names, about = " = ".join(f"`{name}`" for name in (r.id, *r.also)), f"{r.equation}: {r.statement}"
+            about += f". Theory: {r.theory}" if r.theory else ""
+            cells = (names, about, claim_text(r), _measured(r), *_limits(r), r.verdict)
+            yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
+        yield ""
+
+
+def _measured(result: CheckResult) -> str:
+    """Value, sigma and unit."""
+    text, sigma = measured_text(result), sigma_text(result)
+    parts = [text, f"± {sigma}" if sigma else "", "" if result.unit == "1" or result.measured is None else result.unit]
+    return " ".join(part for part in parts if part)
+
+
+def _limits(result: CheckResult) -> tuple[str, str, str]:
+    """Tolerance with its reason, what an error must have to be found, and what is to be told."""
+    if result.power is None or result.tells is None:
+        return ("", "", "")
+    unit = "" if result.unit == "1" else f" {result.unit}"
+    tolerance = f"{plain(result.tolerance)}{unit}: {result.because}"
+    return tolerance, power_text(result), f"{result.against}, {plain(result.tells, 3)}{unit} away"
+
+
+def _chosen(validation: Validation) -> Iterator[str]:
+    """Inputs that were chosen here, and how far each may move."""
+    found = [result for result in validation.results if result.inputs]
+    if not found:
+        return
+    yield "## Chosen inputs"
+    yield ""
+    yield "What the paper does not print and these rows need, and where each may be moved before its row fails."
+    yield ""
+    for result in found:
+        yield f"- `{result.id}`: {_cell('; '.join(i.text for i in result.inputs))}"
+    yield ""
+
+
+def _corrections(validation: Validation) -> Iterator[str]:
+    """Everything that does not agree, with its reason."""
+    found = [result for result in validation.results if result.verdict not in AGREED.values()]
+    if not found:
+        return
+    yield "## Corrections, refutations, the undecided and gaps"
+    yield ""
+    for result in found:
+        lines = result.how.splitlines()
+        # how it was measured, reason, comparison; without a comparison only the reason
+        reason = lines[-2] if len(lines) > 1 else lines[0]
+        yield f"- `{result.id}` ({result.equation}), {result.verdict}: {_cell(reason)}"
+    yield ""
+
+
+def _cell(text: str) -> str:
+    """Text that no table of Markdown takes for its own signs."""
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+TEMPLATE = "validation.html.j2"
+MARKS: dict[Verdict, tuple[str, str]] = {
+    CONFIRMED: ("=", "confirmed"),
+    REPRODUCED: ("⊜", "reproduced"),
+    CONSISTENT: ("∼", "consistent"),
+    CORRECTED: ("≈", "corrected"),
+    REFUTED: ("≠", "refuted"),
+    UNDECIDED: ("±", "undecided"),
+    NOT_CHECKABLE: ("?", "silent"),
+    FAILED: ("✕", "failed"),
+}
+"""Verdict -> mark, so that no meaning hangs on a colour, and class in the page."""
+
+
+def render_report(validation: Validation) -> str:
+    """The page as text."""
+    template = environment(__package__).get_template(TEMPLATE)
+    results = validation.results
+    papers = [
+        {"number": number, "title": title, "rows": [_row(r) for r in results if r.paper == number]}
+        for number, title in PAPERS.items()
+    ]
+    groups = [_group(run) for run in validation.runs if run.artefacts or run.files]
+    return template.render(
+        papers=[paper for paper in papers if paper["rows"]],
+        groups=groups,
+        counts=[
+            {"verdict": v, "mark": MARKS[v][0], "kind": MARKS[v][1], "count": validation.counts[v], "meaning": meaning}
+            for v, meaning in VERDICTS.items()
+        ],
+        total=len(results),
+        unexpected=[{"id": r.id, "verdict": r.verdict, "expected": expected} for r, expected in validation.unexpected],
+        fast=validation.fast,
+        sigmas=f"{SIGMAS:g}",
+        command=command(validation),
+        backend=validation.backend,
+        duration=duration_text(validation.seconds),
+        seed=validation.seed,
+        versions=versions(),
+    )
+
+
+def duration_text(seconds: float) -> str:
+    """A time as one says it."""
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+
+
+def command(validation: Validation) -> str:
+    """What repeats this validation."""
+    only = "" if validation.only is None else f" --only {validation.only.replace(' ', '')}"
+    fast = " --fast" if validation.fast else ""
+    return f"python -m twin.validate{only}{fast} --seed {validation.seed} --backend {validation.backend} --out again"
+
+
+def measured_text(result: CheckResult) -> str:
+    """The measured value with the digits that its sigma leaves."""
+    if result.measured is None:
+        return "\N{EM DASH}"
+    if result.sigma:
+        return fixed(result.measured, decimals_for(result.sigma))
+    return significant(result.measured, 6, floor=0.0)
+
+
+def sigma_text(result: CheckResult) -> str:
+    """Two digits of sigma, nothing without noise."""
+    return fixed(result.sigma, decimals_for(result.sigma)) if result.sigma else ""
+
+
+def printed_text(result: CheckResult) -> str:
+    """What the paper prints."""
+    return "\N{EM DASH}" if result.printed is None else plain(result.printed)
+
+
+def claim_text(result: CheckResult) -> str:
+    """What the paper prints, or in brackets what its statement implies."""
+    if result.printed is None and result.implied is not None:
+        return f"[{plain(result.implied)}]"
+    return printed_text(result)
+
+
+def power_text(result: CheckResult) -> str:
+    """The smallest error of the statement that the row would have found, in its unit and of the claim."""
+    if result.power is None:
+        return "\N{EM DASH}"
+    text = significant(result.power, 2, floor=0.0)
+    unit = "" if result.unit == "1" else f" {result.unit}"
+    share = f", {significant(100.0 * result.power / abs(result.claim), 2, floor=0.0)} %" if result.claim else ""
+    return f"{text}{unit}{share}"
+
+
+def _row(result: CheckResult) -> dict[str, Any]:
+    mark, kind = MARKS[result.verdict]
+    return {
+        "id": result.id,
+        "equation": result.equation,
+        "statement": result.statement,
+        "also": list(result.also),
+        "theory": result.theory,
+        "printed": claim_text(result),
+        "power": power_text(result),
+        "tells": "" if result.tells is None or result.power is None else significant(result.tells, 3, floor=0.0),
+        "against": result.against,
+        "measured": measured_text(result),
+        "sigma": sigma_text(result),
+        "unit": "" if result.unit == "1" else result.unit,
+        "verdict": result.verdict,
+        "mark": mark,
+        "kind": kind,
+        "how": [_typeset(line) for line in result.how.splitlines()],
+    }
+
+
+def _typeset(text: str) -> str:
+    """Hyphens before numbers as minus signs."""
+    return re.sub(r"(?<![\w.,-])-(?=[\d.])|(?<=\de)-(?=\d)", "\N{MINUS SIGN}", text)
+
+
+def _group(run: GroupRun) -> dict[str, Any]:
+    return {
+        "prefix": run.group.prefix,
+        "title": run.group.title,
+        "artefacts": [artefact_content(a, run.place(a)) for a in run.artefacts],
+        "files": list(run.files),
+    }
+
+
+def write_validation(validation: Validation, folder: RunFolder) -> None:
+    """Write validation.json, validation.html, summary/, the groups' artefacts and the manifest."""
+    for run in validation.runs:
+        for artefact in run.artefacts:
+            folder.write_bytes(run.place(artefact), artefact.content())
+    folder.write_json("validation.json", validation.to_dict())
+    folder.write_text("validation.html", render_report(validation))
+    for name, content in summary_files(validation).items():
+        folder.write_bytes(f"{SUMMARY}/{name}", content)
+    manifest = {
+        "program": "twin.validate",
+        "versions": versions(),
+        "backend": validation.backend,
+        "seed": validation.seed,
+        "only": validation.only,
+        "fast": validation.fast,
+        "started_unix_s": validation.started,
+        "wall_time_s": validation.seconds,
+        "sha256": folder.checksums(),
+    }
+    folder.write_json(MANIFEST, manifest)
