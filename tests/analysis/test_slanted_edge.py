@@ -17,6 +17,7 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
+from analysis.mtf.edge_location import _direction
 from analysis.mtf.rice import rice_bias
 from analysis.mtf.slanted_edge import EdgeError, measure_edge
 from analysis.spots.noise import NoiseModel
@@ -425,3 +426,23 @@ def test_stated_saturation():
 def test_arguments_that_make_no_sense(wrong):
     with pytest.raises(ValueError, match=r"oversampling|frequency"):
         measure_edge(edge_image(5), **wrong)
+
+
+def half_an_edge():
+    """Sharp in the lower part; above, the same step so smooth that no row tells where it is."""
+    image = edge_image(5)
+    image[:26, :] = np.linspace(DARK, BRIGHT, 64)
+    return image
+
+
+def test_an_edge_has_to_be_there_in_most_rows():
+    with pytest.raises(EdgeError, match="cannot be followed"):
+        measure_edge(noisy(half_an_edge()))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_steeper_slope_decides_about_the_axis(turned):
+    """A plane whose slopes differ by half a per cent."""
+    row, column = np.indices((16, 16), float)
+    steep, flat = (row, column) if turned else (column, row)
+    assert _direction(1.005 * steep + flat) == ("y" if turned else "x", 1)

@@ -12,7 +12,9 @@ from scipy import stats
 from scipy.special import j1
 
 from analysis.spots.centroid import (
+    _GAUSS_MOVE_PX,
     SpotError,
+    _wandered,
     cramer_rao_bound,
     difference_covariance,
     energy_centroid,
@@ -21,6 +23,7 @@ from analysis.spots.centroid import (
     mean_frames,
 )
 from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_image import sane
 from analysis.spots.spot_template import SpotTemplate
 
 FALSE_ALARM = 1e-6
@@ -295,3 +298,19 @@ def test_bad_input(template, before):
     found = maximum_likelihood_fit(before[:1], FRAMES, NOISE, template, keep_maps=False)
     with pytest.raises(ValueError, match="keep_maps"):
         difference_covariance(found, found, NOISE)
+
+
+@pytest.mark.parametrize("move", [(1.1, 0.0), (-1.1, 0.0), (0.0, 1.1), (0.0, -1.1)])
+def test_a_gaussian_that_wanders_is_told_whichever_way_it_goes(move):
+    row, column = np.array([20.0]), np.array([30.0])
+    theta = np.array([[20.0 + _GAUSS_MOVE_PX * move[0], 30.0 + _GAUSS_MOVE_PX * move[1], 1.0, 0.0, 1.0]])
+    assert _wandered(theta, row, column).all()
+    assert not _wandered(np.array([[20.0, 30.0, 1.0, 0.0, 1.0]]), row, column).any()
+
+
+def test_faint_and_narrow_gaussians_are_still_gaussians():
+    """Less than one unit of light, and narrower than a pixel; not those without light or without width."""
+    good = np.array([[20.0, 30.0, 0.3, 0.0, 0.2]])
+    assert sane(good).all()
+    assert not sane(good * [[1, 1, -1, 1, 1]]).any()
+    assert not sane(good * [[1, 1, 1, 1, -1]]).any()

@@ -158,3 +158,12 @@ def test_points_of_one_line_and_bad_input():
         adjusted({k: replace(r, time=None) for k, r in rays.items()}, WHITE)
     with pytest.raises(CalibrationError, match="robust must be"):
         adjusted(rays, WHITE, robust="tukey")
+
+
+def test_cameras_sit_where_they_were_calibrated_unless_it_is_said_otherwise():
+    view = strip(1, 30, 5.0)
+    rays = make_rays(view)
+    usual, zero = adjusted(rays, WHITE), adjusted(rays, WHITE, offset=(0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(usual.ground, zero.ground)
+    assert usual.chi_square == zero.chi_square
+    assert usual.chi_square < 1e-12

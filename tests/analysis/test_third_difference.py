@@ -72,3 +72,10 @@ def test_bad_series_are_told():
         third_difference(np.delete(time, 5), np.delete(time, 5))
     with pytest.raises(ValueError, match="rise evenly"):
         third_difference(time[::-1], time)
+
+
+def test_constants_of_white_noise_are_those_of_the_binomials():
+    weights = np.array([1.0, -3.0, 3.0, -1.0])
+    overlap = np.correlate(weights, weights, "full")
+    assert pytest.approx(np.sqrt(overlap[3])) == WHITE_GAIN
+    assert overlap[4] / overlap[3] == WHITE_LAG

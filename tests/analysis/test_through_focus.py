@@ -298,3 +298,13 @@ def test_bad_arguments(change, message):
     given = {"position": np.linspace(-1, 1, 9), "value": np.ones(9), "sigma": 0.1} | change
     with pytest.raises(ValueError, match=message):
         focus_vertex(**given)
+
+
+def test_the_unit_of_the_mtf_does_not_matter():
+    """Weights are 1/sigma^2: of an MTF in units of 1e-4 they are far below one, and count as much."""
+    z = steps(50 * UM, -0.6e-3, 0.6e-3)
+    value = curve(z, [30 * UM], PAN, 0.2)[0] + np.random.default_rng(3).normal(0, 0.004, z.size)
+    one, other = focus_vertex(z, value, 0.004), focus_vertex(z, 1e4 * value, 40.0)
+    np.testing.assert_array_equal(one.used, other.used)
+    assert other.position == pytest.approx(one.position, abs=1e-9 * 1e-3)
+    assert other.sigma == pytest.approx(one.sigma, rel=1e-6)

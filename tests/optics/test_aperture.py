@@ -78,3 +78,9 @@ def test_bad_rectangles_are_refused(sizes: tuple[float, float]) -> None:
 def test_bad_ellipses_are_refused(sizes: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="aperture"):
         Ellipse(*sizes)
+
+
+def test_a_rectangle_is_walked_in_even_steps() -> None:
+    """Each corner once: from a point to the next it is a tenth of a side."""
+    steps = np.linalg.norm(np.diff(Rectangle(2.0, 1.0).outline(40), axis=0), axis=-1)
+    np.testing.assert_allclose(steps, np.repeat([0.4, 0.2, 0.4, 0.2], 10), rtol=1e-12)
