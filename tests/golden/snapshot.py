@@ -42,6 +42,7 @@ LEFT_OUT = {
     "": {"versions", "started_unix_s", "wall_time_s", "seconds", "worker_seconds", "states_per_second"},
     "manifest.json": {"workers"},
     "study_state.json": {"fingerprint", "content", "sources"},
+    "study.nc": {"fingerprint"},
 }
 """Keys by file, "" for every file. Words that mean something physical elsewhere, as the sources of stray light, stand
 with the one file in which they do not.
@@ -223,7 +224,7 @@ class Reader:
 
     def _read_nc(self, path: Path) -> Any:
         groups = xr.open_groups(path, engine="h5netcdf", decode_cf=False)
-        return {group: self._group(data) for group, data in groups.items()}
+        return {group: timeless(self._group(data), path.name) for group, data in groups.items()}
 
     def _group(self, data: xr.Dataset) -> Any:
         with data:
