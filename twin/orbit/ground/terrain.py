@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.cbook import get_sample_data
 from scipy.ndimage import spline_filter
 
 from twin.orbit.flight.earth import curvature_radii
@@ -102,8 +103,11 @@ class Terrain:
 @cache
 def _jacksboro() -> tuple[np.ndarray, tuple[float, float]]:
     """Heights (rows to the north), metres, and the posts' distance east and north, metres."""
-    loaded: Any = get_sample_data("jacksboro_fault_dem.npz")
-    with loaded as data:
+    # found without importing matplotlib, which only draws
+    found = find_spec("matplotlib")
+    assert found is not None
+    assert found.origin is not None
+    with np.load(Path(found.origin).parent / "mpl-data" / "sample_data" / "jacksboro_fault_dem.npz") as data:
         posts = data["elevation"][::-1].astype(np.float64)
         step = np.radians([float(data["dx"]), float(data["dy"])])
         latitude = 0.5 * np.radians(float(data["ymin"]) + float(data["ymax"]))
