@@ -6,3 +6,6 @@ import math
 
 ARCSEC = math.pi / 180 / 3600
 """One second of arc, rad."""
+
+ARCMIN = 60.0 * ARCSEC
+"""One minute of arc, rad."""

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -31,6 +32,20 @@ ANALYSIS_MAY: dict[str, set[str]] = {
 }
 LONGEST_FILE = 500
 MOST_FILES = 28
+# what draws and what fills templates
+SHOWS = {"matplotlib", "jinja2"}
+COMPUTE = (
+    "optics",
+    "scenes",
+    "analysis",
+    "twin/sensors",
+    "twin/monitor",
+    "twin/targets",
+    "twin/path_tracing",
+    "twin/study/runs",
+)
+"""Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`."""
+COMMANDS = {"analysis.mtf.__main__", "twin.design"}
 ROOMS = [
     *re.findall(
         r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M
@@ -90,6 +105,38 @@ def _finest(names: set[str]) -> Iterator[str]:
         is_package = modules()[name].name == "__init__.py"
         if not (is_package and any(other.startswith(name + ".") for other in known)):
             yield name
+
+
+def computing() -> list[str]:
+    """Modules that compute: those in `COMPUTE`, and every one that makes a procedure of a test."""
+    return [
+        module
+        for module, path in modules().items()
+        if module not in COMMANDS
+        and (
+            any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
+            or re.search(r"^[A-Z]+ = Procedure\(", (ROOT / path).read_text("utf-8"), re.M)
+        )
+    ]
+
+
+def way_to(names: set[str], module: str, imports: dict[str, set[str]]) -> list[str]:
+    """Module -> ... -> what it imports of ``names``, the shortest way; empty for none."""
+    ways, seen = [[module]], {module}
+    for way in ways:
+        for name in sorted(imports.get(way[-1], ())):
+            if name.split(".")[0] in names:
+                return [*way, name]
+            if name in modules() and name not in seen:
+                seen.add(name)
+                ways.append([*way, name])
+    return []
+
+
+@cache
+def every_import() -> dict[str, set[str]]:
+    """Module -> all that it imports, of the project and of others."""
+    return {module: imported_modules(ROOT / path) for module, path in modules().items()}
 
 
 def room_of(module: str) -> str:
@@ -157,6 +204,31 @@ def test_a_right_arrow_is_not_complained_about(tmp_path: Path, monkeypatch: pyte
         "import numpy\nfrom analysis import centroid\nfrom scenes.specs.load import load_job\nimport optics"
     )
     assert forbidden(path) == set()
+
+
+def test_what_computes_neither_draws_nor_fills_templates() -> None:
+    """Nor does anything that it imports: a study needs no figures, and a run can be shown in any way."""
+    assert len([name for name in computing() if name.startswith("twin.laboratory")]) == 3
+    assert len([name for name in computing() if name.startswith("twin.orbit")]) == 4
+    ways = {module: way_to(SHOWS, module, every_import()) for module in computing()}
+    assert [" imports ".join(way) for way in ways.values() if way] == []
+
+
+def test_the_way_to_what_draws_is_found() -> None:
+    imports = {"twin.lab": {"numpy", "twin.run.page", "twin.run.report"}, "twin.run.page": {"jinja2.sandbox"}}
+    assert way_to(SHOWS, "twin.lab", imports) == ["twin.lab", "twin.run.page", "jinja2.sandbox"]
+    assert way_to(SHOWS, "twin.run.report", imports) == []
+    # reports do draw
+    assert way_to(SHOWS, "twin.laboratory.focus_report", every_import())[-1].startswith("matplotlib")
+
+
+@pytest.mark.slow
+def test_nothing_that_computes_loads_matplotlib() -> None:
+    """Not through other people's packages either. (Those of a cluster load jinja2 for pages of their own.)"""
+    names = [name for name in computing() if not name.startswith("scenes.library")]
+    code = f"import sys, importlib\nfor n in {names}: importlib.import_module(n)\nprint('matplotlib' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
 
 
 def test_source_knows_rooms_that_stand_above_its_own() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import typer
@@ -28,7 +29,8 @@ from scenes.models.camera_model import derive_camera
 from twin.pictures.design_figures import error_figure, layout_figure
 from twin.run.artefact import Data, SvgFigure, Table
 from twin.run.command import AsJson, BackendName, File, Force, Options, Out, Quiet, run_test
-from twin.run.result import Advance, BenchError, LabResult, Section, silent
+from twin.run.procedure import Advance, BenchError, Procedure, silent
+from twin.run.report import Report, Section
 from twin.run.svg import look, to_svg
 
 PROGRAM = "twin.design"
@@ -50,8 +52,23 @@ class CameraFile(Data):
         return str(self.data).encode()
 
 
-def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent) -> LabResult:
-    """Optimise the camera; nothing is drawn, the seed is not used.
+@dataclass(frozen=True, eq=False)
+class DesignRun:
+    """An optimised camera.
+
+    Attributes:
+        setup: what its file says.
+        found: prescription before and after.
+        text: the new camera's file.
+    """
+
+    setup: CameraDesignSetup
+    found: Design
+    text: str
+
+
+def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent) -> DesignRun:
+    """Optimise the camera; nothing is drawn at random, the seed is not used.
 
     Raises:
         InputError: the camera passes no light.
@@ -85,10 +102,31 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         )
     spec = camera_of(camera, found.prescription, test.name, test.description)
     derive_camera(spec, backend)  # it can be used as a camera
-    return _result(setup, found, camera_file(spec, remark))
+    return DesignRun(setup, found, camera_file(spec, remark))
 
 
-def _result(setup: CameraDesignSetup, found: Design, text: str) -> LabResult:
+def design_numbers(run: DesignRun) -> dict[str, Any]:
+    """Contents of design.json without its frames."""
+    found, setup = run.found, run.setup
+    before, after = found.before, found.after
+    return {
+        "camera": setup.test.name,
+        "start": setup.camera.name,
+        "wavefront_error_waves": {"before": before.errors.tolist(), "after": after.errors.tolist()},
+        "fields_deg": np.degrees(found.judge.beams.fields).tolist(),
+        "principal_distance_m": {"before": before.principal_distance, "after": after.principal_distance},
+        "envelope_m": {"before": before.envelope, "after": after.envelope},
+        "clearance_m": {"before": before.clearances.tolist(), "after": after.clearances.tolist()},
+        "jacobians": found.evaluations,
+    }
+
+
+DESIGN = Procedure("design", CameraDesignSetup, resolve_design, run_design, design_numbers)
+
+
+def design_report(run: DesignRun) -> Report:
+    """Report of an optimised camera."""
+    setup, found = run.setup, run.found
     before, after = found.before, found.after
     worst = float(after.errors.max())
     lead = (
@@ -147,22 +185,12 @@ def _result(setup: CameraDesignSetup, found: Design, text: str) -> LabResult:
             (f"{found.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
             (
                 changed,
-                CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/library/cameras.", text),
+                CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/library/cameras.", run.text),
             ),
         ),
     )
-    data = {
-        "camera": setup.test.name,
-        "start": setup.camera.name,
-        "wavefront_error_waves": {"before": before.errors.tolist(), "after": after.errors.tolist()},
-        "fields_deg": fields.tolist(),
-        "principal_distance_m": {"before": before.principal_distance, "after": after.principal_distance},
-        "envelope_m": {"before": before.envelope, "after": after.envelope},
-        "clearance_m": {"before": before.clearances.tolist(), "after": after.clearances.tolist()},
-        "jacobians": found.evaluations,
-    }
     facts = (("start", setup.camera.name), ("variables", str(len(found.variables))))
-    return LabResult("design", f"Design of {setup.test.name}", lead, facts, data, summary, sections)
+    return Report(f"Design of {setup.test.name}", lead, facts, summary, sections)
 
 
 def _numbers(before: Judgement, after: Judgement) -> list[list[str | float]]:
@@ -198,7 +226,7 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    run_test(PROGRAM, "", file, resolve_design, run_design, Options(out, None, backend, force, as_json, quiet))
+    run_test(PROGRAM, "", file, DESIGN, design_report, Options(out, None, backend, force, as_json, quiet))
 
 
 if __name__ == "__main__":

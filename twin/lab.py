@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import typer
 
-from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.laboratory.distortion_report import run_distortion
-from twin.laboratory.focus_report import run_focus
-from twin.laboratory.turntable_report import run_turntable_test
+from twin.laboratory.distortion_numbers import DISTORTION
+from twin.laboratory.distortion_report import distortion_report
+from twin.laboratory.focus_numbers import FOCUS
+from twin.laboratory.focus_report import focus_report
+from twin.laboratory.turntable_numbers import TURNTABLE
+from twin.laboratory.turntable_report import turntable_report
 from twin.run.command import add_test
 
 PROGRAM = "twin.lab"
@@ -33,8 +35,8 @@ add_test(
     app,
     PROGRAM,
     "focus",
-    resolve_focus,
-    run_focus,
+    FOCUS,
+    focus_report,
     """Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
     shims, and the same again.
 
@@ -47,8 +49,8 @@ add_test(
     app,
     PROGRAM,
     "distortion",
-    resolve_distortion,
-    run_distortion,
+    DISTORTION,
+    distortion_report,
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
 
@@ -62,8 +64,8 @@ add_test(
     app,
     PROGRAM,
     "turntable",
-    resolve_turntable,
-    run_turntable_test,
+    TURNTABLE,
+    turntable_report,
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.""",
 )
 

@@ -27,7 +27,7 @@ from twin.study.__main__ import app as study
 
 CUTS = (
     "twin.main_job.render_job.trace_truth",
-    "twin.laboratory.focus_report.align",
+    "twin.laboratory.focus_alignment.align",
     "twin.laboratory.distortion_bench.DistortionBench.record",
     "twin.laboratory.turntable_run.choose",
     "twin.orbit.angle.angle_run.estimated",

@@ -18,10 +18,11 @@ from optics.waves.transfer import TransferTable
 from scenes.specs.lab_setup import resolve_distortion
 from twin.laboratory import printed_004
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.distortion_report import lab_result, to_dict
+from twin.laboratory.distortion_numbers import distortion_numbers
+from twin.laboratory.distortion_report import distortion_report
 from twin.laboratory.distortion_run import DistortionRun, measure
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.run.result import BenchError
+from twin.run.procedure import BenchError
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4
@@ -142,7 +143,7 @@ def test_noise_of_the_spots_is_as_stated():
 
 
 def test_result_agrees_with_the_truth():
-    data = to_dict(run())
+    data = distortion_numbers(run())
     truth = data["truth"]
     assert len(data["points"]) == printed_004.TEST_POINTS
     assert truth["error_rms_compensated_um"] < printed_004.DISTORTION_ACCURACY_UM
@@ -178,7 +179,7 @@ def test_error_of_the_zero_spoils_the_printed_equations_and_not_the_constant():
 
 
 def test_report_and_images():
-    result = lab_result(run())
+    result = distortion_report(run())
     names = {artefact.name for section in result.sections for artefact in section.artefacts}
     assert {"distortion-curve", "distortion-points", "distortion-spot", "distortion-estimates"} <= names
     assert {name: frames.shape for name, frames in result.images.items()} == {

@@ -18,11 +18,11 @@ from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.lab_setup import FocusSetup, resolve_focus
 from scenes.specs.load import LAB, SCENES
-from twin.laboratory.focus_alignment import Alignment, align, line_turn, misset, mount_of, plan_shims
+from twin.laboratory.focus_alignment import Alignment, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_report import run_focus, to_dict
+from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
-from twin.run.result import BenchError, silent
+from twin.run.procedure import BenchError, silent
 from twin.targets.edge_images import TRACK
 
 FILE = SCENES / LAB / "focus.yaml"
@@ -111,8 +111,8 @@ def test_level_is_read_and_set_with_the_theodolites_sigma(alignments) -> None:
 @pytest.mark.slow
 def test_the_seed_decides(alignments, coarse) -> None:
     """The coarse shims' run repeats the first seed as far as the first shims."""
-    first, second = (to_dict(alignments[seed]) for seed in SEEDS)
-    again = to_dict(coarse)
+    first, second = (focus_numbers(alignments[seed]) for seed in SEEDS)
+    again = focus_numbers(coarse)
     assert again["initial"] == first["initial"]
     assert again["truth"]["initial"] == first["truth"]["initial"]
     for part in ("initial", "rounds"):
@@ -135,7 +135,7 @@ def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
 
 def test_json(bench, alignments) -> None:
     alignment = alignments[SEEDS[0]]
-    data = json.loads(json.dumps(to_dict(alignment), allow_nan=False))
+    data = json.loads(json.dumps(focus_numbers(alignment), allow_nan=False))
     assert len(data["rounds"]) == bench.setup.test.rounds == 1
     end, truth = data["rounds"][0], data["truth"]
     assert {"confocal_um_max", "line_level_arcmin", "mtf_nyquist", "shims_um"} <= set(end)

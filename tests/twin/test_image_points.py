@@ -23,7 +23,7 @@ from twin.orbit.calibration.influences import INNER, simultaneous
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.point_judgement import judged, true_ground
-from twin.orbit.images.simulate_run import Simulation, simulate
+from twin.orbit.images.simulate_run import Simulation, run_simulation
 
 run = partial(invoke, command.app)
 SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))
@@ -36,7 +36,7 @@ def flown() -> Simulation:
     setup = resolve_simulate(SIMULATE)
     patch = setup.test.patch.model_copy(update={"lines": 320, "pixels": 320})
     update = {"patch": patch, "points": None, "oversampling": 2}
-    return simulate(setup.model_copy(update={"test": setup.test.model_copy(update=update)}), 3)
+    return run_simulation(setup.model_copy(update={"test": setup.test.model_copy(update=update)}), None, 3)
 
 
 @pytest.fixture(scope="module")

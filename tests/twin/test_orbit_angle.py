@@ -21,10 +21,9 @@ from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from tests.analysis.test_sensitivity import REFUTED
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
-from twin.orbit.angle.angle_run import estimated, frame_rows, run_passes, tls_angles
+from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import look_angle
-from twin.run.result import silent
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "angle.yaml"
@@ -54,7 +53,7 @@ def flight() -> AnglePass:
 @pytest.fixture(scope="module")
 def full():
     """The example as it is."""
-    return run_passes(SETUP, 1, silent)
+    return run_angle(SETUP, None, 1)
 
 
 def directions(name: str, pixel: np.ndarray) -> np.ndarray:
@@ -225,7 +224,7 @@ def test_a_short_orbit_has_no_intersection() -> None:
 def test_a_datum_shift_is_the_stations_shift_reversed() -> None:
     """Moving all points by s is moving the station by -s, with the linear slopes; second order is 1e-5 of it."""
     shift = (10.0, -4.0, 7.0)
-    run_ = run_passes(setup_with(errors={"datum": shift}, passes=2), 3, silent)
+    run_ = run_angle(setup_with(errors={"datum": shift}, passes=2), None, 3)
     (datum,) = (row for row in run_.effects if row.what == "datum")
     slopes = np.array([row.slope for row in run_.table if row.what == "station"])
     expected = -(np.array(shift) @ run_.flight.local) @ slopes

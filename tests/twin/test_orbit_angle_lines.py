@@ -17,10 +17,9 @@ from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
-from twin.orbit.angle.angle_run import estimated, run_passes, values_of
+from twin.orbit.angle.angle_run import estimated, run_angle, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.run.result import silent
 
 run = partial(invoke, command.app)
 PAIR, LINES = (resolve_angle(SCENES / ORBIT / f"{name}.yaml") for name in ("angle_gf7", "angle_off_axis"))
@@ -108,7 +107,7 @@ def test_scatter_of_the_pair(backend) -> None:
     """Chi-square of 100 passes to either side at 1e-4: three statements."""
     changes = {"base/backward/focal_plane": PAIR.test.changes["base/backward/focal_plane"]}
     few = PAIR.model_copy(update={"test": PAIR.test.model_copy(update={"passes": 100, "changes": changes})})
-    full = run_passes(few, 2, silent, backend)
+    full = run_angle(few, backend, 2)
     for scatter in (full.planes, full.along, full.resection):
         assert scatter.tail[0] > 1e-4
         assert np.abs(scatter.bias[0]) < 3.9 * scatter.sigma[0] / np.sqrt(100)
@@ -139,7 +138,7 @@ def test_off_axis_angles_come_back(effects: LightEffects) -> None:
 def test_scatter_of_off_axis_angles() -> None:
     """Chi-square of 200 passes to either side at 1e-4, twelve statements but for one: the dihedral angle of the nearly
     parallel lines, which is mostly their turn about the look, is some 25 sigmas from the fold and still normal."""
-    full = run_passes(LINES, 3, silent)
+    full = run_angle(LINES, None, 3)
     for scatter in (full.planes, full.along, full.resection):
         assert np.all(scatter.tail > 1e-4)
     assert not np.any(full.estimate.angles["tls"].folded)
@@ -158,7 +157,7 @@ def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
     changes = {k: v for k, v in LINES.test.changes.items() if k != "multispectral"}
     test = LINES.test.model_copy(update={"passes": 2, "changes": changes})
     setup = LINES.model_copy(update={"test": test, "camera": camera.model_copy(update={"lines": lines})})
-    full = run_passes(setup, 4, silent)
+    full = run_angle(setup, None, 4)
     few = full.names.index("multispectral")
     assert full.estimate.angles["tls"].folded[few]
     assert abs(full.estimate.along.values[few]) < 4.0 * full.estimate.along.sigma[few]

@@ -20,15 +20,14 @@ from scenes.specs.orbit_angle import LINES, EffectsSpec
 from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import files, invoke, refused
-from twin.orbit.calibration.calibration_json import to_dict
-from twin.orbit.calibration.calibration_run import run_calibration_passes, true_values
+from twin.orbit.calibration.calibration_numbers import calibration_numbers
+from twin.orbit.calibration.calibration_run import run_calibration, true_values
 from twin.orbit.calibration.campaign import fly_fields
 from twin.orbit.calibration.influences import INNER, simultaneous, surprises
 from twin.orbit.calibration.latitude import fitted, latitude_fits, rate_priors
 from twin.orbit.calibration.observations import ImagePoints, PassData, image_sigma, light_shift
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, schemes_tested, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.run.result import silent
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate.yaml"
@@ -51,7 +50,7 @@ def setup_with(thermal: bool = True, effects: EffectsSpec = NO_LIGHT, **errors) 
 @pytest.fixture(scope="module")
 def full():
     """The example as it is."""
-    return run_calibration_passes(SETUP, 1, silent)
+    return run_calibration(SETUP, None, 1)
 
 
 def interior_of_the_file() -> dict[str, float]:
@@ -107,7 +106,7 @@ def test_errors_are_as_large_as_their_sigmas() -> None:
 def test_numbers_say_what_their_sigmas_hold(full) -> None:
     """With the drift of the biases during a pass as the fields tell it, and with what launch leaves of the gauge.
     Errors of the outer lines' x beyond 4 sigmas are a false alarm of 1e-3 with Student's five degrees of freedom."""
-    data = to_dict(full, 1)
+    data = calibration_numbers(full)
     found, plain = data["parameters"], simultaneous(full.campaign).sigma
     expected = SETUP.test.launch.interior
     for name in ("forward x", "aft x"):

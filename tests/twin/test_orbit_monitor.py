@@ -14,8 +14,8 @@ from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
-from twin.orbit.monitoring.monitoring_run import rms, run_monitored
-from twin.run.result import silent
+from twin.orbit.monitoring.monitoring_run import rms, run_monitor
+from twin.run.procedure import silent
 
 ARCSEC = np.pi / 648000
 FALSE_ALARM = 1e-6
@@ -69,7 +69,7 @@ def setup(tmp_path_factory) -> MonitorSetup:
 @pytest.fixture(scope="module")
 def quiet(setup, backend):
     """No noise at all, no temperatures."""
-    return run_monitored(changed(setup, switched_on=False), backend, 3, silent)
+    return run_monitor(changed(setup, switched_on=False), backend, 3, silent)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def noisy(tmp_path_factory, backend):
         HOT, "[2 mK/m, 9 mK/m, 5 mK/m], [4 mK/m, 18 mK/m, 10 mK/m],\n        [8 mK/m, 20 mK/m, 30 mK/m]]"
     )
     assert text != SMALL
-    return run_monitored(resolve_monitor(write(tmp_path_factory.mktemp("noisy"), text)), backend, 3, silent)
+    return run_monitor(resolve_monitor(write(tmp_path_factory.mktemp("noisy"), text)), backend, 3, silent)
 
 
 # The correction

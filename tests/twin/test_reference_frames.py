@@ -7,9 +7,7 @@ from pathlib import Path
 import pytest
 
 import twin
-from twin.run.artefact import Table
 from twin.run.reference_frames import FRAMES, SCHEMA, described, frames_text
-from twin.run.result import LabResult
 from twin.run.run_folder import MANIFEST
 
 SOURCES = sorted(Path(twin.__file__).parent.rglob("*.py"))
@@ -31,7 +29,7 @@ def source(node):
 
 
 def test_every_writer_of_json_states_frames():
-    """A file's content is `described(...)`, a result's `document`, or a name that is assigned from one of these."""
+    """A file's content is `described(...)`, or a name that is assigned from it."""
     count = 0
     for path, call in calls("write_json"):
         name, data = (source(a) for a in call.args)
@@ -43,21 +41,20 @@ def test_every_writer_of_json_states_frames():
             source(n.value) for n in ast.walk(tree) if isinstance(n, ast.Assign) and source(n.targets[0]) == data
         ]
         said = [data, *assigned]
-        assert any(s.startswith("described(") or s.endswith(".document") for s in said), f"{path.name}: {name}"
+        assert any(s.startswith("described(") for s in said), f"{path.name}: {name}"
     assert count >= 4
 
 
 def test_every_kind_of_result_has_frames():
     kinds = set()
-    for path, call in calls("LabResult"):
-        first = call.args[0] if call.args else next(k.value for k in call.keywords if k.arg == "kind")
+    for path, call in calls("Procedure"):
+        first = call.args[0]
         assert isinstance(first, ast.Constant), path
         kinds.add(first.value)
     assert len(kinds) >= 8
     assert kinds <= set(FRAMES)
-    table = Table("t", "T", "", (), ())
     with pytest.raises(KeyError):
-        _ = LabResult("unheard-of", "", (), (), {}, table, ()).document
+        described("unheard-of", {})
 
 
 def test_every_data_file_beside_the_report_has_frames():

@@ -16,8 +16,8 @@ from analysis.orbit.planes import PlaneFit
 from optics.geometry.pose import about_axis
 from optics.numerics.backend import load_backend
 from scenes.specs.orbit_angle import LINES
+from tests.validation.undrawn import undrawn
 from twin.orbit.angle import angle_flight as flight_module
-from twin.run.svg import undrawn
 from twin.validation.checks.check import VERDICTS
 from twin.validation.checks.group import Context
 from twin.validation.paper_000 import equations_000, figures, uses

@@ -17,10 +17,10 @@ from analysis.orbit import stepwise as stepwise_module
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.third_difference import third_difference
 from optics.numerics.backend import load_backend
+from tests.validation.undrawn import undrawn
 from twin.orbit.calibration import schemes as calibration_schemes
 from twin.orbit.calibration.latitude import fitted
 from twin.orbit.ground.grid import stream
-from twin.run.svg import undrawn
 from twin.validation import registry
 from twin.validation.paper_003 import exact, flights, model, rendered, stability
 from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_light

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.numerics.backend import load_backend
-from twin.run.svg import undrawn
+from tests.validation.undrawn import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
 from twin.validation.paper_000 import figures, suppositions, table1
 from twin.validation.paper_000.equations_000 import derivatives, least_slopes, numerical_derivatives, sum_of_squares

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optics.numerics.backend import load_backend
-from twin.run.svg import undrawn
+from tests.validation.undrawn import undrawn
 from twin.validation import registry
 from twin.validation.checks.check import AGREED, CORRECTED, FAILED, NOT_CHECKABLE, UNDECIDED
 from twin.validation.paper_003 import fields, flights, model

@@ -7,7 +7,7 @@ from analysis.monitor import monitoring
 from analysis.spots.spot_positions import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
-from twin.run.svg import undrawn
+from tests.validation.undrawn import undrawn
 from twin.validation.checks.check import CONFIRMED, CORRECTED, FAILED, REFUTED
 from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges import GROUP, ranges_group

@@ -31,7 +31,7 @@ from optics.waves.transfer import TransferTable, transfer
 from scenes.models.camera_assembly import ROOT, build_camera_under_test
 from scenes.specs.lab_setup import DistortionSetup
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.run.result import BenchError
+from twin.run.procedure import Advance, BenchError, silent
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 
@@ -184,8 +184,6 @@ def _width(image: Disk | Polygon) -> float:
     return high - low
 
 
-Advance = Callable[[str, int, int], None]
-
 LEAST_WIDTH = 2.0
 """Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001 of
 a pixel.
@@ -200,10 +198,6 @@ BLUR = 3.0
 
 _BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
 """Numbers of the seed's random streams; those below belong to the turntable."""
-
-
-def silent(part: str, done: int, total: int) -> None:
-    """Tell nobody."""
 
 
 @dataclass(frozen=True, eq=False)

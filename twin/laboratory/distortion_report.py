@@ -1,4 +1,4 @@
-"""What a distortion test gives: distortion.json, the main table, figures, the report."""
+"""Report of a distortion test: the main table, figures, sections."""
 
 from __future__ import annotations
 
@@ -10,126 +10,16 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from analysis.spots.centroid import mean_frames
-from analysis.turntable.chauvenet import rejection_rate
 from analysis.units import ARCSEC
-from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.lab_setup import DistortionSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory import printed_004
-from twin.laboratory.distortion_bench import Advance, DistortionBench, silent
-from twin.laboratory.distortion_run import DistortionRun, measure, rms
+from twin.laboratory.distortion_numbers import distortion_numbers
+from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.run.artefact import Cell, SvgFigure, Table
-from twin.run.result import LabResult, Section
+from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
-
-
-def to_dict(run: DistortionRun) -> dict[str, Any]:
-    """distortion.json: every number in the unit that its key ends in."""
-    fit, smooth = run.compensated.fit, run.compensated.smooth
-    names = ("principal_distance", "principal_point")
-    f, p = (fit.terms.index(name) for name in names)
-    return {
-        "name": run.setup.test.name,
-        "seed": run.seed,
-        "principal_distance_mm": 1e3 * fit.value(names[0]),
-        "principal_distance_mm_sigma": 1e3 * fit.sigma(names[0]),
-        "principal_point_mm": 1e3 * fit.value(names[1]),
-        "principal_point_mm_sigma": 1e3 * fit.sigma(names[1]),
-        "correlation": float(fit.correlation[f, p]),
-        "principal_point_observable": bool(fit.point.observable),
-        "principal_point_statement": fit.point.statement,
-        "rms_raw_um": 1e6 * rms(run.raw.smooth.residual),
-        "rms_compensated_um": 1e6 * rms(smooth.residual),
-        "zero_arcsec": run.compensated.zero / ARCSEC,
-        "points": _points(run),
-        "radial3_mm": 1e3 * smooth.value("radial3"),
-        "radial3_mm_sigma": 1e3 * smooth.sigma("radial3"),
-        "correlations": {"terms": list(smooth.terms), "matrix": smooth.correlation.tolist()},
-        "estimates": {
-            name: {
-                "principal_distance_mm": 1e3 * e.f,
-                "principal_distance_mm_sigma": None if e.f_sigma is None else 1e3 * e.f_sigma,
-                "principal_point_mm": 1e3 * e.p,
-                "principal_point_mm_sigma": None if e.p_sigma is None else 1e3 * e.p_sigma,
-                "distortion_rms_um": 1e6 * e.rms,
-            }
-            for name, e in run.estimates.items()
-        },
-        "noise": {
-            "centroid_um": 1e6 * rms(run.spots.temporal),
-            "centroid_columns_um": 1e6 * rms(run.spots.fixed),
-            "exposure_um": 1e6 * run.means.scatter,
-            "white_raw_um": 1e6 * run.raw.white,
-            "white_compensated_um": 1e6 * run.compensated.white,
-            "rejected": int(np.sum(~run.means.keep)),
-            "rejected_expected_of_good": rejection_rate(run.means.keep.shape[1]) * run.means.keep.size,
-        },
-        "compensation": {
-            "fit": run.compensation.fit.name,
-            "repeatability_arcsec": run.compensation.repeatability / ARCSEC,
-            "common_arcsec": run.compensation.common / ARCSEC,
-            "smooth_arcsec": run.compensation.smooth / ARCSEC,
-            "white_arcsec": run.compensation.white / ARCSEC,
-        },
-        "truth": _truth(run),
-    }
-
-
-def _truth(run: DistortionRun) -> dict[str, Any]:
-    exact = run.true_fit()
-    raw, compensated = (rms(run.error(measured)) for measured in (run.raw, run.compensated))
-    left = run.bench.true_offset - run.bench.design_offset
-    return {
-        "principal_distance_mm": 1e3 * exact.value("principal_distance"),
-        "principal_point_mm": 1e3 * exact.value("principal_point"),
-        "zero_arcsec": run.truth.zero / ARCSEC,
-        "axis_tilt_arcsec": (run.truth.axis[1:] / run.truth.axis[0] / ARCSEC).tolist(),
-        "distortion_um": (1e6 * run.true_distortion).tolist(),
-        "error_rms_raw_um": 1e6 * raw,
-        "error_rms_compensated_um": 1e6 * compensated,
-        "reduction": 1.0 - compensated / raw,
-        "principal_distance_error_sigma": (
-            (run.compensated.fit.value("principal_distance") - exact.value("principal_distance"))
-            / run.compensated.fit.sigma("principal_distance")
-        ),
-        "gross_errors": int(np.sum(run.truth.gross)),
-        "gross_errors_kept": int(np.sum(run.truth.gross & run.means.keep)),
-        "row_smile_um": 1e6 * float(np.ptp(run.truth.place[..., 1])),
-        "estimates": {
-            name: {
-                "principal_distance_mm": 1e3 * e.f_true,
-                "principal_point_mm": 1e3 * e.p_true,
-                "distortion_error_rms_um": 1e6 * e.error,
-            }
-            for name, e in run.estimates.items()
-        },
-        "centroid_minus_chief_ray_left_um": (1e6 * left).tolist(),
-    }
-
-
-def _points(run: DistortionRun) -> list[dict[str, Any]]:
-    raw, own = run.raw, run.compensated
-    columns = {
-        "reading_deg": np.degrees(run.means.mean(run.record.reading)),
-        "field_deg": np.degrees(own.fit.angle),
-        "position_mm": 1e3 * own.fit.position,
-        "distortion_raw_um": 1e6 * raw.distortion,
-        "distortion_compensated_um": 1e6 * own.distortion,
-        "sigma_raw_um": 1e6 * raw.sigma,
-        "sigma_um": 1e6 * own.sigma,
-        "residual_raw_um": 1e6 * raw.smooth.residual,
-        "residual_compensated_um": 1e6 * own.smooth.residual,
-        "rms_over_sets_raw_um": 1e6 * raw.rms_over_sets,
-        "rms_over_sets_compensated_um": 1e6 * own.rms_over_sets,
-    }
-    kept = run.means.keep.sum(axis=1)
-    return [
-        {"point": i + 1, **{name: float(values[i]) for name, values in columns.items()}, "sets_kept": int(kept[i])}
-        for i in range(len(kept))
-    ]
-
 
 RAW, COMPENSATED = "angles as read", "compensated angles"
 
@@ -231,26 +121,15 @@ SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
 
 
-def run_distortion(setup: DistortionSetup, backend: Backend, seed: int, advance: Advance = silent) -> LabResult:
-    """``python -m twin.lab distortion``.
-
-    Raises:
-        InputError: ``as_built`` names what the camera does not have.
-        BenchError: the test cannot be carried out or measured as its file says.
-    """
-    return lab_result(measure(DistortionBench.build(setup, backend, advance), seed, advance))
-
-
-def lab_result(run: DistortionRun) -> LabResult:
-    """The test as the command gives it."""
-    data = to_dict(run)
+def distortion_report(run: DistortionRun) -> Report:
+    """Report of a distortion test."""
+    data = distortion_numbers(run)
     truth, test = data["truth"], run.setup.test
     fit = run.compensated.fit
     count, sets = run.record.reading.shape
     numbers = np.linspace(0, count - 1, SHOWN).astype(int)
     width = run.bench.images.width
-    return LabResult(
-        kind="distortion",
+    return Report(
         title="Interior orientation and distortion",
         lead=(
             f"Principal distance {data['principal_distance_mm']:.3f} ± {data['principal_distance_mm_sigma']:.3f} mm "
@@ -277,7 +156,6 @@ def lab_result(run: DistortionRun) -> LabResult:
                 f"over {truth['row_smile_um']:.0f} µm: smile of the mapping and tilt of the axis",
             ),
         ),
-        data=data,
         summary=_summary(data),
         sections=(_curve(run), _compensation(run), _estimates(run), _noise(run, data)),
         images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),

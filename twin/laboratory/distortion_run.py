@@ -29,10 +29,11 @@ from analysis.orientation.measurement import (
 from analysis.spots.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
+from optics.numerics.backend import Backend
 from scenes.specs.lab_setup import DistortionSetup
-from twin.laboratory.distortion_bench import Advance, DistortionBench, DistortionRecord, DistortionTruth, silent
+from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.run.result import BenchError
+from twin.run.procedure import Advance, BenchError, silent
 
 Array = NDArray[np.float64]
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
@@ -220,3 +221,13 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> Spots:
             raise BenchError(problem, ("window",), "a larger window") from error
         remedy = "less light: 30 to 80 percent is good" if "saturated" in reason else "more light or more frames"
         raise BenchError(problem, ("light",), remedy) from error
+
+
+def run_distortion(setup: DistortionSetup, backend: Backend, seed: int, advance: Advance = silent) -> DistortionRun:
+    """``python -m twin.lab distortion``.
+
+    Raises:
+        InputError: ``as_built`` names what the camera does not have.
+        BenchError: the test cannot be carried out or measured as its file says.
+    """
+    return measure(DistortionBench.build(setup, backend, advance), seed, advance)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,11 @@ import numpy as np
 from analysis.focal_plane.plane_fit import FocalPlaneFit, LineLevel, RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import Mount, ShimError, ShimPlan, shim_plan
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from twin.laboratory.focus_bench import FocusBench
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from optics.targets.collimator import TooNarrowError
+from twin.laboratory.focus_bench import BudgetLine, FocusBench
 from twin.laboratory.focus_scan import (
     VERTEX_ERROR,
     VERTEX_TREND,
@@ -27,11 +32,12 @@ from twin.laboratory.focus_scan import (
     in_focus,
     scan,
 )
-from twin.run.result import Advance, BenchError, silent
+from twin.run.procedure import Advance, BenchError, silent
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
     from scenes.specs.focus_test import FocusTestSpec
+    from scenes.specs.lab_setup import FocusSetup
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
 
@@ -94,6 +100,11 @@ class Alignment:
     states: tuple[State, ...]
     shimmings: tuple[Shimming, ...]
 
+    @cached_property
+    def budget(self) -> tuple[BudgetLine, ...]:
+        """What makes the MTF, as `FocusBench.budget` traces it."""
+        return self.bench.budget()
+
     def true_plane(self, number: int) -> np.ndarray:
         """What ``shimmings[number].plane`` should have been: piston and slopes (3,) of the true defocus with the same
         weights.
@@ -103,6 +114,37 @@ class Alignment:
         design = np.column_stack([np.ones(len(weight)), plane.place]) * weight[:, None]
         terms, *_ = np.linalg.lstsq(design, -self.states[number].true_defocus * weight, rcond=None)
         return np.asarray(terms)
+
+
+def run_focus(setup: FocusSetup, backend: Backend, seed: int, advance: Advance = silent) -> Alignment:
+    """Build the bench and align: ``python -m twin.lab focus``.
+
+    Raises:
+        InputError: the camera cannot be built as the file says.
+        BenchError: what the file asks for cannot be done.
+    """
+    mount_of(setup.test)
+    try:
+        bench = FocusBench(setup, backend, advance)
+    except TooNarrowError as error:
+        raise BenchError(str(error), ("collimator", "aperture"), "a wider collimator") from error
+    except (AimError, BeamMissedError, ValueError) as error:
+        raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
+    _check_light(bench)
+    return align(bench, seed, advance)
+
+
+def _check_light(bench: FocusBench) -> None:
+    """BenchError when the bright side of the edge would saturate, which would falsify its MTF."""
+    most = {name: ccd.largest_white for name, ccd in bench.ccds.items()}
+    name = min(most, key=lambda n: most[n])
+    white = bench.setup.test.white
+    if white > most[name]:
+        raise BenchError(
+            f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}",
+            ("white",),
+            f"{np.floor(100 * most[name]):.0f} percent or less",
+        )
 
 
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:

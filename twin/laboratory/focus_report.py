@@ -1,167 +1,27 @@
-"""What a focal-plane alignment gives: focus.json, the main table, the report."""
+"""Report of a focal-plane alignment: the main table, sections."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from analysis.units import ARCSEC
-from optics.geometry.pose import rotation_vector
-from optics.numerics.backend import Backend
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
-from optics.targets.collimator import TooNarrowError
-from twin.laboratory.focus_alignment import Alignment, Shimming, State, align, mount_of
-from twin.laboratory.focus_bench import FocusBench
+from analysis.units import ARCMIN
+from twin.laboratory.focus_alignment import Alignment
 from twin.laboratory.focus_figures import defocus_svg, edges_svg, mtf_svg, through_focus_svg
-from twin.laboratory.focus_scan import VERTEX_ERROR
+from twin.laboratory.focus_numbers import UM, focus_numbers
 from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.run.artefact import SvgFigure, Table, fixed
-from twin.run.result import Advance, BenchError, LabResult, Section
+from twin.run.report import Report, Section
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
-if TYPE_CHECKING:
-    from scenes.specs.lab_setup import FocusSetup
 
-
-ARCMIN = 60.0 * ARCSEC
-UM = 1e6
-
-
-def to_dict(alignment: Alignment) -> dict[str, Any]:
-    """focus.json."""
-    states, shimmings = alignment.states, alignment.shimmings
-    return {
-        "camera": alignment.bench.setup.camera.name,
-        "seed": alignment.seed,
-        "initial": _state(alignment, states[0]),
-        "rounds": [
-            {**_state(alignment, after), **_shims(done)} for after, done in zip(states[1:], shimmings, strict=True)
-        ],
-        "mtf_budget": [
-            {"band": line.band, "direction": line.edge, "factors": dict(line.factors), "total": line.total}
-            for line in alignment.bench.budget()
-        ],
-        "truth": {
-            "initial": _truth(alignment, states[0]),
-            "rounds": [_truth(alignment, state) for state in states[1:]],
-        },
-    }
-
-
-def _state(alignment: Alignment, state: State) -> dict[str, Any]:
-    out: dict[str, Any] = {
-        "confocal_um_max": UM * float(np.max(np.abs(state.defocus))),
-        "confocal_um_sigma": UM * float(np.hypot(np.max(state.defocus_sigma), VERTEX_ERROR)),
-        "line_level_arcmin": state.level.angle / ARCMIN,
-        "line_level_arcmin_sigma": state.level.sigma / ARCMIN,
-        "sites": [
-            {
-                "band": site.band,
-                "field": site.field,
-                "defocus_um": UM * float(defocus),
-                "defocus_um_sigma": UM * float(sigma),
-            }
-            for site, defocus, sigma in zip(alignment.bench.sites, state.defocus, state.defocus_sigma, strict=True)
-        ],
-    }
-    if state.focus:
-        for edge, key in ((TRACK, "mtf_nyquist"), (ALONG, "mtf_nyquist_along_line")):
-            values = {band: _mean_mtf(alignment, state, band, edge) for band in alignment.bench.ccds}
-            out[key] = {band: value for band, (value, _) in values.items()}
-            out[f"{key}_sigma"] = {band: sigma for band, (_, sigma) in values.items()}
-    return out
-
-
-def _mean_mtf(alignment: Alignment, state: State, band: str, edge: str) -> tuple[float, float]:
-    """Mean over the fields of the measured MTF at Nyquist, and its sigma."""
-    pairs = [f.by_edge[edge] for f, s in zip(state.focus, alignment.bench.sites, strict=True) if s.band == band]
-    values, sigmas = np.array(pairs).T
-    return float(np.mean(values)), float(np.sqrt(np.sum(sigmas**2)) / len(sigmas))
-
-
-def _shims(shimming: Shimming) -> dict[str, Any]:
-    plane, plan = shimming.plane, shimming.plan
-    assert plan.thickness is not None
-    names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
-    piston, slope_x, slope_y = np.sqrt(np.diag(shimming.covariance))
-    return {
-        # whole steps of the workshop; beyond picometres there is only rounding
-        "shims_um": {n: round(UM * float(t), 6) for n, t in zip(names, plan.thickness, strict=True)},
-        "shim_changes_um": {n: round(UM * float(t), 6) for n, t in zip(names, plan.rounded_change, strict=True)},
-        "slides_mm": {n: [1e3 * float(x) for x in s] for n, s in zip(names, plan.slide, strict=True)},
-        "turn_by_hand_arcmin": plan.turn / ARCMIN,
-        "line_level_without_turn_arcmin": plan.level_coupling / ARCMIN,
-        "correction": {
-            "rotation_arcmin": [float(v) / ARCMIN for v in plan.wanted.rotation],
-            "shift_um": [UM * float(v) for v in plan.wanted.shift],
-            "piston_um_sigma": UM * float(piston),
-            "slope_x_arcsec_sigma": float(slope_x) / ARCSEC,
-            "slope_y_arcsec_sigma": float(slope_y) / ARCSEC,
-        },
-        "chips_um_rms": UM * plane.extra_sigma,
-    }
-
-
-def _truth(alignment: Alignment, state: State) -> dict[str, Any]:
-    bench, standing = alignment.bench, state.standing
-    mtf = {}
-    for band in bench.ccds:
-        values = [
-            s.imagers[TRACK].mtf(float(s.crossing(standing.pose, standing.heights[band])[2]), s.nyquist)
-            for s in bench.sites
-            if s.band == band
-        ]
-        mtf[band] = float(np.mean(values))
-    return {
-        "confocal_um_max": UM * float(np.max(np.abs(state.true_defocus))),
-        "line_level_arcmin": state.true_level / ARCMIN,
-        "mtf_nyquist": mtf,
-        "rotation_arcmin": [float(v) / ARCMIN for v in rotation_vector(standing.pose.rotation)],
-        "shift_um": [UM * float(v) for v in standing.pose.translation],
-        "chip_height_um": {band: UM * height for band, height in standing.heights.items()},
-        "defocus_um": [UM * float(v) for v in state.true_defocus],
-    }
-
-
-def run_focus(setup: FocusSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Build the bench, align, and put the result together.
-
-    Raises:
-        InputError: the camera cannot be built as the file says.
-        BenchError: what the file asks for cannot be done.
-    """
-    mount_of(setup.test)
-    try:
-        bench = FocusBench(setup, backend, advance)
-    except TooNarrowError as error:
-        raise BenchError(str(error), ("collimator", "aperture"), "a wider collimator") from error
-    except (AimError, BeamMissedError, ValueError) as error:
-        raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
-    _check_light(bench)
-    return focus_result(align(bench, seed, advance))
-
-
-def _check_light(bench: FocusBench) -> None:
-    """BenchError when the bright side of the edge would saturate, which would falsify its MTF."""
-    most = {name: ccd.largest_white for name, ccd in bench.ccds.items()}
-    name = min(most, key=lambda n: most[n])
-    white = bench.setup.test.white
-    if white > most[name]:
-        raise BenchError(
-            f"the bright side of the edge, {100 * white:g}% of the full well, saturates pixels of {name}",
-            ("white",),
-            f"{np.floor(100 * most[name]):.0f} percent or less",
-        )
-
-
-def focus_result(alignment: Alignment) -> LabResult:
-    """Numbers, table and report of an alignment."""
+def focus_report(alignment: Alignment) -> Report:
+    """Report of an alignment."""
     first, last = alignment.states[0], alignment.states[-1]
     bench = alignment.bench
-    data = to_dict(alignment)
+    data = focus_numbers(alignment)
     end = data["rounds"][-1]
     lead = (
         f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
@@ -175,12 +35,10 @@ def focus_result(alignment: Alignment) -> LabResult:
         for edge in DIRECTIONS
         for k in [bench.setup.test.fields.index(bench.sites[i].field) + 1]
     }
-    return LabResult(
-        "focus",
+    return Report(
         f"Focal-plane alignment of {bench.setup.camera.name}",
         lead,
         _facts(alignment),
-        data,
         _summary(data),
         (_alignment_section(alignment), _mtf_section(alignment, data), _shim_section(alignment)),
         images,

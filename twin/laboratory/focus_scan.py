@@ -14,7 +14,7 @@ from analysis.mtf.slanted_edge import measure_edge
 from optics.geometry.pose import Pose
 from optics.numerics.threads import cores, one_blas_thread
 from twin.laboratory.focus_bench import FocusBench, Site
-from twin.run.result import Advance, BenchError, silent
+from twin.run.procedure import Advance, BenchError, silent
 from twin.sensors.area_detector import FixedPattern
 from twin.targets.edge_images import ALONG, DIRECTIONS
 

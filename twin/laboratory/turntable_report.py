@@ -1,26 +1,22 @@
-"""What a turntable test gives: turntable.json, the main table, figures, the report."""
+"""Report of a turntable test: the main table, figures, sections."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.units import ARCSEC
-from optics.numerics.backend import Backend
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC
-from twin.laboratory.turntable_run import TurntableRun, run_turntable
+from twin.laboratory.turntable_numbers import turntable_numbers
+from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import SvgFigure, Table
-from twin.run.result import Advance, LabResult, Section
+from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
-
-if TYPE_CHECKING:
-    from scenes.specs.lab_setup import TurntableSetup
-
 
 FIT_NAMES = {
     "piecewise_linear": "piecewise linear",
@@ -149,7 +145,7 @@ def _finish(*panels: Axes) -> None:
 
 def sections(run: TurntableRun) -> tuple[Section, ...]:
     """Comparison, and fits."""
-    result = run.to_dict()
+    result = turntable_numbers(run)
     return _comparison(run, result), _fits(run, result)
 
 
@@ -260,14 +256,9 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     return Section("Fits of the dividing error", tuple(text), (curve, residuals, table))
 
 
-def run_turntable_test(setup: TurntableSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Calibrate a drawn turntable and put the result together; nothing is traced, so that the backend is not used."""
-    return turntable_result(run_turntable(setup.test, seed, lambda part: advance(part, 0, 1)))
-
-
-def turntable_result(run: TurntableRun) -> LabResult:
-    """Numbers, table and report of a turntable test."""
-    data = run.to_dict()
+def turntable_report(run: TurntableRun) -> Report:
+    """Report of a turntable test."""
+    data = turntable_numbers(run)
     plan = run.spec.calibration
     chosen = data["chosen"]
     held = data["fits"][chosen]["heldout_rms_arcsec"]
@@ -291,8 +282,7 @@ def turntable_result(run: TurntableRun) -> LabResult:
         )
         for name in data["ranking"]
     ]
-    return LabResult(
-        "turntable",
+    return Report(
         "Dividing error of the turntable",
         lead,
         (
@@ -303,7 +293,6 @@ def turntable_result(run: TurntableRun) -> LabResult:
             ),
             ("Description", run.spec.description),
         ),
-        data,
         Table(
             "dividing-error",
             "Result",

@@ -9,18 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
-from analysis.turntable.chauvenet import rejection_rate
 from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
-from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
+from scenes.specs.lab_setup import TurntableSetup
 from scenes.specs.turntable_test import TurntableTestSpec
 from twin.laboratory.turntable_bench import TurntableModel
+from twin.run.procedure import Advance, silent
 
 Array = NDArray[np.float64]
 TRUTH_READINGS = 4000
@@ -63,7 +63,7 @@ class TurntableRun:
     @cached_property
     def ranking(self) -> tuple[str, ...]:
         """Names of the fits by their RMS at the held-out readings, the best first."""
-        return tuple(sorted(self.fits, key=lambda name: _rms(self.held_out_residual(name))))
+        return tuple(sorted(self.fits, key=lambda name: rms(self.held_out_residual(name))))
 
     @cached_property
     def truth_readings(self) -> Array:
@@ -76,58 +76,6 @@ class TurntableRun:
     def true_error(self) -> Array:
         """True dividing error at `truth_readings`, radians."""
         return self.model.error(self.truth_readings)
-
-    def to_dict(self) -> dict[str, Any]:
-        """turntable.json: every number in the unit that its key ends in."""
-        series, held = self.series, self.held_out
-        fits = {}
-        for name, fit in self.fits.items():
-            validation = self.choice[name].validation
-            assert validation is not None
-            fits[name] = {
-                "heldout_rms_arcsec": _rms(self.held_out_residual(name)) / ARCSEC,
-                "train_rms_arcsec": _rms(series.mean - fit(series.angle)) / ARCSEC,
-                "cross_validation_rms_arcsec": validation.rms / ARCSEC,
-                "effective_parameters": fit.effective_parameters,
-                "settings": dict(fit.settings),
-            }
-        compensation = self.compensation
-        return {
-            "name": self.spec.name,
-            "seed": self.model.seed,
-            "repeat_rms_arcsec": float(np.max(series.rms_before)) / ARCSEC,
-            "chauvenet_rms_arcsec": float(np.max(series.rms_after)) / ARCSEC,
-            "averaging_alone_rms_arcsec": series.averaging_alone / ARCSEC,
-            "mean_rms_arcsec": series.mean_rms / ARCSEC,
-            "repeatability_arcsec": series.repeatability / ARCSEC,
-            "rejected": series.rejected,
-            "rejected_expected_of_good": rejection_rate(series.repeats) * series.comparisons.size,
-            "suspect_angles": int(np.sum(series.suspect)),
-            "heldout_sigma_arcsec": _rms(held.sigma) / ARCSEC,
-            "fits": fits,
-            "failed": {trial.name: trial.failure for trial in self.choice.trials if trial.fit is None},
-            "chosen": self.choice.chosen,
-            "ranking": list(self.ranking),
-            "compensation": {
-                "common_arcsec": compensation.common / ARCSEC,
-                "smooth_arcsec": compensation.smooth / ARCSEC,
-                "white_arcsec": compensation.white / ARCSEC,
-            },
-            "points": _points(series, self.fits),
-            "heldout_points": _points(held, self.fits),
-            "truth": self._truth(),
-        }
-
-    def _truth(self) -> dict[str, Any]:
-        fits = {}
-        for name, fit in self.fits.items():
-            left = fit(self.truth_readings) - self.true_error
-            fits[name] = {"true_rms_arcsec": _rms(left) / ARCSEC, "true_spread_arcsec": float(np.std(left)) / ARCSEC}
-        return {
-            "fits": fits,
-            "dividing_error_spread_arcsec": float(np.std(self.true_error)) / ARCSEC,
-            "part_rms_full_circle_arcsec": {name: p.rms / ARCSEC for name, p in self.model.error.parts.items()},
-        }
 
 
 def run_turntable(
@@ -167,23 +115,11 @@ def run_turntable(
         return TurntableRun(model, series, held_out, choice, compensate(series, choice, held_out))
 
 
-def _rms(value: Array) -> float:
+def rms(value: Array) -> float:
+    """Root of the mean square."""
     return float(np.sqrt(np.mean(value**2)))
 
 
-def _points(series: CalibrationSeries, fits: dict[str, AngleFit]) -> list[dict[str, Any]]:
-    """One entry for each angle, for figures of one's own."""
-    fitted = {name: fit(series.angle) / ARCSEC for name, fit in fits.items()}
-    return [
-        {
-            "reading_deg": float(np.degrees(series.angle[i])),
-            "mean_arcsec": float(series.mean[i]) / ARCSEC,
-            "sigma_arcsec": float(series.sigma[i]) / ARCSEC,
-            "rms_before_arcsec": float(series.rms_before[i]) / ARCSEC,
-            "rms_after_arcsec": float(series.rms_after[i]) / ARCSEC,
-            "comparisons_arcsec": (series.comparisons[i] / ARCSEC).tolist(),
-            "kept": series.keep[i].tolist(),
-            "fitted_arcsec": {name: float(values[i]) for name, values in fitted.items()},
-        }
-        for i in range(len(series.angle))
-    ]
+def run_turntable_test(setup: TurntableSetup, backend: Backend, seed: int, advance: Advance = silent) -> TurntableRun:
+    """``python -m twin.lab turntable``; nothing is traced, so that the backend is not used. Raises InputError."""
+    return run_turntable(setup.test, seed, lambda part: advance(part, 0, 1))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import typer
 
-from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
-from twin.orbit.angle.angle_report import run_angle
-from twin.orbit.calibration.calibration_report import run_calibration
-from twin.orbit.images.simulate_report import run_simulation
-from twin.orbit.monitoring.monitoring_report import run_monitor
+from twin.orbit.angle.angle_numbers import ANGLE
+from twin.orbit.angle.angle_report import angle_report
+from twin.orbit.calibration.calibration_numbers import CALIBRATION
+from twin.orbit.calibration.calibration_report import calibration_report
+from twin.orbit.images.simulate_numbers import SIMULATE
+from twin.orbit.images.simulate_report import simulation_report
+from twin.orbit.monitoring.monitoring_numbers import MONITOR
+from twin.orbit.monitoring.monitoring_report import monitor_report
 from twin.run.command import add_test
 
 PROGRAM = "twin.orbit"
@@ -33,8 +36,8 @@ add_test(
     app,
     PROGRAM,
     "angle",
-    resolve_angle,
-    run_angle,
+    ANGLE,
+    angle_report,
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
 
@@ -47,8 +50,8 @@ add_test(
     app,
     PROGRAM,
     "calibrate",
-    resolve_calibration,
-    run_calibration,
+    CALIBRATION,
+    calibration_report,
     """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
     parameters tested on all fields without ground control (paper 003).
 
@@ -61,8 +64,8 @@ add_test(
     app,
     PROGRAM,
     "monitor",
-    resolve_monitor,
-    run_monitor,
+    MONITOR,
+    monitor_report,
     """Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
     monitor, heights as in papers 000 and 003).
 
@@ -75,8 +78,8 @@ add_test(
     app,
     PROGRAM,
     "simulate",
-    resolve_simulate,
-    run_simulation,
+    SIMULATE,
+    simulation_report,
     """Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from optics.numerics.backend import Backend, load_backend
+from optics.numerics.backend import load_backend
 from scenes.yaml.errors import InputError
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run.cli import (
@@ -27,8 +27,10 @@ from twin.run.cli import (
     print_whole,
     progress_columns,
 )
-from twin.run.page import RunFacts, cell_text, write_lab
-from twin.run.result import Advance, BenchError, LabResult
+from twin.run.page import RunFacts, cell_text, write_test
+from twin.run.procedure import BenchError, Procedure, Run
+from twin.run.reference_frames import described
+from twin.run.report import Report
 from twin.run.run_folder import RunFolder, chosen
 
 File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
@@ -67,8 +69,8 @@ def add_test(
     app: typer.Typer,
     program: str,
     command: str,
-    resolve: Callable[[Path], Any],
-    run: Callable[[Any, Backend, int, Advance], LabResult],
+    procedure: Procedure[Any, Run],
+    report: Callable[[Run], Report],
     about: str,
 ) -> None:
     """Add a test to a program as a subcommand with the options that all tests have.
@@ -77,8 +79,8 @@ def add_test(
         app: of the program.
         program: as the user calls it, ``twin.lab``.
         command: the subcommand, ``focus``.
-        resolve: as for `run_test`.
-        run: as for `run_test`.
+        procedure: the test.
+        report: of its run.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
     """
 
@@ -92,15 +94,15 @@ def add_test(
         as_json: AsJson = False,
         quiet: Quiet = False,
     ) -> None:
-        run_test(program, command, file, resolve, run, Options(out, seed, backend, force, as_json, quiet))
+        run_test(program, command, file, procedure, report, Options(out, seed, backend, force, as_json, quiet))
 
 
 def run_test(
     program: str,
     command: str,
     file: Path,
-    resolve: Callable[[Path], Any],
-    run: Callable[[Any, Backend, int, Advance], LabResult],
+    procedure: Procedure[Any, Run],
+    report: Callable[[Run], Report],
     options: Options,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
@@ -109,8 +111,8 @@ def run_test(
         program: as the user calls it, ``twin.lab``.
         command: its subcommand, ``focus``.
         file: of the test.
-        resolve: file -> set-up with ``test`` (which has a ``seed``), ``with_seed`` and ``to_yaml``.
-        run: set-up, backend, seed and progress -> result.
+        procedure: the test; ``test`` of its set-up has a ``seed``.
+        report: of its run.
         options: what the user chose.
 
     Raises:
@@ -119,7 +121,7 @@ def run_test(
     errors = Console(stderr=True)
     with explained(errors):
         check_backend(options.backend)
-        setup = resolve(file)
+        setup = procedure.resolve(file)
         number = setup.test.seed if options.seed is None else options.seed
         folder = RunFolder(chosen(options.out, file.stem), options.force)
         tracer = load_backend(options.backend)
@@ -138,18 +140,19 @@ def run_test(
                 bar.update(parts[part], completed=done, total=total)
 
             try:
-                result = run(setup, tracer, number, advance)
+                run = procedure.run(setup, tracer, number, advance)
             except BenchError as error:
                 raise _explained_at(setup.test, error) from error
+            numbers, shown = procedure.numbers(run), report(run)
             config = setup.with_seed(number).to_yaml()
             seconds = time.monotonic() - clock
             facts = RunFacts(config, str(file), tracer.name, number, started, seconds, program, command)
-            write_lab(result, facts, folder)
+            write_test(procedure.kind, numbers, shown, facts, folder)
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if options.as_json:
-            print_json(result.document)
+            print_json(described(procedure.kind, numbers))
         elif not options.quiet:
-            _print_result(result, folder.target)
+            _print_report(shown, folder.target)
 
 
 def _explained_at(test: Any, error: BenchError) -> InputError:
@@ -159,9 +162,9 @@ def _explained_at(test: Any, error: BenchError) -> InputError:
     return result
 
 
-def _print_result(result: LabResult, target: Path) -> None:
-    summary = result.summary
-    table = Table(title=result.title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+def _print_report(report: Report, target: Path) -> None:
+    summary = report.summary
+    table = Table(title=report.title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(head, justify="left" if text else "right", no_wrap=text)
@@ -169,8 +172,8 @@ def _print_result(result: LabResult, target: Path) -> None:
         table.add_row(*(cell_text(cell) for cell in row))
     console = Terminal()
     print_whole(console, table)
-    for line in result.lead:
+    for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    for warning in result.warnings:
+    for warning in report.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     print_place(console, target)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -11,7 +12,8 @@ from markupsafe import Markup
 
 from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, plain, significant
 from twin.run.data_files import preview_png, tiff
-from twin.run.result import LabResult
+from twin.run.reference_frames import described
+from twin.run.report import Report
 from twin.run.run_folder import MANIFEST, RunFolder
 from twin.run.versions import versions
 
@@ -91,22 +93,23 @@ def place(artefact: Artefact) -> str:
     return f"artefacts/{artefact.name}.{artefact.kind}"
 
 
-def render_report(result: LabResult, facts: RunFacts) -> str:
-    """``report.html`` as text."""
+def render_report(kind: str, report: Report, facts: RunFacts) -> str:
+    """``report.html`` as text; its numbers are in KIND.json."""
     options = f"--seed {facts.seed} --backend {facts.backend} --out again"
     return (
         environment(__package__)
         .get_template(TEMPLATE)
         .render(
-            result=result,
-            summary=artefact_content(result.summary, place(result.summary)),
+            kind=kind,
+            report=report,
+            summary=artefact_content(report.summary, place(report.summary)),
             sections=[
                 {
                     "title": section.title,
                     "text": section.text,
                     "artefacts": [artefact_content(a, place(a)) for a in section.artefacts],
                 }
-                for section in result.sections
+                for section in report.sections
             ],
             facts=facts,
             command=f"python -m {facts.program} {facts.command} config.yaml {options}",
@@ -115,25 +118,33 @@ def render_report(result: LabResult, facts: RunFacts) -> str:
     )
 
 
-def write_lab(result: LabResult, facts: RunFacts, folder: RunFolder) -> None:
-    """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest."""
+def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: RunFacts, folder: RunFolder) -> None:
+    """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest.
+
+    Args:
+        kind: of the test.
+        numbers: of its run; KIND.json gets them after their frames.
+        report: of the test.
+        facts: how it was run.
+        folder: open.
+    """
     folder.write_text("config.yaml", facts.config)
-    folder.write_json(f"{result.kind}.json", result.document)
-    for artefact in (result.summary, *(a for section in result.sections for a in section.artefacts)):
+    folder.write_json(f"{kind}.json", described(kind, numbers))
+    for artefact in (report.summary, *(a for section in report.sections for a in section.artefacts)):
         folder.write_bytes(place(artefact), artefact.content())
-    for name, frames in result.images.items():
+    for name, frames in report.images.items():
         folder.write_bytes(f"images/{name}.tiff", tiff(frames))
         folder.write_bytes(f"images/{name}.png", preview_png(frames, stretch=None))
-    folder.write_text("report.html", render_report(result, facts))
+    folder.write_text("report.html", render_report(kind, report, facts))
     manifest = {
         "program": facts.program,
-        "test": result.kind,
+        "test": kind,
         "versions": versions(),
         "backend": facts.backend,
         "seed": facts.seed,
         "started_unix_s": facts.started,
         "wall_time_s": facts.seconds,
-        "warnings": list(result.warnings),
+        "warnings": list(report.warnings),
         "sha256": folder.checksums(),
     }
     folder.write_json(MANIFEST, manifest)

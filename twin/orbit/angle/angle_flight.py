@@ -48,7 +48,7 @@ from twin.orbit.flight.line_camera import (
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
-from twin.run.result import BenchError
+from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_angle import OrbitAngleSpec

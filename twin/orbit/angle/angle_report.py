@@ -1,4 +1,4 @@
-"""What the intersection angle test gives: angle.json, the main table, the report."""
+"""Report of an intersection-angle test: lead, the main table, facts."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.units import ARCSEC
-from optics.numerics.backend import Backend
 from scenes.specs.job import DEFAULT_PIVOT, PerturbationSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.orbit.angle.angle_figures import signs
-from twin.orbit.angle.angle_run import AngleRun, run_passes, values_of
-from twin.orbit.angle.angle_sections import PRINTED_DIFFERENCE_ARCSEC, listed, sections, to_dict
+from twin.orbit.angle.angle_numbers import PRINTED_DIFFERENCE_ARCSEC
+from twin.orbit.angle.angle_run import AngleRun, values_of
+from twin.orbit.angle.angle_sections import listed, sections
 from twin.run.artefact import Cell, Table, fixed
-from twin.run.result import Advance, LabResult
+from twin.run.report import Report
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import AngleSetup
@@ -27,19 +27,12 @@ METHOD_NAMES = {
 }
 
 
-def run_angle(setup: AngleSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Simulate a pass and put the result together; the backend traces the lines of an instrument."""
-    return angle_result(run_passes(setup, seed, advance, backend), setup, seed)
-
-
-def angle_result(run: AngleRun, setup: AngleSetup, seed: int) -> LabResult:
-    """Numbers, table and report of an intersection angle test."""
-    return LabResult(
-        "angle",
+def angle_report(run: AngleRun) -> Report:
+    """Report of an intersection angle test."""
+    return Report(
         "Intersection angles from ground points",
         _lead(run),
-        _facts(setup),
-        to_dict(run, seed),
+        _facts(run.setup),
         _methods(run),
         sections(run),
         warnings=_warnings(run),

@@ -10,7 +10,7 @@ lines of sight onto straight lines.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -34,7 +34,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit_angle import PAPER_ANGLES
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.run.result import BenchError
+from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -143,6 +143,8 @@ class AngleRun:
     """A finished test.
 
     Attributes:
+        setup: what its file says.
+        seed: of all random numbers.
         flight: the truth.
         measurement: of the pass that is shown.
         estimate: from it.
@@ -155,6 +157,8 @@ class AngleRun:
         height: angle -> height error of one arcsecond, metres; None where the orbit is too short.
     """
 
+    setup: AngleSetup
+    seed: int
     flight: AnglePass
     measurement: Measurement
     estimate: Estimate
@@ -215,16 +219,14 @@ def values_of(angles: Mapping[str, float]) -> np.ndarray:
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
-def run_passes(
-    setup: AngleSetup, seed: int, advance: Callable[[str, int, int], None], backend: Backend | None = None
-) -> AngleRun:
-    """Fly, measure and estimate.
+def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:
+    """Fly, measure and estimate: ``python -m twin.orbit angle``.
 
     Args:
         setup: the test and its camera.
+        backend: where to trace an instrument; a payload needs none.
         seed: of all random numbers.
         advance: told of the progress.
-        backend: where to trace an instrument; a payload needs none.
 
     Raises:
         InputError: an instrument's changes are not possible.
@@ -261,6 +263,8 @@ def run_passes(
         third = Scatter(np.array([a.values for a in alongs]), np.mean([a.covariance for a in alongs], axis=0), along)
         common = centred(measurement, estimate.resection)
         return AngleRun(
+            setup,
+            seed,
             flight,
             measurement,
             estimate,

@@ -1,32 +1,27 @@
-"""What an in-orbit calibration gives: calibration.json, the main table, the report."""
+"""Report of an in-orbit calibration: lead, the main table, facts."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from analysis.units import ARCSEC
-from optics.numerics.backend import Backend
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.calibration_json import meets, to_dict, unit
-from twin.orbit.calibration.calibration_run import CalibrationRun, run_calibration_passes
+from twin.orbit.calibration.calibration_numbers import meets, unit
+from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.calibration_sections import bought, gained, said, scheme_names, sections
 from twin.orbit.calibration.influences import SURPRISE
 from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.schemes import values_of
 from twin.run.artefact import Cell, Table
-from twin.run.result import Advance, LabResult
+from twin.run.report import Report
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup
 
 
-def run_calibration(setup: CalibrationSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Simulate the passes and put the result together; nothing is traced, so that the backend is not used."""
-    return calibration_result(run_calibration_passes(setup, seed, advance), setup, seed)
-
-
-def calibration_result(run: CalibrationRun, setup: CalibrationSetup, seed: int) -> LabResult:
-    """Numbers, table and report of a calibration."""
+def calibration_report(run: CalibrationRun) -> Report:
+    """Report of a calibration."""
+    setup = run.setup
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
     good = [k for k, errors in run.schemes.items() if meets(errors, limits.plan, limits.height)]
@@ -39,12 +34,10 @@ def calibration_result(run: CalibrationRun, setup: CalibrationSetup, seed: int) 
         *(() if run.monitoring is None else (bought(run.monitoring),)),
         *(() if run.strips is None else (gained(run.schemes, run.strips),)),
     )
-    return LabResult(
-        "calibration",
+    return Report(
         "Calibration in orbit over test fields",
         lead,
         _facts(setup),
-        to_dict(run, seed),
         _summary(run),
         sections(run),
         warnings=_warnings(run),

@@ -43,9 +43,10 @@ from twin.orbit.calibration.schemes import (
 )
 from twin.orbit.calibration.screening import screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
-from twin.run.result import Advance, BenchError
+from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
     from scenes.specs.orbit_setup import CalibrationSetup
 
 STEPWISE_TOLERANCE = 1e-3
@@ -72,6 +73,8 @@ class CalibrationRun:
     """All that was computed.
 
     Attributes:
+        setup: what its file says.
+        seed: of all random numbers.
         campaign: truth and measurements.
         together: simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it,
             the drift of the biases during the passes.
@@ -90,6 +93,8 @@ class CalibrationRun:
         strips: passes adjusted on tie points; None for none.
     """
 
+    setup: CalibrationSetup
+    seed: int
     campaign: Campaign
     together: Adjustment
     truth: np.ndarray
@@ -108,14 +113,16 @@ class CalibrationRun:
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
-def run_calibration_passes(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun:
-    """Fly, calibrate, test.
+def run_calibration(
+    setup: CalibrationSetup, backend: Backend | None, seed: int, advance: Advance = silent
+) -> CalibrationRun:
+    """Fly, calibrate, test: ``python -m twin.orbit calibrate``; nothing is traced, so that the backend is not used.
 
     Raises:
         BenchError: the orbit, the points or the adjustment do not allow it.
     """
     try:
-        return _run(setup, np.random.SeedSequence(seed), advance)
+        return _run(setup, seed, advance)
     except RankError as error:
         remedy = "a field with width and length, and more points"
         raise BenchError(str(error), ("points",), remedy) from error
@@ -123,10 +130,10 @@ def run_calibration_passes(setup: CalibrationSetup, seed: int, advance: Advance)
         raise BenchError(str(error), ("errors",), "errors that an adjustment can take, and more points") from error
 
 
-def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> CalibrationRun:
+def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun:
     parts = 6 + len(setup.test.fields)
     advance("calibration", 0, parts)
-    shown, others = seed.spawn(2)
+    shown, others = np.random.SeedSequence(seed).spawn(2)
     campaign = fly_fields(setup, shown, advance)
     if campaign.images is not None:
         campaign = screened(campaign)
@@ -150,6 +157,8 @@ def _run(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance
     datum = datum_rows(campaign)
     advance("calibration", parts, parts)
     return CalibrationRun(
+        setup,
+        seed,
         campaign,
         together,
         true_values(campaign, together.names),

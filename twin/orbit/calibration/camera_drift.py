@@ -23,7 +23,7 @@ from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields, rea
 from twin.orbit.calibration.influences import simultaneous
 from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import GAUGE, averaged, calibrated_alone, schemes_tested, tested
-from twin.run.result import Advance
+from twin.run.procedure import Advance
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup

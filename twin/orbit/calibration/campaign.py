@@ -31,7 +31,7 @@ from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
 from twin.orbit.ground.grid import stream
-from twin.run.result import Advance, BenchError, silent
+from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec

@@ -22,7 +22,7 @@ from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPo
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import Patch, PatchError, fly_patch, imaged_lines
 from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
-from twin.run.result import Advance, BenchError
+from twin.run.procedure import Advance, BenchError
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_calibration import CalibrationImagesSpec, FieldSpec, PatchPlaceSpec

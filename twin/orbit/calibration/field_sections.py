@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from analysis.orbit.three_line_model import BIAS
@@ -11,15 +9,16 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_figures import drawn
+from twin.orbit.calibration.calibration_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import BEYOND, FieldImages
 from twin.orbit.calibration.influences import INNER, OFFSET, SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
-from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS, LineJudgement
+from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS
 from twin.orbit.images.point_report import drawn_points
 from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
-from twin.run.result import Section
+from twin.run.report import Section
 
 
 def fields_section(run: CalibrationRun) -> Section:
@@ -172,7 +171,7 @@ def images_section(campaign: Campaign) -> Section:
     assert campaign.images is not None
     assert campaign.spec.images is not None
     spec = campaign.spec.images
-    total = image_totals(campaign)
+    total = ImageTotals.of(campaign.images)
     matching = _matching(campaign.images)
     rows: list[tuple[Cell, ...]] = []
     for one in campaign.images:
@@ -211,13 +210,13 @@ def images_section(campaign: Campaign) -> Section:
     counts = [len(p.control_ground[p.control.control]) for p in campaign.passes]
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total['found']} places that matching found, {total['wrong_found']} are wrong "
-        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on fields that look different in the "
-        f"orthophoto; thresholds of the matching leave {total['wrong_matched']} of {total['matched']}, the "
-        f"neighbours' agreement {total['wrong_accepted']} of {total['accepted']}, the adjustment "
-        f"{total['wrong_left']} of {total['left']} image points ({total['check_left']} check points: "
-        f"{total['wrong_check_left']}). The neighbours' test costs {total['right_rejected_by_consensus']} right ones, "
-        f"the adjustment {total['right_rejected_by_adjustment']}.",
+        f"Of {total.found} places that matching found, {total.wrong_found} are wrong "
+        f"({100.0 * total.wrong_found / total.found:.1f}%), mostly on fields that look different in the "
+        f"orthophoto; thresholds of the matching leave {total.wrong_matched} of {total.matched}, the "
+        f"neighbours' agreement {total.wrong_accepted} of {total.accepted}, the adjustment "
+        f"{total.wrong_left} of {total.left} image points ({total.check_left} check points: "
+        f"{total.wrong_check_left}). The neighbours' test costs {total.right_rejected_by_consensus} right ones, "
+        f"the adjustment {total.right_rejected_by_adjustment}.",
         f"{' and '.join(str(c) for c in counts)} control points are left. Their image points weigh by the covariances "
         f"of the matching and {BEYOND:g} px beyond them, for what no fit shows. Matches of the three "
         "lines with one piece of the orthophoto err alike, by its noise and its "
@@ -240,40 +239,17 @@ def images_section(campaign: Campaign) -> Section:
     return Section("Points in images", text, (matching, screened, *figures))
 
 
-def image_totals(campaign: Campaign) -> dict[str, int]:
-    """Counts over all fields and lines; wrong by truth."""
-    assert campaign.images is not None
-    every = [j for one in campaign.images for _, j in _judgements(one)]
-    names = ("found", "matched", "accepted", "wrong_found", "wrong_matched", "wrong_accepted")
-    out = {name: sum(getattr(j, name) for j in every) for name in names}
-    out["right_rejected_by_consensus"] = sum(j.good_lost for j in every)
-    screenings = [one.screening for one in campaign.images if one.screening is not None]
-    more = ("entered", "left", "wrong_entered", "wrong_left", "check_entered", "check_left", "wrong_check_left")
-    out |= {name: sum(getattr(s, name) for s in screenings) for name in more}
-    out["right_rejected_by_adjustment"] = sum(s.right_lost for s in screenings)
-    return out
-
-
-def images_data(campaign: Campaign) -> dict[str, Any] | None:
-    """The numbers as plain data; None for drawn points."""
-    if campaign.images is None:
-        return None
-    fields: dict[str, Any] = {}
-    for one in campaign.images:
-        fields[one.name] = {
-            sort: {line: _numbers(parts) for line, parts in lines.items()} for sort, lines in _by_line(one).items()
-        }
-    return {"total": image_totals(campaign), "fields": fields}
-
-
 def _matching(images: tuple[FieldImages, ...]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for one in images:
-        for sort, lines in _by_line(one).items():
-            for line, parts in lines.items():
-                n = _numbers(parts)
-                wrong = (f"{n[f'wrong_{stage}']} of {n[stage]}" for stage in ("found", "matched", "accepted"))
-                cells = (n["right_rejected_by_consensus"], n["rms_lines_px"], n["rms_pixels_px"], n["chi_square_ratio"])
+        for sort, lines in MatchingNumbers.by_line(one).items():
+            for line, n in lines.items():
+                wrong = (
+                    f"{n.wrong_found} of {n.found}",
+                    f"{n.wrong_matched} of {n.matched}",
+                    f"{n.wrong_accepted} of {n.accepted}",
+                )
+                cells = (n.right_rejected_by_consensus, n.rms_lines_px, n.rms_pixels_px, n.chi_square_ratio)
                 rows.append((one.name, _SORTS[sort], line, *wrong, *cells))
     return Table(
         "image-matching",
@@ -296,34 +272,6 @@ def _matching(images: tuple[FieldImages, ...]) -> Table:
         rows,
         (None, None, None, None, None, None, None, 3, 3, 2),
     )
-
-
-def _judgements(one: FieldImages) -> list[tuple[tuple[str, str], LineJudgement]]:
-    return [
-        ((sort, line), j)
-        for patch in one.patches
-        for sort, lines in patch.judgements.items()
-        for line, j in lines.items()
-    ]
-
-
-def _by_line(one: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
-    out: dict[str, dict[str, list[LineJudgement]]] = {}
-    for (sort, line), j in _judgements(one):
-        out.setdefault(sort, {}).setdefault(line, []).append(j)
-    return out
-
-
-def _numbers(parts: list[LineJudgement]) -> dict[str, Any]:
-    names = ("found", "matched", "accepted", "wrong_found", "wrong_matched", "wrong_accepted")
-    out: dict[str, Any] = {name: sum(getattr(j, name) for j in parts) for name in names}
-    out["right_rejected_by_consensus"] = sum(j.good_lost for j in parts)
-    degrees = np.array([j.degrees_of_freedom for j in parts])
-    square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
-    rms = np.sqrt(square / max(degrees.sum(), 1))
-    out |= {"rms_lines_px": float(rms[0]), "rms_pixels_px": float(rms[1])}
-    out["chi_square_ratio"] = float(sum(j.chi_square for j in parts) / max(degrees.sum(), 1))
-    return out
 
 
 def light_section(run: CalibrationRun) -> Section:

@@ -18,7 +18,7 @@ from analysis.orbit.three_line_model import LineModel
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
 from twin.orbit.calibration.observations import EFFECTS
-from twin.run.result import Advance
+from twin.run.procedure import Advance
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup

@@ -22,7 +22,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.schemes import GAUGE, averaged
-from twin.run.result import Advance
+from twin.run.procedure import Advance
 
 
 @dataclass(frozen=True, eq=False)

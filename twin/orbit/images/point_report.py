@@ -1,9 +1,8 @@
-"""Points measured in images as data, tables and figures."""
+"""Points measured in images as listing, tables and figures."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,19 +12,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit_scene import ImagePointsSpec
-from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints, PatchPoints, status_text
+from twin.orbit.images.image_points import CONSENSUS, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import LineImage, Patch
 from twin.orbit.images.point_judgement import (
     WRONG_FLOOR,
     WRONG_PIXELS,
     WRONG_SIGMAS,
-    LineJudgement,
     judged,
-    true_ground,
 )
+from twin.orbit.images.simulate_numbers import median_sigma, median_way, reasons
 from twin.run.artefact import Cell, Data, PngFigure, Table
 from twin.run.data_files import csv_table
-from twin.run.result import Section
+from twin.run.report import Section
 from twin.run.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
 
 
@@ -98,76 +96,6 @@ def listing(patch: Patch, points: PatchPoints) -> list[list[Any]]:
                 ground = [*map(float, degrees[k]), *map(float, one.ground[k])]
                 rows.append([kind, k, name, *ground, *shown, int(line.accepted[k]), status_text(code)])
     return rows
-
-
-def points_data(points: PatchPoints) -> dict[str, Any]:
-    """What the user knows, by sort and line."""
-    out: dict[str, Any] = {}
-    for sort, one in points.sorts.items():
-        lines = {name: _line(line) for name, line in one.lines.items() if name != one.source}
-        out[sort] = {"sought": len(one.ground), "in_all_lines": int(one.in_all.sum()), "lines": lines}
-    return out
-
-
-def points_truth(patch: Patch, points: PatchPoints) -> dict[str, Any]:
-    """What only the truth knows, by sort and line."""
-    out: dict[str, Any] = {}
-    for sort, one in points.sorts.items():
-        lines = {name: _judged(line) for name, line in judged(patch, one).items()}
-        out[sort] = {"itrs_m": true_ground(patch, one).tolist(), "lines": lines}
-    return out
-
-
-def reasons(line: MatchedLine) -> Mapping[str, int]:
-    """Why points were not accepted, the most frequent first."""
-    count = Counter(int(code) for code in line.status[~line.accepted])
-    return {status_text(code): number for code, number in count.most_common()}
-
-
-def median_way(line: MatchedLine) -> np.ndarray:
-    """(2,) from predicted to found, median of the accepted, lines and pixels."""
-    return np.asarray(np.median((line.place - line.predicted)[line.accepted], axis=0))
-
-
-def median_sigma(line: MatchedLine) -> np.ndarray:
-    """(2,) of lines and pixels, median of the accepted."""
-    return np.asarray(np.median(np.sqrt(np.diagonal(line.covariance[line.accepted], axis1=1, axis2=2)), axis=0))
-
-
-def _line(line: MatchedLine) -> dict[str, Any]:
-    way, sigma = median_way(line), median_sigma(line)
-    return {
-        "found": int(np.isfinite(line.place[:, 0]).sum()),
-        "matched": int(line.matched.sum()),
-        "accepted": int(line.accepted.sum()),
-        "rejected_by_consensus": int((line.status == CONSENSUS).sum()),
-        "not_accepted": dict(reasons(line)),
-        "displacement_lines_px": float(way[0]),
-        "displacement_pixels_px": float(way[1]),
-        "sigma_lines_px": float(sigma[0]),
-        "sigma_pixels_px": float(sigma[1]),
-        "consensus_scatter_px": line.scatter,
-    }
-
-
-def _judged(one: LineJudgement) -> dict[str, Any]:
-    error = [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
-    return {
-        "found": one.found,
-        "matched": one.matched,
-        "accepted": one.accepted,
-        "wrong_found": one.wrong_found,
-        "wrong_matched": one.wrong_matched,
-        "wrong_accepted": one.wrong_accepted,
-        "right_rejected_by_consensus": one.good_lost,
-        "rms_lines_px": float(one.rms[0]),
-        "rms_pixels_px": float(one.rms[1]),
-        "mean_lines_px": float(one.mean[0]),
-        "mean_pixels_px": float(one.mean[1]),
-        "chi_square": one.chi_square,
-        "degrees_of_freedom": one.degrees_of_freedom,
-        "error_px": error,
-    }
 
 
 def _degrees(patch: Patch, points: MatchedPoints) -> np.ndarray:

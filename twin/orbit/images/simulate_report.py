@@ -1,4 +1,4 @@
-"""What a simulated pass over a patch gives: simulate.json, tables, figures, the report."""
+"""Report of a simulated pass over a patch: tables, figures, files."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from optics.numerics.backend import Backend
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_report import pixel_axes, points_section
-from twin.orbit.images.simulate_json import camera_data, georeference, to_dict, trajectory_data, truth_data
-from twin.orbit.images.simulate_run import Simulation, simulate
+from twin.orbit.images.simulate_numbers import camera_data, georeference, trajectory_data, truth_data
+from twin.orbit.images.simulate_run import Simulation
 from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
 from twin.run.reference_frames import described
-from twin.run.result import Advance, LabResult, Section
+from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
 
 if TYPE_CHECKING:
@@ -208,18 +207,8 @@ def _data(run: Simulation) -> Section:
     return Section("Data", text, parts)
 
 
-def run_simulation(setup: SimulateSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Fly the pass and put the result together; nothing is traced, so that the backend is not used."""
-    advance("images", 0, 2)
-    run = simulate(setup, seed)
-    advance("images", 1, 2)
-    result = simulation_result(run, setup, seed)
-    advance("images", 2, 2)
-    return result
-
-
-def simulation_result(run: Simulation, setup: SimulateSetup, seed: int) -> LabResult:
-    """Numbers, table and report of a pass."""
+def simulation_report(run: Simulation) -> Report:
+    """Report of a pass."""
     patch = run.spec.patch
     longitude, latitude = np.degrees(run.place)
     images = run.patch.images
@@ -230,12 +219,10 @@ def simulation_result(run: Simulation, setup: SimulateSetup, seed: int) -> LabRe
     )
     files = {name: image.frame[None] for name, image in images.items()}
     files |= {"orthophoto": run.patch.control.orthophoto.values[None], "dem": run.patch.control.dem.values[None]}
-    return LabResult(
-        "simulate",
+    return Report(
         "Images of a patch of ground from orbit",
         lead,
-        _facts(setup),
-        to_dict(run, seed),
+        _facts(run.setup),
         _summary(run),
         sections(run),
         files,

@@ -22,9 +22,10 @@ from twin.orbit.ground.grid import stream
 from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
-from twin.run.result import BenchError
+from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
     from scenes.specs.orbit_setup import SimulateSetup
 
 _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
@@ -42,8 +43,8 @@ class Simulation:
     """A pass and what it gave.
 
     Attributes:
-        spec: the test.
-        laboratory: the camera as it was measured before launch.
+        setup: what its file says.
+        seed: of all random numbers.
         truth: the camera as it is.
         trajectory: the true one.
         measured: what the satellite says of it.
@@ -53,8 +54,8 @@ class Simulation:
         points: measured in the images; None where none were asked for.
     """
 
-    spec: OrbitSimulateSpec
-    laboratory: ThreeLineCameraSpec
+    setup: SimulateSetup
+    seed: int
     truth: ThreeLineCameraSpec
     trajectory: Trajectory
     measured: Trajectory
@@ -63,13 +64,24 @@ class Simulation:
     patch: Patch
     points: PatchPoints | None
 
+    @property
+    def spec(self) -> OrbitSimulateSpec:
+        """The test."""
+        return self.setup.test
 
-def simulate(setup: SimulateSetup, seed: int) -> Simulation:
-    """Fly the pass.
+    @property
+    def laboratory(self) -> ThreeLineCameraSpec:
+        """The camera as it was measured before launch."""
+        return self.setup.camera
+
+
+def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Simulation:
+    """Fly the pass: ``python -m twin.orbit simulate``; nothing is traced, so that the backend is not used.
 
     Raises:
         BenchError: no such orbit, a patch that a line cannot image, points that cannot be measured.
     """
+    advance("images", 0, 1)
     spec, root = setup.test, np.random.SeedSequence(seed)
     earth = Earth.from_spec(spec.earth)
     try:
@@ -94,7 +106,8 @@ def simulate(setup: SimulateSetup, seed: int) -> Simulation:
         key, remedy = _REMEDIES[error.part]
         raise BenchError(str(error), key, remedy) from error
     points = _points(done, spec)
-    return Simulation(spec, setup.camera, truth, trajectory, measured, FrozenMap(lines), place, done, points)
+    advance("images", 1, 1)
+    return Simulation(setup, seed, truth, trajectory, measured, FrozenMap(lines), place, done, points)
 
 
 def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:

@@ -36,7 +36,7 @@ from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_ca
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
-from twin.run.result import Advance, BenchError
+from twin.run.procedure import Advance, BenchError
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_monitor import OrbitMonitorSpec

@@ -1,4 +1,4 @@
-"""What a monitored orbit gives: the main table and the report."""
+"""Report of a monitored orbit: the main table, sections."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import numpy as np
 
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
-from optics.numerics.backend import Backend
 from scenes.specs.course import moment
 from scenes.specs.orbit_monitor import PARAMETERS
 from twin.orbit.monitoring.monitoring_figures import PART_NAMES, drawn
-from twin.orbit.monitoring.monitoring_json import cause_heights, to_dict
-from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms, run_monitored
+from twin.orbit.monitoring.monitoring_numbers import cause_heights
+from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import Cell, SvgFigure, Table
-from twin.run.result import Advance, LabResult, Section
+from twin.run.report import Report, Section
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import MonitorSetup
@@ -194,13 +193,9 @@ def _noise(run: MonitorRun) -> Section:
     return Section("Noise of the monitor", text)
 
 
-def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> LabResult:
-    """Fly, monitor, intersect, and put the result together."""
-    return monitor_result(run_monitored(setup, backend, seed, advance), setup, seed)
-
-
-def monitor_result(run: MonitorRun, setup: MonitorSetup, seed: int) -> LabResult:
-    """Numbers, table and report."""
+def monitor_report(run: MonitorRun) -> Report:
+    """Report of a monitored orbit."""
+    setup = run.setup
     cases, spec = run.cases, setup.test
     none, chosen, floor = cases["none"], cases["interval"], cases["true"]
     lead = (
@@ -211,12 +206,10 @@ def monitor_result(run: MonitorRun, setup: MonitorSetup, seed: int) -> LabResult
         f"interval, {cases['monitored'].camera_height_rms:.2f} m monitored at every time. "
         f"One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height.",
     )
-    return LabResult(
-        "monitor",
+    return Report(
         "What on-board monitoring buys on the ground",
         lead,
         _facts(setup),
-        to_dict(run, seed),
         _table(run),
         sections(run),
         warnings=_warnings(run),

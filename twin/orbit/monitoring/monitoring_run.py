@@ -23,12 +23,11 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit_monitor import PARAMETERS
 from twin.orbit.flight.line_camera import look_angle
 from twin.orbit.monitoring.monitoring_flight import MonitorFlight, fly_monitored, in_analysis
-from twin.run.result import BenchError
+from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.orbit_setup import MonitorSetup
-    from twin.run.result import Advance
 
 CASES = ("none", "monitored", "interval", "parameters", "true")
 """As calibrated; corrected at every time; corrected by values interpolated over the file's interval; by the true four
@@ -144,6 +143,8 @@ class MonitorRun:
     """A finished test.
 
     Attributes:
+        setup: what its file says.
+        seed: of all random numbers.
         flight: truth and measurements.
         cases: of `CASES` -> errors.
         intervals: seconds -> errors with values interpolated over it.
@@ -157,6 +158,8 @@ class MonitorRun:
             the line and all times, radians.
     """
 
+    setup: MonitorSetup
+    seed: int
     flight: MonitorFlight
     cases: Mapping[str, CaseErrors]
     intervals: Mapping[float, CaseErrors]
@@ -180,16 +183,16 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def run_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
-    """Fly, measure, intersect. Raises BenchError, InputError as `fly_monitored`."""
+def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun:
+    """Fly, measure, intersect: ``python -m twin.orbit monitor``. Raises BenchError, InputError as `fly_monitored`."""
     flight = fly_monitored(setup, backend, seed, advance)
     try:
-        return analysed(flight)
+        return analysed(flight, setup, seed)
     except IntersectionError as error:
         raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
 
 
-def analysed(flight: MonitorFlight) -> MonitorRun:
+def analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRun:
     """All cases of a flight."""
     count, spec = len(flight.times), flight.spec
     said = {n: flight.monitored[n].vector * _mask(flight) for n in flight.pair}
@@ -211,6 +214,8 @@ def analysed(flight: MonitorFlight) -> MonitorRun:
     first, second = (flight.monitored[n] for n in flight.pair)
     angle = exact(first, second, *flight.looks)
     return MonitorRun(
+        setup,
+        seed,
         flight,
         FrozenMap(cases),
         FrozenMap(intervals),

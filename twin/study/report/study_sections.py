@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scenes.specs.study_factor import FactorSpec
 from scenes.yaml.errors import key_text
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed, plain
-from twin.run.result import Section
+from twin.run.report import Section
 from twin.run.svg import look, to_svg
 from twin.study.report import conclusions
 from twin.study.report.influence_figures import (

@@ -6,21 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+
 from optics.numerics.backend import Backend
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec
-from twin.study.runs.config_tree import Tree
-from collections.abc import Callable, Sequence
-from typing import Any
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.svg import undrawn
+from twin.run.procedure import BenchError, Procedure, silent
 from twin.study.runs.config_tree import Tree, with_values
-from twin.run.result import BenchError
-from twin.run.result import Advance, LabResult, silent
 
 
 @dataclass(frozen=True)
@@ -79,18 +75,19 @@ PHYSICS = (InputError, BenchError, AimError, BeamMissedError, ValueError, Arithm
 
 
 @dataclass(frozen=True)
-class BenchBase:
-    """A test as ``twin.run.command.run_test`` runs it.
+class ProcedureBase:
+    """A test, one run after the other; only its numbers are made.
 
     Attributes:
-        model: the set-up.
-        read: file -> set-up.
-        run: set-up, backend, seed and progress -> result.
+        procedure: the test.
     """
 
-    model: type[Spec]
-    read: Callable[[Path | str], Spec]
-    run: Callable[[Any, Backend, int, Advance], LabResult]
+    procedure: Procedure[Any, Any]
+
+    @property
+    def model(self) -> type[Spec]:
+        """The test's set-up."""
+        return self.procedure.setup
 
     @property
     def block(self) -> int:
@@ -99,7 +96,8 @@ class BenchBase:
 
     def resolve(self, file: Path | str) -> Spec:
         """Read the test with all it refers to. Raises InputError."""
-        return self.read(file)
+        setup: Spec = self.procedure.resolve(file)
+        return setup
 
     def check(self, tree: Tree, backend: Backend) -> None:
         """Nothing more can be told before a run."""
@@ -111,11 +109,11 @@ class BenchBase:
     def _one(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
         try:
             setup: Any = validate(self.model, YamlFile("", with_values(tree, run.values), {}))
-            with undrawn():
-                result = self.run(setup, backend, setup.test.seed if run.seed is None else run.seed, silent)
+            done = self.procedure.run(setup, backend, setup.test.seed if run.seed is None else run.seed, silent)
+            numbers = self.procedure.numbers(done)
         except PHYSICS as error:
             return Failure(one_line(error))
-        return {result.kind: dict(result.data)}
+        return {self.procedure.kind: dict(numbers)}
 
 
 def one_line(error: Exception) -> str:

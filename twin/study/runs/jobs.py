@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from scenes.yaml.errors import InputError, Issue
-from twin.study.runs.base_job import BaseJob
-from twin.study.runs.base_job import BenchBase
+from twin.study.runs.base_job import BaseJob, ProcedureBase
 
 
 def base_job(command: str) -> BaseJob:
@@ -30,45 +29,39 @@ def _render() -> BaseJob:
 
 
 def _focus() -> BaseJob:
-    from scenes.specs.lab_setup import FocusSetup, resolve_focus
-    from twin.laboratory.focus_report import run_focus
+    from twin.laboratory.focus_numbers import FOCUS
 
-    return BenchBase(FocusSetup, resolve_focus, run_focus)
+    return ProcedureBase(FOCUS)
 
 
 def _distortion() -> BaseJob:
-    from scenes.specs.lab_setup import DistortionSetup, resolve_distortion
-    from twin.laboratory.distortion_report import run_distortion
+    from twin.laboratory.distortion_numbers import DISTORTION
 
-    return BenchBase(DistortionSetup, resolve_distortion, run_distortion)
+    return ProcedureBase(DISTORTION)
 
 
 def _turntable() -> BaseJob:
-    from scenes.specs.lab_setup import TurntableSetup, resolve_turntable
-    from twin.laboratory.turntable_report import run_turntable_test
+    from twin.laboratory.turntable_numbers import TURNTABLE
 
-    return BenchBase(TurntableSetup, resolve_turntable, run_turntable_test)
+    return ProcedureBase(TURNTABLE)
 
 
 def _angle() -> BaseJob:
-    from scenes.specs.orbit_setup import AngleSetup, resolve_angle
-    from twin.orbit.angle.angle_report import run_angle
+    from twin.orbit.angle.angle_numbers import ANGLE
 
-    return BenchBase(AngleSetup, resolve_angle, run_angle)
+    return ProcedureBase(ANGLE)
 
 
 def _calibrate() -> BaseJob:
-    from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
-    from twin.orbit.calibration.calibration_report import run_calibration
+    from twin.orbit.calibration.calibration_numbers import CALIBRATION
 
-    return BenchBase(CalibrationSetup, resolve_calibration, run_calibration)
+    return ProcedureBase(CALIBRATION)
 
 
 def _monitor() -> BaseJob:
-    from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
-    from twin.orbit.monitoring.monitoring_report import run_monitor
+    from twin.orbit.monitoring.monitoring_numbers import MONITOR
 
-    return BenchBase(MonitorSetup, resolve_monitor, run_monitor)
+    return ProcedureBase(MONITOR)
 
 
 JOBS: dict[str, Callable[[], BaseJob]] = {
@@ -80,6 +73,4 @@ JOBS: dict[str, Callable[[], BaseJob]] = {
     "orbit calibrate": _calibrate,
     "orbit monitor": _monitor,
 }
-"""As scenes.specs.study.BaseCommand names them -> the job. A test that ``twin.run.command.run_test`` runs needs no more
-than its set-up, its ``resolve`` and its ``run``.
-"""
+"""As scenes.specs.study.BaseCommand names them -> the job. A test needs no more than its `twin.run.procedure.Procedure`."""

@@ -15,8 +15,8 @@ from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit_angle import LINES
 from twin.orbit.angle.angle_flight import Measurement
+from twin.orbit.angle.angle_numbers import PRINTED_DIFFERENCE_ARCSEC
 from twin.orbit.angle.angle_run import effect_rows, values_of
-from twin.orbit.angle.angle_sections import PRINTED_DIFFERENCE_ARCSEC
 from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import NOT_CHECKABLE, REFUTED, SIGMAS, Check, CheckResult, Explanation

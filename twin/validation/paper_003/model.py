@@ -309,7 +309,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
     if "003.model.points" in context.selected:
         rms, total = rendered.matching(campaign)
         how = (
-            f"{size}. {total['matched']} places pass the matching, {total['wrong_matched']} of them wrong by truth; "
+            f"{size}. {total.matched} places pass the matching, {total.wrong_matched} of them wrong by truth; "
             "control points are identified less well by eye, and the campaigns take 0.3 px."
         )
         yield context.check("003.model.points").judge(rms, None, how, setup_of(FIELDS).test.errors.image)

@@ -15,8 +15,8 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_scene import TerrainSpec
 from scenes.specs.orbit_setup import CalibrationSetup
+from twin.orbit.calibration.calibration_numbers import ImageTotals
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
-from twin.orbit.calibration.field_sections import image_totals
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, tested, tested_before
 from twin.orbit.calibration.screening import screened
 from twin.orbit.ground.grid import GroundFrame, stream
@@ -195,7 +195,7 @@ def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
     return tuple(_field(campaign, one) for one in campaign.passes)
 
 
-def matching(campaign: Campaign) -> tuple[float, dict[str, int]]:
+def matching(campaign: Campaign) -> tuple[float, ImageTotals]:
     """RMS of right places of control points against the truth over lines and pixels, px, and counts."""
     assert campaign.images is not None
     square, count = 0.0, 0
@@ -205,7 +205,7 @@ def matching(campaign: Campaign) -> tuple[float, dict[str, int]]:
                 right = one.degrees_of_freedom // 2
                 square += right * float(np.sum(np.nan_to_num(one.rms) ** 2))
                 count += 2 * right
-    return float(np.sqrt(square / max(count, 1))), image_totals(campaign)
+    return float(np.sqrt(square / max(count, 1))), ImageTotals.of(campaign.images)
 
 
 def _field(campaign: Campaign, one: FieldPass) -> FromImages:

@@ -13,13 +13,12 @@ from analysis.focal_plane.plane_fit import RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
-from analysis.units import ARCSEC
+from analysis.units import ARCMIN, ARCSEC
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_focus
 from twin.laboratory.focus_alignment import Alignment, State, align, line_turn, mount_of
 from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_report import ARCMIN
 from twin.laboratory.focus_scan import NYQUIST
 from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.run.artefact import Cell, SvgFigure, Table

@@ -1,8 +1,9 @@
-"""calibration.json: metres and radians."""
+"""Numbers of an in-orbit calibration, as calibration.json has them: metres and radians."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,19 @@ from analysis.orbit.calibration_parameters import RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
-from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult
+from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
+from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, run_calibration
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
 from twin.orbit.calibration.campaign import FieldPass
-from twin.orbit.calibration.field_sections import images_data
+from twin.orbit.calibration.field_images import FieldImages, PatchRecord
 from twin.orbit.calibration.influences import INNER, OFFSET, DatumRow, LightRow
 from twin.orbit.calibration.latitude import LatitudeFit
 from twin.orbit.calibration.repeatability import Repeatability, repeatability
 from twin.orbit.calibration.schemes import STATEMENTS, Finding, Repeats
 from twin.orbit.calibration.strip import Strips
+from twin.orbit.images.point_judgement import LineJudgement
+from twin.run.plain_data import plain_data
+from twin.run.procedure import Procedure
 
 
 def monitoring_dict(found: Monitoring) -> dict[str, Any]:
@@ -71,8 +76,8 @@ def _pooled(errors: PooledErrors) -> dict[str, float]:
     return {"plan_rms_m": errors.plan, "height_rms_m": errors.height}
 
 
-def to_dict(run: CalibrationRun, seed: int) -> dict[str, Any]:
-    """The numbers of a calibration as plain data; what is not defined is None."""
+def calibration_numbers(run: CalibrationRun) -> dict[str, Any]:
+    """Contents of calibration.json without its frames; what is not defined is None."""
     found, spec = run.together, run.campaign.spec
     sigma = found.sigma
     whole = found.sigma_with(dict.fromkeys(found.gauge.held, spec.launch.interior))
@@ -80,7 +85,7 @@ def to_dict(run: CalibrationRun, seed: int) -> dict[str, Any]:
     free = [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
     limits = spec.limits
     return {
-        "seed": seed,
+        "seed": run.seed,
         "parameters": {
             name: {
                 "value": float(value),
@@ -106,7 +111,7 @@ def to_dict(run: CalibrationRun, seed: int) -> dict[str, Any]:
         "null_vectors": [_combination(c) for c in found.open],
         "weak_vectors": [_combination(c) for c in found.weak],
         "gauge": str(found.gauge),
-        "images": images_data(run.campaign),
+        "images": None if run.campaign.images is None else plain_data(ImageNumbers.of(run.campaign.images)),
         "fit": {
             "chi_square": found.chi_square,
             "degrees_of_freedom": found.degrees_of_freedom,
@@ -268,3 +273,102 @@ def _combination(one: Combination) -> dict[str, Any]:
         "strength": one.strength,
         "sigma_m": one.sigma,
     }
+
+
+@dataclass(frozen=True)
+class ImageTotals:
+    """Points in images, over all fields and lines; wrong by truth."""
+
+    found: int
+    matched: int
+    accepted: int
+    wrong_found: int
+    wrong_matched: int
+    wrong_accepted: int
+    right_rejected_by_consensus: int
+    entered: int
+    left: int
+    wrong_entered: int
+    wrong_left: int
+    check_entered: int
+    check_left: int
+    wrong_check_left: int
+    right_rejected_by_adjustment: int
+
+    @classmethod
+    def of(cls, images: Sequence[FieldImages]) -> ImageTotals:
+        """Of all fields."""
+        every = [j for one in images for patch in one.patches for j in judgements(patch).values()]
+        screenings = [one.screening for one in images if one.screening is not None]
+        matched = {name: sum(getattr(j, name) for j in every) for name in _COUNTS}
+        screened = {name: sum(getattr(s, name) for s in screenings) for name in _SCREENED}
+        return cls(
+            **matched,
+            right_rejected_by_consensus=sum(j.good_lost for j in every),
+            **screened,
+            right_rejected_by_adjustment=sum(s.right_lost for s in screenings),
+        )
+
+
+_COUNTS = ("found", "matched", "accepted", "wrong_found", "wrong_matched", "wrong_accepted")
+_SCREENED = ("entered", "left", "wrong_entered", "wrong_left", "check_entered", "check_left", "wrong_check_left")
+
+
+@dataclass(frozen=True)
+class MatchingNumbers:
+    """Points of one sort in the images of one line, over a field's patches; RMS of those that are not wrong."""
+
+    found: int
+    matched: int
+    accepted: int
+    wrong_found: int
+    wrong_matched: int
+    wrong_accepted: int
+    right_rejected_by_consensus: int
+    rms_lines_px: float
+    rms_pixels_px: float
+    chi_square_ratio: float
+
+    @classmethod
+    def of(cls, parts: Sequence[LineJudgement]) -> MatchingNumbers:
+        """Of some patches."""
+        degrees = np.array([j.degrees_of_freedom for j in parts])
+        square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
+        rms = np.sqrt(square / max(degrees.sum(), 1))
+        return cls(
+            **{name: sum(getattr(j, name) for j in parts) for name in _COUNTS},
+            right_rejected_by_consensus=sum(j.good_lost for j in parts),
+            rms_lines_px=float(rms[0]),
+            rms_pixels_px=float(rms[1]),
+            chi_square_ratio=float(sum(j.chi_square for j in parts) / max(degrees.sum(), 1)),
+        )
+
+    @classmethod
+    def by_line(cls, one: FieldImages) -> dict[str, dict[str, MatchingNumbers]]:
+        """Sort of points -> line -> numbers of a field."""
+        parts: dict[str, dict[str, list[LineJudgement]]] = {}
+        for patch in one.patches:
+            for (sort, line), j in judgements(patch).items():
+                parts.setdefault(sort, {}).setdefault(line, []).append(j)
+        return {sort: {line: cls.of(some) for line, some in lines.items()} for sort, lines in parts.items()}
+
+
+def judgements(patch: PatchRecord) -> dict[tuple[str, str], LineJudgement]:
+    """(sort of points, line) -> judgement."""
+    return {(sort, line): j for sort, lines in patch.judgements.items() for line, j in lines.items()}
+
+
+@dataclass(frozen=True)
+class ImageNumbers:
+    """Points in images; fields: field -> sort of points -> line."""
+
+    total: ImageTotals
+    fields: Mapping[str, Mapping[str, Mapping[str, MatchingNumbers]]]
+
+    @classmethod
+    def of(cls, images: Sequence[FieldImages]) -> ImageNumbers:
+        """Of all fields."""
+        return cls(ImageTotals.of(images), {one.name: MatchingNumbers.by_line(one) for one in images})
+
+
+CALIBRATION = Procedure("calibration", CalibrationSetup, resolve_calibration, run_calibration, calibration_numbers)

@@ -1,4 +1,6 @@
-"""monitor.json: times in seconds, changes in arcseconds and micrometres, errors in metres."""
+"""Numbers of a monitored orbit, as monitor.json has them: times in seconds, changes in arcseconds and micrometres,
+errors in metres.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +11,19 @@ import numpy as np
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.orbit_monitor import PARAMETERS as APPLICABLE
+from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
 from twin.orbit.monitoring.monitoring_flight import Cause
-from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms
+from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms, run_monitor
+from twin.run.procedure import Procedure
 
 
-def to_dict(run: MonitorRun, seed: int) -> dict[str, Any]:
-    """The numbers as plain data. Errors at the top level are those with the file's interval."""
+def monitor_numbers(run: MonitorRun) -> dict[str, Any]:
+    """Contents of monitor.json without its frames. Errors at the top level are those with the file's interval."""
     flight, spec = run.flight, run.flight.spec
     chosen, scatter, low_high = run.cases["interval"], run.scatter, run.scatter.limits
     change = run.angle_change / ARCSEC
     return {
-        "seed": seed,
+        "seed": run.seed,
         "interval_s": spec.interval,
         "height_rms_m": chosen.height_rms,
         "height_worst_m": chosen.worst,
@@ -136,3 +140,6 @@ def _cause(run: MonitorRun, cause: Cause) -> dict[str, Any]:
         "height_without_monitoring_m": without,
         "height_left_by_monitor_m": left,
     }
+
+
+MONITOR = Procedure("monitor", MonitorSetup, resolve_monitor, run_monitor, monitor_numbers)

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import about_axis, rotation_matrix
+from scenes.specs.orbit_setup import SimulateSetup, resolve_simulate
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
-from twin.orbit.images.patch import LineImage
-from twin.orbit.images.point_report import points_data, points_truth
-from twin.orbit.images.simulate_run import Simulation
+from twin.orbit.images.image_points import CONSENSUS, MatchedLine, PatchPoints, status_text
+from twin.orbit.images.patch import LineImage, Patch
+from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
+from twin.orbit.images.simulate_run import Simulation, run_simulation
+from twin.run.procedure import Procedure
 from twin.run.reference_frames import described
 
 _TRUE_POINTS = 21
 """Along each side of the grid of true ground points."""
 
 
-def to_dict(run: Simulation, seed: int) -> dict[str, Any]:
-    """simulate.json: what the user of the images may know."""
+def simulate_numbers(run: Simulation) -> dict[str, Any]:
+    """Contents of simulate.json without its frames: what the user of the images may know."""
     longitude, latitude = run.place
     return {
-        "seed": seed,
+        "seed": run.seed,
         "epoch_utc": str(run.spec.orbit.epoch),
         "longitude_deg": float(np.degrees(longitude)),
         "latitude_deg": float(np.degrees(latitude)),
@@ -58,6 +63,76 @@ def _line(image: LineImage) -> dict[str, Any]:
         "advance_px_per_line": image.motion.advance,
         "drift_px_per_line": image.motion.drift,
         "geometry_error_px": image.error,
+    }
+
+
+def points_data(points: PatchPoints) -> dict[str, Any]:
+    """What the user knows, by sort and line."""
+    out: dict[str, Any] = {}
+    for sort, one in points.sorts.items():
+        lines = {name: _matched(line) for name, line in one.lines.items() if name != one.source}
+        out[sort] = {"sought": len(one.ground), "in_all_lines": int(one.in_all.sum()), "lines": lines}
+    return out
+
+
+def points_truth(patch: Patch, points: PatchPoints) -> dict[str, Any]:
+    """What only the truth knows, by sort and line."""
+    out: dict[str, Any] = {}
+    for sort, one in points.sorts.items():
+        lines = {name: _judged(line) for name, line in judged(patch, one).items()}
+        out[sort] = {"itrs_m": true_ground(patch, one).tolist(), "lines": lines}
+    return out
+
+
+def reasons(line: MatchedLine) -> Mapping[str, int]:
+    """Why points were not accepted, the most frequent first."""
+    count = Counter(int(code) for code in line.status[~line.accepted])
+    return {status_text(code): number for code, number in count.most_common()}
+
+
+def median_way(line: MatchedLine) -> np.ndarray:
+    """(2,) from predicted to found, median of the accepted, lines and pixels."""
+    return np.asarray(np.median((line.place - line.predicted)[line.accepted], axis=0))
+
+
+def median_sigma(line: MatchedLine) -> np.ndarray:
+    """(2,) of lines and pixels, median of the accepted."""
+    return np.asarray(np.median(np.sqrt(np.diagonal(line.covariance[line.accepted], axis1=1, axis2=2)), axis=0))
+
+
+def _matched(line: MatchedLine) -> dict[str, Any]:
+    way, sigma = median_way(line), median_sigma(line)
+    return {
+        "found": int(np.isfinite(line.place[:, 0]).sum()),
+        "matched": int(line.matched.sum()),
+        "accepted": int(line.accepted.sum()),
+        "rejected_by_consensus": int((line.status == CONSENSUS).sum()),
+        "not_accepted": dict(reasons(line)),
+        "displacement_lines_px": float(way[0]),
+        "displacement_pixels_px": float(way[1]),
+        "sigma_lines_px": float(sigma[0]),
+        "sigma_pixels_px": float(sigma[1]),
+        "consensus_scatter_px": line.scatter,
+    }
+
+
+def _judged(one: LineJudgement) -> dict[str, Any]:
+    error = [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
+    return {
+        "found": one.found,
+        "matched": one.matched,
+        "accepted": one.accepted,
+        "wrong_found": one.wrong_found,
+        "wrong_matched": one.wrong_matched,
+        "wrong_accepted": one.wrong_accepted,
+        "right_rejected_by_consensus": one.good_lost,
+        "rms_lines_px": float(one.rms[0]),
+        "rms_pixels_px": float(one.rms[1]),
+        "mean_lines_px": float(one.mean[0]),
+        "mean_pixels_px": float(one.mean[1]),
+        "chi_square": one.chi_square,
+        "degrees_of_freedom": one.degrees_of_freedom,
+        "error_px": error,
     }
 
 
@@ -159,3 +234,6 @@ def truth_data(run: Simulation) -> dict[str, Any]:
 
 def _inside(times: np.ndarray, trajectory: Trajectory) -> np.ndarray:
     return times[(times >= trajectory.first) & (times <= trajectory.last)]
+
+
+SIMULATE = Procedure("simulate", SimulateSetup, resolve_simulate, run_simulation, simulate_numbers)

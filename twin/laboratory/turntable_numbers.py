@@ -1,0 +1,177 @@
+"""Numbers of a turntable test, as turntable.json has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.turntable.angle_fits import AngleFit
+from analysis.turntable.chauvenet import rejection_rate
+from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.units import ARCSEC
+from scenes.specs.lab_setup import TurntableSetup, resolve_turntable
+from twin.laboratory.turntable_run import TurntableRun, rms, run_turntable_test
+from twin.run.plain_data import plain_data
+from twin.run.procedure import Procedure
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FitNumbers:
+    """One fit: RMS at the held-out readings, at the calibrated ones, and by cross-validation."""
+
+    heldout_rms_arcsec: float
+    train_rms_arcsec: float
+    cross_validation_rms_arcsec: float
+    effective_parameters: float
+    settings: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, run: TurntableRun, name: str) -> FitNumbers:
+        """Of one fit by name."""
+        series, fit, validation = run.series, run.fits[name], run.choice[name].validation
+        assert validation is not None
+        return cls(
+            heldout_rms_arcsec=rms(run.held_out_residual(name)) / ARCSEC,
+            train_rms_arcsec=rms(series.mean - fit(series.angle)) / ARCSEC,
+            cross_validation_rms_arcsec=validation.rms / ARCSEC,
+            effective_parameters=fit.effective_parameters,
+            settings=fit.settings,
+        )
+
+
+@dataclass(frozen=True)
+class CompensationNumbers:
+    """Sigma of a compensated angle: common to all, along the curve, of each reading by itself."""
+
+    common_arcsec: float
+    smooth_arcsec: float
+    white_arcsec: float
+
+
+@dataclass(frozen=True)
+class PointNumbers:
+    """One angle, for figures of one's own."""
+
+    reading_deg: float
+    mean_arcsec: float
+    sigma_arcsec: float
+    rms_before_arcsec: float
+    rms_after_arcsec: float
+    comparisons_arcsec: Array
+    kept: np.ndarray
+    fitted_arcsec: Mapping[str, float]
+
+    @classmethod
+    def of(cls, series: CalibrationSeries, fits: Mapping[str, AngleFit]) -> tuple[PointNumbers, ...]:
+        """Of all angles."""
+        fitted = {name: fit(series.angle) / ARCSEC for name, fit in fits.items()}
+        return tuple(
+            cls(
+                reading_deg=float(np.degrees(series.angle[i])),
+                mean_arcsec=float(series.mean[i]) / ARCSEC,
+                sigma_arcsec=float(series.sigma[i]) / ARCSEC,
+                rms_before_arcsec=float(series.rms_before[i]) / ARCSEC,
+                rms_after_arcsec=float(series.rms_after[i]) / ARCSEC,
+                comparisons_arcsec=series.comparisons[i] / ARCSEC,
+                kept=series.keep[i],
+                fitted_arcsec={name: float(values[i]) for name, values in fitted.items()},
+            )
+            for i in range(len(series.angle))
+        )
+
+
+@dataclass(frozen=True)
+class TrueFitNumbers:
+    """A fit against the true curve; ``spread``: without a constant, which differences of angles do not see."""
+
+    true_rms_arcsec: float
+    true_spread_arcsec: float
+
+
+@dataclass(frozen=True)
+class TurntableTruth:
+    """What no test in a laboratory has."""
+
+    fits: Mapping[str, TrueFitNumbers]
+    dividing_error_spread_arcsec: float
+    part_rms_full_circle_arcsec: Mapping[str, float]
+
+    @classmethod
+    def of(cls, run: TurntableRun) -> TurntableTruth:
+        """Of a run."""
+        fits = {}
+        for name, fit in run.fits.items():
+            left = fit(run.truth_readings) - run.true_error
+            fits[name] = TrueFitNumbers(rms(left) / ARCSEC, float(np.std(left)) / ARCSEC)
+        return cls(
+            fits=fits,
+            dividing_error_spread_arcsec=float(np.std(run.true_error)) / ARCSEC,
+            part_rms_full_circle_arcsec={name: p.rms / ARCSEC for name, p in run.model.error.parts.items()},
+        )
+
+
+@dataclass(frozen=True)
+class TurntableNumbers:
+    """turntable.json. The four RMS at the top are the largest of any angle."""
+
+    name: str
+    seed: int
+    repeat_rms_arcsec: float
+    chauvenet_rms_arcsec: float
+    averaging_alone_rms_arcsec: float
+    mean_rms_arcsec: float
+    repeatability_arcsec: float
+    rejected: int
+    rejected_expected_of_good: float
+    suspect_angles: int
+    heldout_sigma_arcsec: float
+    fits: Mapping[str, FitNumbers]
+    failed: Mapping[str, str | None]
+    chosen: str
+    ranking: Sequence[str]
+    compensation: CompensationNumbers
+    points: tuple[PointNumbers, ...]
+    heldout_points: tuple[PointNumbers, ...]
+    truth: TurntableTruth
+
+    @classmethod
+    def of(cls, run: TurntableRun) -> TurntableNumbers:
+        """Of a run."""
+        series, compensation = run.series, run.compensation
+        return cls(
+            name=run.spec.name,
+            seed=run.model.seed,
+            repeat_rms_arcsec=float(np.max(series.rms_before)) / ARCSEC,
+            chauvenet_rms_arcsec=float(np.max(series.rms_after)) / ARCSEC,
+            averaging_alone_rms_arcsec=series.averaging_alone / ARCSEC,
+            mean_rms_arcsec=series.mean_rms / ARCSEC,
+            repeatability_arcsec=series.repeatability / ARCSEC,
+            rejected=series.rejected,
+            rejected_expected_of_good=rejection_rate(series.repeats) * series.comparisons.size,
+            suspect_angles=int(np.sum(series.suspect)),
+            heldout_sigma_arcsec=rms(run.held_out.sigma) / ARCSEC,
+            fits={name: FitNumbers.of(run, name) for name in run.fits},
+            failed={trial.name: trial.failure for trial in run.choice.trials if trial.fit is None},
+            chosen=run.choice.chosen,
+            ranking=run.ranking,
+            compensation=CompensationNumbers(
+                compensation.common / ARCSEC, compensation.smooth / ARCSEC, compensation.white / ARCSEC
+            ),
+            points=PointNumbers.of(series, run.fits),
+            heldout_points=PointNumbers.of(run.held_out, run.fits),
+            truth=TurntableTruth.of(run),
+        )
+
+
+def turntable_numbers(run: TurntableRun) -> dict[str, Any]:
+    """Contents of turntable.json without its frames."""
+    return dict(plain_data(TurntableNumbers.of(run)))
+
+
+TURNTABLE = Procedure("turntable", TurntableSetup, resolve_turntable, run_turntable_test, turntable_numbers)
