@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.calibration_numbers import meets, unit
+from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.calibration_sections import bought, gained, said, scheme_names, sections
 from twin.orbit.calibration.influences import SURPRISE
 from twin.orbit.calibration.observations import any_effect, light_effects
+from twin.orbit.calibration.scheme_numbers import meets
 from twin.orbit.calibration.schemes import values_of
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report

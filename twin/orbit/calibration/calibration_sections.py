@@ -12,7 +12,7 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_figures import drawn, drift_drawn
-from twin.orbit.calibration.calibration_numbers import meets, unit
+from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
 from twin.orbit.calibration.field_sections import (
@@ -23,6 +23,7 @@ from twin.orbit.calibration.field_sections import (
     light_section,
 )
 from twin.orbit.calibration.influences import INNER, OFFSET
+from twin.orbit.calibration.scheme_numbers import meets
 from twin.orbit.calibration.schemes import RMS, STATEMENTS, Finding, Repeats, values_of
 from twin.orbit.calibration.strip import Strips
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table

@@ -9,10 +9,10 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_figures import drawn
-from twin.orbit.calibration.calibration_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import BEYOND, FieldImages
+from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.influences import INNER, OFFSET, SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
 from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS

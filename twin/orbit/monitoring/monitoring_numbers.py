@@ -4,73 +4,23 @@ errors in metres.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
-from scenes.specs.orbit_monitor import PARAMETERS as APPLICABLE
+from scenes.specs.orbit_monitor import PARAMETERS
 from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
-from twin.orbit.monitoring.monitoring_flight import Cause
+from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight
 from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms, run_monitor
+from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 
-
-def monitor_numbers(run: MonitorRun) -> dict[str, Any]:
-    """Contents of monitor.json without its frames. Errors at the top level are those with the file's interval."""
-    flight, spec = run.flight, run.flight.spec
-    chosen, scatter, low_high = run.cases["interval"], run.scatter, run.scatter.limits
-    change = run.angle_change / ARCSEC
-    return {
-        "seed": run.seed,
-        "interval_s": spec.interval,
-        "height_rms_m": chosen.height_rms,
-        "height_worst_m": chosen.worst,
-        "height_camera_rms_m": chosen.camera_height_rms,
-        "plan_rms_m": chosen.plan_rms,
-        "metres_per_arcsec": run.conversion.of_angle,
-        "times_s": flight.times.tolist(),
-        "reference_time_s": spec.reference,
-        "monitored_times_s": flight.times[spec.measured(spec.interval)].tolist(),
-        "cameras": {name: _camera(run, name) for name in flight.pair},
-        "intersection_angle": {
-            "reference_deg": float(np.degrees(flight.angle[spec.referred])),
-            "true_change_arcsec": plain(change),
-            "monitored_change_arcsec": plain(run.angle / ARCSEC),
-            "monitored_change_sigma_arcsec": plain(run.angle_sigma / ARCSEC),
-            "true_change_span_arcsec": float(np.ptp(change)),
-        },
-        "cases": {name: {**_summary(case), **_series(case)} for name, case in run.cases.items()},
-        "intervals": [{"interval_s": interval, **_summary(case)} for interval, case in run.intervals.items()],
-        "conversion": {
-            "by_angle_m_per_arcsec": run.conversion.of_angle,
-            "by_common_turn_m_per_arcsec": run.conversion.of_common,
-            "by_camera_m_per_arcsec": dict(run.conversion.traced),
-            "theory_by_camera_m_per_arcsec": dict(run.conversion.theory),
-            "base_to_height": run.conversion.base_to_height,
-        },
-        "sensitivity": {name: _slopes(run, name) for name in flight.pair},
-        "propagation": {
-            "height_sigma_m": plain(run.sigma),
-            "time_s": float(flight.times[flight.worst]),
-            "repeats": len(scatter.heights),
-            "sigma_m": scatter.sigma,
-            "spread_m": scatter.spread,
-            "ratio": scatter.spread / scatter.sigma,
-            "lower_limit": low_high[0],
-            "upper_limit": low_high[1],
-            "agrees": scatter.agrees,
-        },
-        "parts": {name: {"height_rms_m": rms(part), "height_m": plain(part)} for name, part in run.parts.items()},
-        "causes": [_cause(run, cause) for cause in flight.causes],
-        "correction_residual_arcsec": run.residual / ARCSEC,
-    }
-
-
-def plain(values: np.ndarray) -> list[float]:
-    """A list; adding 0.0 turns a negative zero into a plain one."""
-    return [float(v) for v in np.asarray(values) + 0.0]
+Array = NDArray[np.float64]
 
 
 def cause_heights(run: MonitorRun, cause: Cause) -> tuple[float, float]:
@@ -78,26 +28,91 @@ def cause_heights(run: MonitorRun, cause: Cause) -> tuple[float, float]:
     flight = run.flight
     slopes = {n: run.slopes[n][flight.worst] for n in flight.pair}
     without = sum(float(-slopes[n] @ cause.truth[n]) for n in flight.pair)
-    applied = np.array([float(name in flight.spec.apply) for name in APPLICABLE])
+    applied = np.array([float(name in flight.spec.apply) for name in PARAMETERS])
     left = sum(float(slopes[n] @ (applied * cause.error[n])) for n in flight.pair)
     return without, left
 
 
-def _camera(run: MonitorRun, name: str) -> dict[str, Any]:
-    flight = run.flight
-    return {
-        "true": _table(flight.truth[name]),
-        "monitored": flight.monitored[name].to_dict(),
-        "without_noise": _table(flight.clean[name]),
-        "prisms_alone": _table(flight.prisms[name]),
-    }
+@dataclass(frozen=True)
+class ChangeNumbers:
+    """Changes of a camera: numbers, or (T,) over the times."""
+
+    d_alpha_arcsec: Array
+    d_beta_arcsec: Array
+    d_gamma_arcsec: Array
+    d_f_um: Array
+
+    @classmethod
+    def of(cls, values: Array) -> Self:
+        """Of (..., 4), radians and metres."""
+        return cls(*np.moveaxis(values * PER_SI, -1, 0))
 
 
-def _table(values: np.ndarray) -> dict[str, list[float]]:
-    return {key: plain(column) for key, column in zip(PARAMETERS, (values * PER_SI).T, strict=True)}
+@dataclass(frozen=True)
+class CameraNumbers:
+    """Changes of one camera since the reference; those monitored with their sigmas."""
+
+    true: ChangeNumbers
+    monitored: Mapping[str, Any]
+    without_noise: ChangeNumbers
+    prisms_alone: ChangeNumbers
+
+    @classmethod
+    def of(cls, flight: MonitorFlight, name: str) -> Self:
+        """Of one camera by name."""
+        true, clean, prisms = (
+            ChangeNumbers.of(unsigned(values[name])) for values in (flight.truth, flight.clean, flight.prisms)
+        )
+        return cls(true, flight.monitored[name].to_dict(), clean, prisms)
 
 
-def _summary(case: CaseErrors) -> dict[str, float]:
+def unsigned(values: Array) -> Array:
+    """The same with plain zeros for negative ones."""
+    return np.asarray(values + 0.0)
+
+
+@dataclass(frozen=True)
+class AngleNumbers:
+    """The intersection angle at the reference, and its changes over the times."""
+
+    reference_deg: float
+    true_change_arcsec: Array
+    monitored_change_arcsec: Array
+    monitored_change_sigma_arcsec: Array
+    true_change_span_arcsec: float
+
+    @classmethod
+    def of(cls, run: MonitorRun) -> Self:
+        """Of a run."""
+        change = run.angle_change / ARCSEC
+        return cls(
+            reference_deg=float(np.degrees(run.flight.angle[run.flight.spec.referred])),
+            true_change_arcsec=unsigned(change),
+            monitored_change_arcsec=unsigned(run.angle / ARCSEC),
+            monitored_change_sigma_arcsec=unsigned(run.angle_sigma / ARCSEC),
+            true_change_span_arcsec=float(np.ptp(change)),
+        )
+
+
+@dataclass(frozen=True)
+class SummaryNumbers:
+    """Errors at the check points over all times; worst: the RMS of the worst time; camera: what the cameras do."""
+
+    height_rms_m: float
+    height_worst_m: float
+    height_bias_rms_m: float
+    height_camera_rms_m: float
+    plan_rms_m: float
+    plan_camera_rms_m: float
+
+    @classmethod
+    def of(cls, case: CaseErrors) -> SummaryNumbers:
+        """Of one case."""
+        return cls(**_summary(case))
+
+
+def _summary(case: CaseErrors) -> dict[str, Any]:
+    """Fields of `SummaryNumbers`."""
     return {
         "height_rms_m": case.height_rms,
         "height_worst_m": case.worst,
@@ -108,38 +123,180 @@ def _summary(case: CaseErrors) -> dict[str, float]:
     }
 
 
-def _series(case: CaseErrors) -> dict[str, dict[str, list[float]]]:
-    return {
-        "series": {
-            "height_rms_m": plain(case.height),
-            "height_bias_m": plain(case.bias),
-            "height_camera_m": plain(case.camera),
-            "plan_rms_m": plain(case.plan),
-        }
-    }
+@dataclass(frozen=True)
+class SeriesNumbers:
+    """The same at each time, (T,)."""
+
+    height_rms_m: Array
+    height_bias_m: Array
+    height_camera_m: Array
+    plan_rms_m: Array
 
 
-def _slopes(run: MonitorRun, name: str) -> dict[str, float]:
-    at = run.slopes[name][run.flight.spec.referred] / PER_SI
-    keys = ("d_alpha_m_per_arcsec", "d_beta_m_per_arcsec", "d_gamma_m_per_arcsec", "d_f_m_per_um")
-    return {key: float(value) for key, value in zip(keys, at, strict=True)}
+@dataclass(frozen=True)
+class CaseNumbers(SummaryNumbers):
+    """One case with its series."""
+
+    series: SeriesNumbers
+
+    @classmethod
+    def of(cls, case: CaseErrors) -> CaseNumbers:
+        """Of one case."""
+        series = SeriesNumbers(*map(unsigned, (case.height, case.bias, case.camera, case.plan)))
+        return cls(**_summary(case), series=series)
 
 
-def _cause(run: MonitorRun, cause: Cause) -> dict[str, Any]:
-    without, left = cause_heights(run, cause)
-    keys = dict(zip(PARAMETERS, PER_SI, strict=True))
-    return {
-        "what": cause.what,
-        "node": cause.path,
-        "true": {
-            n: {k: float(v * s) for (k, s), v in zip(keys.items(), t, strict=True)} for n, t in cause.truth.items()
-        },
-        "monitor_error": {
-            n: {k: float(v * s) for (k, s), v in zip(keys.items(), t, strict=True)} for n, t in cause.error.items()
-        },
-        "height_without_monitoring_m": without,
-        "height_left_by_monitor_m": left,
-    }
+@dataclass(frozen=True)
+class ConversionNumbers:
+    """Metres of height for an arcsecond; of the angle, of both cameras alike, of each camera."""
+
+    by_angle_m_per_arcsec: float
+    by_common_turn_m_per_arcsec: float
+    by_camera_m_per_arcsec: Mapping[str, float]
+    theory_by_camera_m_per_arcsec: Mapping[str, float]
+    base_to_height: float
+
+
+@dataclass(frozen=True)
+class SlopeNumbers:
+    """Change of the mean height with what the analysis is told of one camera, at the reference."""
+
+    d_alpha_m_per_arcsec: float
+    d_beta_m_per_arcsec: float
+    d_gamma_m_per_arcsec: float
+    d_f_m_per_um: float
+
+    @classmethod
+    def of(cls, run: MonitorRun, name: str) -> Self:
+        """Of one camera by name."""
+        return cls(*(float(v) for v in run.slopes[name][run.flight.spec.referred] / PER_SI))
+
+
+@dataclass(frozen=True)
+class PropagationNumbers:
+    """Sigma of the mean height by the monitor's covariance over the times, and against repeats at one time."""
+
+    height_sigma_m: Array
+    time_s: float
+    repeats: int
+    sigma_m: float
+    spread_m: float
+    ratio: float
+    lower_limit: float
+    upper_limit: float
+    agrees: bool
+
+    @classmethod
+    def of(cls, run: MonitorRun) -> Self:
+        """Of a run."""
+        scatter, (low, high) = run.scatter, run.scatter.limits
+        return cls(
+            height_sigma_m=unsigned(run.sigma),
+            time_s=float(run.flight.times[run.flight.worst]),
+            repeats=len(scatter.heights),
+            sigma_m=scatter.sigma,
+            spread_m=scatter.spread,
+            ratio=scatter.spread / scatter.sigma,
+            lower_limit=low,
+            upper_limit=high,
+            agrees=scatter.agrees,
+        )
+
+
+@dataclass(frozen=True)
+class PartNumbers:
+    """A part of the monitored cameras' height error, signed over the times."""
+
+    height_rms_m: float
+    height_m: Array
+
+
+@dataclass(frozen=True)
+class CauseNumbers:
+    """One cause alone, at one time; by camera."""
+
+    what: str
+    node: str
+    true: Mapping[str, ChangeNumbers]
+    monitor_error: Mapping[str, ChangeNumbers]
+    height_without_monitoring_m: float
+    height_left_by_monitor_m: float
+
+    @classmethod
+    def of(cls, run: MonitorRun, cause: Cause) -> Self:
+        """Of one cause."""
+        true, error = (
+            {name: ChangeNumbers.of(values) for name, values in by_camera.items()}
+            for by_camera in (cause.truth, cause.error)
+        )
+        return cls(cause.what, cause.path, true, error, *cause_heights(run, cause))
+
+
+@dataclass(frozen=True)
+class MonitorNumbers:
+    """monitor.json; errors at the top are those with the file's interval."""
+
+    seed: int
+    interval_s: float
+    height_rms_m: float
+    height_worst_m: float
+    height_camera_rms_m: float
+    plan_rms_m: float
+    metres_per_arcsec: float
+    times_s: Array
+    reference_time_s: float
+    monitored_times_s: Array
+    cameras: Mapping[str, CameraNumbers]
+    intersection_angle: AngleNumbers
+    cases: Mapping[str, CaseNumbers]
+    intervals: Sequence[Mapping[str, float]]
+    conversion: ConversionNumbers
+    sensitivity: Mapping[str, SlopeNumbers]
+    propagation: PropagationNumbers
+    parts: Mapping[str, PartNumbers]
+    causes: Sequence[CauseNumbers]
+    correction_residual_arcsec: float
+
+    @classmethod
+    def of(cls, run: MonitorRun) -> Self:
+        """Of a run."""
+        flight, spec, conversion = run.flight, run.flight.spec, run.conversion
+        chosen = run.cases["interval"]
+        return cls(
+            seed=run.seed,
+            interval_s=spec.interval,
+            height_rms_m=chosen.height_rms,
+            height_worst_m=chosen.worst,
+            height_camera_rms_m=chosen.camera_height_rms,
+            plan_rms_m=chosen.plan_rms,
+            metres_per_arcsec=conversion.of_angle,
+            times_s=flight.times,
+            reference_time_s=spec.reference,
+            monitored_times_s=flight.times[spec.measured(spec.interval)],
+            cameras={name: CameraNumbers.of(flight, name) for name in flight.pair},
+            intersection_angle=AngleNumbers.of(run),
+            cases={name: CaseNumbers.of(case) for name, case in run.cases.items()},
+            intervals=[
+                {"interval_s": interval, **vars(SummaryNumbers.of(case))} for interval, case in run.intervals.items()
+            ],
+            conversion=ConversionNumbers(
+                conversion.of_angle,
+                conversion.of_common,
+                conversion.traced,
+                conversion.theory,
+                conversion.base_to_height,
+            ),
+            sensitivity={name: SlopeNumbers.of(run, name) for name in flight.pair},
+            propagation=PropagationNumbers.of(run),
+            parts={name: PartNumbers(rms(part), unsigned(part)) for name, part in run.parts.items()},
+            causes=[CauseNumbers.of(run, cause) for cause in flight.causes],
+            correction_residual_arcsec=run.residual / ARCSEC,
+        )
+
+
+def monitor_numbers(run: MonitorRun) -> dict[str, Any]:
+    """Contents of monitor.json without its frames."""
+    return dict(plain_data(MonitorNumbers.of(run)))
 
 
 MONITOR = Procedure("monitor", MonitorSetup, resolve_monitor, run_monitor, monitor_numbers)

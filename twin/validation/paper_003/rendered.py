@@ -15,8 +15,8 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_scene import TerrainSpec
 from scenes.specs.orbit_setup import CalibrationSetup
-from twin.orbit.calibration.calibration_numbers import ImageTotals
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.image_numbers import ImageTotals
 from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, tested, tested_before
 from twin.orbit.calibration.screening import screened
 from twin.orbit.ground.grid import GroundFrame, stream
