@@ -13,7 +13,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_report import pixel_axes, points_section
-from twin.orbit.images.simulate_numbers import camera_data, georeference, trajectory_data, truth_data
+from twin.orbit.images.simulate_files import camera_data, georeference_data, trajectory_data, truth_data
 from twin.orbit.images.simulate_run import Simulation
 from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
 from twin.run.reference_frames import described
@@ -187,16 +187,14 @@ def _sharpness(run: Simulation) -> Section:
 
 
 def _data(run: Simulation) -> Section:
-    errors, control = run.spec.errors, run.patch.control
-    gps, star = errors.gps.interval, errors.star_tracker.interval
-    rasters = {"orthophoto": georeference(control.orthophoto), "dem": georeference(control.dem)}
     camera = described("camera", camera_data(run.laboratory))
-    path = described("trajectory", trajectory_data(run.measured, gps, star))
+    path = described("trajectory", trajectory_data(run, run.measured))
+    rasters = described("georeference", georeference_data(run))
     truth = described("simulate-truth", truth_data(run))
     parts = (
         Data("camera", "Camera", "As the laboratory measured it.", camera),
         Data("trajectory", "Orbit and attitude", "As measured.", path),
-        Data("georeference", "Georeference", "Of orthophoto and elevation model.", described("georeference", rasters)),
+        Data("georeference", "Georeference", "Of orthophoto and elevation model.", rasters),
         Data("truth", "Truth", "Camera, orbit, attitude, ground points; not for an analysis.", truth),
     )
     text = (
