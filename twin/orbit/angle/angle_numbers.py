@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
@@ -11,101 +12,209 @@ from analysis.orbit.sensitivity import STATEMENTS, judge
 from analysis.units import ARCSEC
 from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_run import AngleRun, Scatter, run_angle, values_of
+from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 
 PRINTED_DIFFERENCE_ARCSEC = {"alpha": 0.44, "beta": 1.53}
 """Resection and planes, paper 000, Table 1."""
 
 
-def angle_numbers(run: AngleRun) -> dict[str, Any]:
-    """Contents of angle.json without its frames; what could not be computed is None. Angles' keys begin with their
-    names.
-    """
-    estimate, flight, names = run.estimate, run.flight, run.names
-
-    def degrees(values: Iterable[float]) -> dict[str, float | None]:
-        return {f"{name}_deg": _number(np.degrees(v)) for name, v in zip(names, values, strict=True)}
-
-    def sigmas(values: Iterable[float]) -> dict[str, float | None]:
-        return {f"{name}_sigma_arcsec": _number(v / ARCSEC) for name, v in zip(names, values, strict=True)}
-
-    def arcsec(values: Iterable[float]) -> dict[str, float | None]:
-        return {name: _number(v / ARCSEC) for name, v in zip(names, values, strict=True)}
-
-    return {
-        "seed": run.seed,
-        "time_s": flight.spec.time,
-        "angles": {name: list(pair) for name, pair in flight.pairs.items()},
-        "planes": {
-            method: {**degrees(angles.values), **sigmas(angles.sigma)} for method, angles in estimate.angles.items()
-        },
-        "folded": {name: bool(f) for name, f in zip(names, estimate.angles["tls"].folded, strict=True)},
-        "look": degrees(estimate.look),
-        "along_track": {**degrees(estimate.along.values), **sigmas(estimate.along.sigma)},
-        "resection": {
-            **degrees(run.resected),
-            **sigmas(run.resected_sigma),
-            "p_value": estimate.resection.p_value,
-        },
-        "truth": {
-            "look": degrees(flight.look.values()),
-            "dihedral": degrees(flight.dihedral.values()),
-            "along_track": degrees(flight.along_track.values()),
-        },
-        "change_arcsec": {
-            "ground": arcsec(run.change),
-            "truth": arcsec(values_of(flight.look) - values_of(flight.laboratory_look)),
-            "trace": {name: _number(v / ARCSEC) for name, v in flight.trace.items()},
-        },
-        "difference_arcsec": arcsec(run.difference),
-        "difference_sigma_arcsec": arcsec(run.difference_sigma),
-        "difference_printed_arcsec": dict(PRINTED_DIFFERENCE_ARCSEC) if run.of_paper else {},
-        "sensitivity": [row.to_dict() for row in run.table],
-        "statements": [
-            {
-                "figure": j.statement.figure,
-                "text": j.statement.text,
-                "holds": bool(j.holds),
-                "ratio": _number(j.ratio),
-                "numbers": {axis: _number(v) for axis, v in j.numbers.items()},
-            }
-            for j in (judge(statement, run.table) for statement in STATEMENTS if run.of_paper)
-        ],
-        "effects": [
-            {"what": row.what, "bias_arcsec": arcsec(row.bias), "corrected_arcsec": arcsec(row.left)}
-            for row in run.effects
-        ],
-        "frames": [
-            {
-                "frame": row.frame,
-                "method": row.method,
-                **degrees(row.values),
-                **sigmas(row.sigma),
-                "least_normal_z": row.steepest,
-                "near_vertical": row.warned,
-            }
-            for row in run.frames
-        ],
-        "scatter": {
-            "passes": len(run.planes.values),
-            "planes": _scatter(names, run.planes),
-            "along_track": _scatter(names, run.along),
-            "resection": _scatter(names, run.resection),
-        },
-        "height_m_per_arcsec": dict(run.height),
-    }
-
-
-def _scatter(names: Sequence[str], scatter: Scatter) -> dict[str, Any]:
-    rows = {"bias": scatter.bias, "spread": scatter.spread, "sigma": scatter.sigma}
-    return {
-        **{f"{key}_arcsec": dict(zip(names, (row / ARCSEC).tolist(), strict=True)) for key, row in rows.items()},
-        "p_value": dict(zip(names, scatter.tail.tolist(), strict=True)),
-    }
+ByAngle = Mapping[str, float | None]
+"""A number for each angle of the test's file; what could not be computed is None."""
 
 
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def _arcsec(names: Iterable[str], values: Iterable[float]) -> ByAngle:
+    """Radians as arcseconds."""
+    return {name: _number(v / ARCSEC) for name, v in zip(names, values, strict=True)}
+
+
+def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
+    """Radians as degrees; keys say so, since they stand beside those of sigmas."""
+    return {f"{name}_deg": _number(np.degrees(v)) for name, v in zip(names, values, strict=True)}
+
+
+def _with_sigmas(names: Iterable[str], values: Iterable[float], sigmas: Iterable[float]) -> ByAngle:
+    """Angles in degrees, then their sigmas in arcseconds."""
+    names = tuple(names)
+    claimed = {f"{name}_sigma_arcsec": _number(v / ARCSEC) for name, v in zip(names, sigmas, strict=True)}
+    return {**_degrees(names, values), **claimed}
+
+
+@dataclass(frozen=True)
+class TruthNumbers:
+    """Angles of the true camera, by each definition."""
+
+    look: ByAngle
+    dihedral: ByAngle
+    along_track: ByAngle
+
+    @classmethod
+    def of(cls, run: AngleRun) -> Self:
+        """Of a run."""
+        angles = run.flight.look, run.flight.dihedral, run.flight.along_track
+        return cls(*(_degrees(run.names, values.values()) for values in angles))
+
+
+@dataclass(frozen=True)
+class ChangeNumbers:
+    """Changes of the look angles since the laboratory, arcseconds: from the ground, true, by the instrument's trace."""
+
+    ground: ByAngle
+    truth: ByAngle
+    trace: ByAngle
+
+    @classmethod
+    def of(cls, run: AngleRun) -> Self:
+        """Of a run."""
+        flight = run.flight
+        return cls(
+            ground=_arcsec(run.names, run.change),
+            truth=_arcsec(run.names, values_of(flight.look) - values_of(flight.laboratory_look)),
+            trace=_arcsec(flight.trace, flight.trace.values()),
+        )
+
+
+@dataclass(frozen=True)
+class StatementNumbers:
+    """A sentence of the paper on its figures, judged."""
+
+    figure: str
+    text: str
+    holds: bool
+    ratio: float | None
+    numbers: Mapping[str, float | None]
+
+    @classmethod
+    def of(cls, run: AngleRun) -> tuple[Self, ...]:
+        """All sentences; none where the angles are not the paper's."""
+        judged = [judge(statement, run.table) for statement in STATEMENTS if run.of_paper]
+        return tuple(
+            cls(
+                figure=j.statement.figure,
+                text=j.statement.text,
+                holds=bool(j.holds),
+                ratio=_number(j.ratio),
+                numbers={axis: _number(v) for axis, v in j.numbers.items()},
+            )
+            for j in judged
+        )
+
+
+@dataclass(frozen=True)
+class EffectNumbers:
+    """What an effect on the light does to the angles, and what its correction leaves."""
+
+    what: str
+    bias_arcsec: ByAngle
+    corrected_arcsec: ByAngle
+
+
+@dataclass(frozen=True)
+class ScatterNumbers:
+    """One estimator over the passes; p_value: chance of a spread as far off if the sigma is right."""
+
+    bias_arcsec: ByAngle
+    spread_arcsec: ByAngle
+    sigma_arcsec: ByAngle
+    p_value: ByAngle
+
+    @classmethod
+    def of(cls, names: Sequence[str], scatter: Scatter) -> Self:
+        """Of one estimator."""
+        rows = scatter.bias / ARCSEC, scatter.spread / ARCSEC, scatter.sigma / ARCSEC, scatter.tail
+        return cls(*(dict(zip(names, row.tolist(), strict=True)) for row in rows))
+
+
+@dataclass(frozen=True)
+class PassesNumbers:
+    """Passes with errors drawn anew."""
+
+    passes: int
+    planes: ScatterNumbers
+    along_track: ScatterNumbers
+    resection: ScatterNumbers
+
+    @classmethod
+    def of(cls, run: AngleRun) -> Self:
+        """Of a run."""
+        estimators = run.planes, run.along, run.resection
+        return cls(len(run.planes.values), *(ScatterNumbers.of(run.names, scatter) for scatter in estimators))
+
+
+@dataclass(frozen=True)
+class AngleNumbers:
+    """angle.json; frames: of every form of the planes in every frame."""
+
+    seed: int
+    time_s: float
+    angles: Mapping[str, Sequence[str]]
+    planes: Mapping[str, ByAngle]
+    folded: Mapping[str, bool]
+    look: ByAngle
+    along_track: ByAngle
+    resection: ByAngle
+    truth: TruthNumbers
+    change_arcsec: ChangeNumbers
+    difference_arcsec: ByAngle
+    difference_sigma_arcsec: ByAngle
+    difference_printed_arcsec: ByAngle
+    sensitivity: Sequence[Mapping[str, Any]]
+    statements: Sequence[StatementNumbers]
+    effects: Sequence[EffectNumbers]
+    frames: Sequence[Mapping[str, Any]]
+    scatter: PassesNumbers
+    height_m_per_arcsec: ByAngle
+
+    @classmethod
+    def of(cls, run: AngleRun) -> Self:
+        """Of a run."""
+        estimate, flight, names = run.estimate, run.flight, run.names
+        return cls(
+            seed=run.seed,
+            time_s=flight.spec.time,
+            angles=flight.pairs,
+            planes={
+                method: _with_sigmas(names, angles.values, angles.sigma) for method, angles in estimate.angles.items()
+            },
+            folded={name: bool(f) for name, f in zip(names, estimate.angles["tls"].folded, strict=True)},
+            look=_degrees(names, estimate.look),
+            along_track=_with_sigmas(names, estimate.along.values, estimate.along.sigma),
+            resection={
+                **_with_sigmas(names, run.resected, run.resected_sigma),
+                "p_value": estimate.resection.p_value,
+            },
+            truth=TruthNumbers.of(run),
+            change_arcsec=ChangeNumbers.of(run),
+            difference_arcsec=_arcsec(names, run.difference),
+            difference_sigma_arcsec=_arcsec(names, run.difference_sigma),
+            difference_printed_arcsec=PRINTED_DIFFERENCE_ARCSEC if run.of_paper else {},
+            sensitivity=[row.to_dict() for row in run.table],
+            statements=StatementNumbers.of(run),
+            effects=[
+                EffectNumbers(row.what, _arcsec(names, row.bias), _arcsec(names, row.left)) for row in run.effects
+            ],
+            frames=[
+                {
+                    "frame": row.frame,
+                    "method": row.method,
+                    **_with_sigmas(names, row.values, row.sigma),
+                    "least_normal_z": row.steepest,
+                    "near_vertical": row.warned,
+                }
+                for row in run.frames
+            ],
+            scatter=PassesNumbers.of(run),
+            height_m_per_arcsec=run.height,
+        )
+
+
+def angle_numbers(run: AngleRun) -> dict[str, Any]:
+    """Contents of angle.json without its frames. Keys of angles begin with their names."""
+    return dict(plain_data(AngleNumbers.of(run)))
 
 
 ANGLE = Procedure("angle", AngleSetup, resolve_angle, run_angle, angle_numbers)
