@@ -1,0 +1,161 @@
+"""A test of one's own, from outside: what it takes to make a command and a base of studies of it."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import read_yaml
+from tests.twin.commands import files, invoke
+from twin.run import reference_frames
+from twin.run.artefact import SvgFigure, Table
+from twin.run.command import add_test
+from twin.run.plain_data import plain_data
+from twin.run.procedure import Advance, BenchError, Procedure
+from twin.run.report import Report, Section
+from twin.study.runs.base_job import Failure, ProcedureBase, Run
+
+FILE = "name: levels\nreadings: 5\nsigma_arcsec: 0.5\nseed: 3\n"
+MOST = 100
+
+
+class LevelSpec(Spec):
+    name: Name
+    readings: Whole
+    sigma_arcsec: Number
+    seed: Seed = 1
+
+
+class LevelSetup(ExperimentSetup[LevelSpec]):
+    pass
+
+
+@dataclass(frozen=True)
+class LevelRun:
+    setup: LevelSetup
+    seed: int
+    backend: str
+    readings: np.ndarray
+
+
+@dataclass(frozen=True)
+class LevelNumbers:
+    seed: int
+    mean_arcsec: float
+    mean_arcsec_sigma: float
+    readings_arcsec: np.ndarray
+
+
+def resolve(path: Path | str) -> LevelSetup:
+    again = read_setup(LevelSetup, path)
+    return again or LevelSetup.model_construct(test=validate(LevelSpec, read_yaml(path)))
+
+
+def measure(setup: LevelSetup, backend: Backend, seed: int, advance: Advance) -> LevelRun:
+    test = setup.test
+    if test.readings > MOST:
+        raise BenchError("the memory of the level is full", ("readings",), f"{MOST} or fewer")
+    advance("read", test.readings, test.readings)
+    readings = np.random.default_rng(seed).normal(0.0, test.sigma_arcsec, test.readings)
+    return LevelRun(setup, seed, backend.name, readings)
+
+
+def numbers(run: LevelRun) -> dict:
+    scatter = float(np.std(run.readings, ddof=1))
+    return plain_data(LevelNumbers(run.seed, np.mean(run.readings), scatter / len(run.readings) ** 0.5, run.readings))
+
+
+def report(run: LevelRun) -> Report:
+    rows = [(k, float(v)) for k, v in enumerate(run.readings)]
+    figure = SvgFigure("scatter", "Scatter", "All readings.", "<svg></svg>")
+    return Report(
+        title="Level",
+        lead=(f"{len(rows)} readings.",),
+        facts=(("sigma", f"{run.setup.test.sigma_arcsec} arcsec"),),
+        summary=Table("readings", "Readings", "", ("number", "arcsec"), rows),
+        sections=(Section("Readings", (), (figure,)),),
+        images={"level": np.zeros((1, 4, 4), np.uint16)},
+        warnings=("a toy",),
+    )
+
+
+LEVEL = Procedure("level", LevelSetup, resolve, measure, numbers)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
+    frames = {**reference_frames.FRAMES, "level": {"readings_arcsec": "about the level's own axis"}}
+    monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap(frames))
+    app = typer.Typer()
+
+    @app.callback()
+    def main() -> None:
+        """Instruments of one's own."""
+
+    add_test(app, "own.bench", "level", LEVEL, report, "Read a level.")
+    return lambda *arguments: invoke(app, *arguments)
+
+
+def test_command(run: Callable, tmp_path: Path) -> None:
+    path = tmp_path / "level.yaml"
+    path.write_text(FILE, "utf-8")
+    done = run("level", path, "--out", tmp_path / "run", "--seed", 7, "--json")
+    assert done.exit_code == 0, done.stderr
+    data = json.loads((tmp_path / "run" / "level.json").read_text("utf-8"))
+    assert json.loads(done.stdout) == data
+    assert list(data) == [
+        *("schema", "reference_frames"),
+        *("seed", "mean_arcsec", "mean_arcsec_sigma", "readings_arcsec"),
+    ]
+    assert data["seed"] == 7
+    assert data["readings_arcsec"] == np.random.default_rng(7).normal(0.0, 0.5, 5).tolist()
+    assert files(tmp_path / "run") == {
+        *("config.yaml", "level.json", "manifest.json", "report.html"),
+        *("artefacts/readings.csv", "artefacts/scatter.svg", "images/level.tiff", "images/level.png"),
+    }
+    page = (tmp_path / "run" / "report.html").read_text("utf-8")
+    for text in (
+        "<h1>Level</h1>",
+        "5 readings.",
+        "a toy",
+        'href="level.json"',
+        "python -m own.bench level config.yaml",
+    ):
+        assert text in page, text
+    again = run("level", tmp_path / "run" / "config.yaml", "--out", tmp_path / "again", "--quiet")
+    assert again.exit_code == 0, again.stderr
+    assert (tmp_path / "again" / "level.json").read_bytes() == (tmp_path / "run" / "level.json").read_bytes()
+
+
+def test_what_fails_on_the_bench_is_told_at_the_line_of_the_file(run: Callable, tmp_path: Path) -> None:
+    path = tmp_path / "level.yaml"
+    path.write_text(FILE.replace("readings: 5", "readings: 500"), "utf-8")
+    done = run("level", path, "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    assert f"{path}:2: readings" in done.stderr
+    assert "100 or fewer" in done.stderr
+    assert files(tmp_path) == {"level.yaml"}
+
+
+def test_base_of_studies(backend: Backend, tmp_path: Path) -> None:
+    """Numbers without frames, of the base's seed or the run's own; a run that fails says why and leaves the others."""
+    path = tmp_path / "level.yaml"
+    path.write_text(FILE, "utf-8")
+    base = ProcedureBase(LEVEL)
+    tree = base.resolve(path).plain()
+    readings = ("test", "readings")
+    runs = (Run(0, (), None), Run(1, (), 4), Run(2, ((readings, 500),), None))
+    first, second, third = base.evaluate(tree, runs, backend)
+    assert set(first) == {"level"}
+    assert first["level"] == numbers(measure(base.resolve(path), backend, 3, lambda *_: None))
+    assert second["level"]["seed"] == 4
+    assert third == Failure("the memory of the level is full")
