@@ -16,7 +16,7 @@ from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.derivatives import push_forward
-from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.system import FrameNumbers, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.imaging import aim_collimated
 
@@ -113,20 +113,17 @@ def trace_beams(
     if not valid.all():
         raise BeamMissedError("a part of a beam misses a surface of the prescription")
     hits = np.stack([traced.hit(i)[0] for i in keep])
-    rotation, origin = _stands(imaging)
+    rotation, origin = _stands(imaging.world)
     points = np.einsum("kij,knj->kni", rotation[:, 0], hits) + origin[:, 0, None]
     points = np.concatenate([launch[None], points.reshape(len(hits), *shape)])
     rays = DesignRays(position.reshape(shape), direction.reshape(shape), path.reshape(shape[:2]) + phase, points)
     return rays if variables is None else _differentiated(backend, prescription, beams, variables, rays, chief)
 
 
-def _stands(systems: SystemBatch, tangents: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def _stands(poses: Sequence[FrameNumbers]) -> tuple[np.ndarray, np.ndarray]:
     """World rotation (K, B, 3, 3) and origin (K, B, 3) of a batch's elements, or their derivatives."""
-    tables = systems.tangents if tangents else systems.values
-    assert tables is not None
-    rotation = [[[table[f"W{a}{b}"] for b in range(3)] for a in range(3)] for table in tables]
-    origin = [[table[f"P{a}"] for a in range(3)] for table in tables]
-    return np.moveaxis(np.array(rotation), -1, 1), np.moveaxis(np.array(origin), -1, 1)
+    rotation, origin = zip(*(pose.arrays() for pose in poses), strict=True)
+    return np.stack(rotation), np.stack(origin)
 
 
 def _differentiated(
@@ -175,8 +172,9 @@ def _differentiated(
         heading_step.reshape(flat),
         keep=keep,
     )
-    rotation, _ = _stands(systems)
-    rotation_step, origin_step = _stands(systems, tangents=True)
+    assert systems.world_tangents is not None
+    rotation, _ = _stands(systems.world)
+    rotation_step, origin_step = _stands(systems.world_tangents)
     hits = np.stack([pushed.traced.hit(k) for k in keep])
     hit_steps = np.stack([pushed.hits[k] for k in keep])
     points = np.einsum("kvij,kvnj->kvni", rotation, hit_steps) + np.einsum("kvij,kvnj->kvni", rotation_step, hits)

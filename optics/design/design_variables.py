@@ -15,6 +15,7 @@ from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
 from optics.geometry.tree import Body, RigidTree
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.number_tree import Path, leaves, map_leaves, with_leaf
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import SystemBatch, assemble
 
@@ -22,7 +23,15 @@ SHAPE = ("curvature", "conic", "A4", "A6", "A8")
 STAND = ("z", "y", "tilt")
 BIAS = "field_bias"
 _STEPS = {"z": ("", "shift", 2), "y": ("", "shift", 1), "tilt": ("/face", "rotate", 0)}
-_NUMBERS = {"curvature": "c", "conic": "k", "A4": "A0", "A6": "A1", "A8": "A2"}
+_NUMBERS: Mapping[str, Path] = FrozenMap(
+    {
+        "curvature": ("surface", "curvature"),
+        "conic": ("surface", "conic"),
+        "A4": ("surface", "even", 0),
+        "A6": ("surface", "even", 1),
+        "A8": ("surface", "even", 2),
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -148,14 +157,17 @@ class Prescription:
         along = assembly.sequences[sequence]
         tables = []
         for i, name in enumerate(along):
-            zero = np.zeros(len(variables))
-            table = {k: np.asarray(systems.tangents[i].get(k, zero)) for k in systems.values[i]}
+            table = map_leaves(_or_zero, systems.values[i], systems.tangents[i])
             for n, variable in enumerate(variables):
                 if variable.element == name and variable.quantity in _NUMBERS:
                     number = _NUMBERS[variable.quantity]
-                    table[number] = table[number] + np.eye(len(variables))[n]
+                    table = with_leaf(table, number, leaves(table)[number] + np.eye(len(variables))[n])
             tables.append(table)
         return replace(systems, tangents=tuple(tables))
+
+
+def _or_zero(value: np.ndarray, tangent: np.ndarray | None) -> np.ndarray:
+    return np.zeros_like(value) if tangent is None else tangent
 
 
 def _step(variable: Variable) -> tuple[str, str, int]:

@@ -1,4 +1,8 @@
-"""Clear apertures of surfaces, in the surface's own x, y."""
+"""Clear apertures of surfaces, in the surface's own x, y.
+
+Whether a point lies inside is decided here for all: by the methods ``contains`` of the numbers that an aperture
+consists of, which work on floats, NumPy arrays and in kernels.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,68 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class DiskNumbers:
+    """A disk about (x, y), metres, with the square of its radius, m^2."""
+
+    x: Any
+    y: Any
+    radius_squared: Any
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside, the edge included."""
+        dx, dy = x - self.x, y - self.y
+        return dx * dx + dy * dy <= self.radius_squared
+
+
+@dataclass(frozen=True, eq=False)
+class RingNumbers:
+    """A disk with a concentric hole, whose radius squared is ``hole_squared``, m^2."""
+
+    x: Any
+    y: Any
+    radius_squared: Any
+    hole_squared: Any
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside, both edges included."""
+        dx, dy = x - self.x, y - self.y
+        r2 = dx * dx + dy * dy
+        return (r2 <= self.radius_squared) & (r2 >= self.hole_squared)
+
+
+@dataclass(frozen=True, eq=False)
+class RectangleNumbers:
+    """A rectangle about (x, y) with its half-widths, metres."""
+
+    x: Any
+    y: Any
+    half_x: Any
+    half_y: Any
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside, the edge included."""
+        return (abs(x - self.x) <= self.half_x) & (abs(y - self.y) <= self.half_y)
+
+
+@dataclass(frozen=True, eq=False)
+class EllipseNumbers:
+    """An ellipse about (x, y) with its half axes, metres."""
+
+    x: Any
+    y: Any
+    half_x: Any
+    half_y: Any
+
+    def contains(self, x: Any, y: Any) -> Any:
+        """Mask of points inside, the edge included."""
+        u, v = (x - self.x) / self.half_x, (y - self.y) / self.half_y
+        return u * u + v * v <= 1.0
+
+
+ApertureNumbers = DiskNumbers | RingNumbers | RectangleNumbers | EllipseNumbers
 
 
 @dataclass(frozen=True)
@@ -23,10 +89,12 @@ class Circle:
 
     def contains(self, x: Any, y: Any) -> Any:
         """Mask of points inside; NumPy or Dr.Jit arrays."""
-        dx, dy = x - self.centre[0], y - self.centre[1]
-        r2 = dx * dx + dy * dy
-        inside = r2 <= self.radius**2
-        return inside & (r2 >= self.inner**2) if self.inner else inside
+        return self.numbers().contains(x, y)
+
+    def numbers(self, size: Any = 1.0) -> DiskNumbers | RingNumbers:
+        """What decides on a body of that size (1 is the nominal one, or an array)."""
+        x, y, square = size * self.centre[0], size * self.centre[1], (size * self.radius) ** 2
+        return RingNumbers(x, y, square, (size * self.inner) ** 2) if self.inner else DiskNumbers(x, y, square)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -61,7 +129,11 @@ class Rectangle:
 
     def contains(self, x: Any, y: Any) -> Any:
         """Mask of points inside; NumPy or Dr.Jit arrays."""
-        return (abs(x - self.centre[0]) <= self.half_x) & (abs(y - self.centre[1]) <= self.half_y)
+        return self.numbers().contains(x, y)
+
+    def numbers(self, size: Any = 1.0) -> RectangleNumbers:
+        """What decides on a body of that size (1 is the nominal one, or an array)."""
+        return RectangleNumbers(size * self.centre[0], size * self.centre[1], size * self.half_x, size * self.half_y)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -99,8 +171,11 @@ class Ellipse:
 
     def contains(self, x: Any, y: Any) -> Any:
         """Mask of points inside; NumPy or Dr.Jit arrays."""
-        u, v = (x - self.centre[0]) / self.half_x, (y - self.centre[1]) / self.half_y
-        return u * u + v * v <= 1.0
+        return self.numbers().contains(x, y)
+
+    def numbers(self, size: Any = 1.0) -> EllipseNumbers:
+        """What decides on a body of that size (1 is the nominal one, or an array)."""
+        return EllipseNumbers(size * self.centre[0], size * self.centre[1], size * self.half_x, size * self.half_y)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:

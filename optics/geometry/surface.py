@@ -1,4 +1,4 @@
-"""A surface: its ideal shape and its figure error, on NumPy arrays and in kernels."""
+"""A surface: its ideal shape and its figure error, on NumPy arrays and, as a level function, in kernels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
 from optics.geometry import zernike
-from optics.geometry.zernike import triangle_index
+from optics.geometry.zernike import triangle_index, triangle_order
 from optics.numerics.frozen_map import FrozenMap
 
 
@@ -71,6 +71,13 @@ class GridFigure:
         return np.pad(coefficients, 2, mode="reflect")
 
     @property
+    def numbers(self) -> GridNumbers:
+        """What a kernel reads of it, with the coefficients ``spline`` at the beginning of its table."""
+        dx, dy = self.spacing
+        rows, columns = self.values.shape
+        return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
+
+    @property
     def spacing(self) -> tuple[float, float]:
         """Sample distance along x and y, metres."""
         x0, x1, y0, y1 = self.bounds
@@ -87,6 +94,115 @@ class GridFigure:
 
 
 Figure = ZernikeFigure | GridFigure
+
+
+@dataclass(frozen=True, eq=False)
+class FigureNumbers:
+    """A figure as a polynomial about (x, y), metres: c_ab of x^a y^b, ordered by ``zernike.triangle_index``."""
+
+    x: Any
+    y: Any
+    coefficients: tuple[Any, ...]
+
+    @property
+    def order(self) -> int:
+        """Highest degree a + b."""
+        return triangle_order(len(self.coefficients))
+
+
+@dataclass(frozen=True, eq=False)
+class GridNumbers:
+    """Where the samples of a ``GridFigure`` stand: first ones at (x, y), metres; samples per metre; how many there are;
+    place of the first coefficient in the table.
+    """
+
+    x: Any
+    y: Any
+    per_x: Any
+    per_y: Any
+    columns: Any
+    rows: Any
+    first: Any
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceNumbers:
+    """What a surface consists of in kernels: numbers, or arrays of them for many surfaces of the same form.
+
+    What is None or empty is no part of the code that ``level`` makes.
+
+    Attributes:
+        curvature, conic: c, 1/m, and k; None for a plane.
+        even: A4, A6, ..., m^-3, m^-5, ...
+        figure, grid: departures from that shape.
+    """
+
+    curvature: Any = None
+    conic: Any = None
+    even: tuple[Any, ...] = ()
+    figure: FigureNumbers | None = None
+    grid: GridNumbers | None = None
+
+    @property
+    def is_conic(self) -> bool:
+        """True when there is nothing but a conic or a plane: a ray's crossing has a closed form."""
+        return not self.even and self.figure is None and self.grid is None
+
+
+def level(
+    x: Any, y: Any, z: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True
+) -> tuple[Any, Any, Any, Any]:
+    """Level function G of a surface and its gradient, on Dr.Jit arrays.
+
+    With h the aspheric terms and the figure and w = z - h(x, y), the surface is where
+
+        G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
+
+    the conic's own equation in w: no square root and no division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
+    positive on the sheet of the vertex.
+
+    Args:
+        x: where, in the surface's frame, metres.
+        y: likewise.
+        z: likewise.
+        surface: its numbers.
+        table: coefficients of grid figures.
+        active: points that matter; elsewhere the table is not read.
+    """
+    import drjit as dr
+
+    height: Any = None
+    sx: Any = None
+    sy: Any = None
+    r2 = dr.fma(x, x, y * y)
+    if surface.even:
+        # h and dh/d(r^2) of sum A_n r^(2n+4) by Horner, from the highest term down
+        last = len(surface.even) - 1
+        polynomial: Any = surface.even[last]
+        slope: Any = float(last + 2) * surface.even[last]
+        for n in range(last - 1, -1, -1):
+            polynomial = dr.fma(polynomial, r2, surface.even[n])
+            slope = dr.fma(slope, r2, float(n + 2) * surface.even[n])
+        radial = 2.0 * slope * r2
+        height, sx, sy = polynomial * r2 * r2, radial * x, radial * y
+    if surface.figure is not None:
+        figure = surface.figure
+        added = polynomial_figure(x - figure.x, y - figure.y, figure.coefficients, figure.order)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
+    if surface.grid is not None:
+        added = grid_figure(x, y, surface.grid, table, active)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
+    w = z if height is None else z - height
+    if surface.curvature is None:
+        return w, (0.0 * x if sx is None else -sx), (0.0 * x if sy is None else -sy), 1.0 + 0.0 * x
+    c = surface.curvature
+    qw = (1.0 + surface.conic) * w
+    value = dr.fma(-0.5 * c, dr.fma(qw, w, r2), w)
+    nz = dr.fma(-c, qw, 1.0)
+    nx, ny = -c * x, -c * y
+    if sx is not None:
+        nx, ny = dr.fma(-nz, sx, nx), dr.fma(-nz, sy, ny)
+    return value, nx, ny, nz
 
 
 def polynomial_figure(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
@@ -109,22 +225,22 @@ def polynomial_figure(x: Any, y: Any, coefficients: Sequence[Any], order: int) -
     return height, slope_x, slope_y
 
 
-def grid_figure(x: Any, y: Any, g: Mapping[str, Any], table: Any) -> tuple[Any, Any, Any]:
-    """Cubic B-spline of a ``GridFigure`` and its slopes; ``table`` holds its padded coefficients, row by row."""
+def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    """Cubic B-spline of a ``GridFigure`` and its slopes; ``table`` holds padded coefficients, row by row."""
     import drjit as dr
 
     float_type = type(x)
     index_type = dr.uint32_array_t(float_type)
-    columns, rows = g["gnx"], g["gny"]
-    u = dr.clip((x - g["gx0"]) * g["gix"], 0.0, columns - 1.0)
-    v = dr.clip((y - g["gy0"]) * g["giy"], 0.0, rows - 1.0)
+    columns, rows = grid.columns, grid.rows
+    u = dr.clip((x - grid.x) * grid.per_x, 0.0, columns - 1.0)
+    v = dr.clip((y - grid.y) * grid.per_y, 0.0, rows - 1.0)
     iu = dr.minimum(dr.floor(u), columns - 2.0)
     iv = dr.minimum(dr.floor(v), rows - 2.0)
     wu, du = _weights(u - iu)
     wv, dv = _weights(v - iv)
     width = index_type(columns + 4.0)
     # the table has two extra samples on every side, so that sample -1 of the stencil is at +1
-    start = (index_type(iv) + 1) * width + index_type(iu) + 1
+    start = (index_type(iv) + 1) * width + index_type(iu) + 1 + index_type(grid.first)
     height: Any = 0.0 * x
     slope_x: Any = 0.0 * x
     slope_y: Any = 0.0 * x
@@ -132,13 +248,13 @@ def grid_figure(x: Any, y: Any, g: Mapping[str, Any], table: Any) -> tuple[Any, 
         row: Any = 0.0 * x
         row_slope: Any = 0.0 * x
         for i in range(4):
-            c = dr.gather(float_type, table, start + j * width + i)
+            c = dr.gather(float_type, table, start + j * width + i, active)
             row = row + wu[i] * c
             row_slope = row_slope + du[i] * c
         height = height + wv[j] * row
         slope_x = slope_x + wv[j] * row_slope
         slope_y = slope_y + dv[j] * row
-    return height, slope_x * g["gix"], slope_y * g["giy"]
+    return height, slope_x * grid.per_x, slope_y * grid.per_y
 
 
 def _weights(f: Any) -> tuple[list[Any], list[Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from math import comb, factorial, sqrt
+from math import comb, factorial, isqrt, sqrt
 from typing import Any
 
 import numpy as np
@@ -100,6 +100,14 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
 def triangle_size(order: int) -> int:
     """Number of monomials x^a y^b with a + b <= order."""
     return (order + 1) * (order + 2) // 2
+
+
+def triangle_order(size: int) -> int:
+    """Order of which there are ``size`` monomials: the inverse of ``triangle_size``."""
+    order = (isqrt(8 * size + 1) - 3) // 2
+    if triangle_size(order) != size:
+        raise ValueError(f"{size} monomials are not all of some order")
+    return order
 
 
 def triangle_index(a: int, b: int) -> int:

@@ -8,10 +8,10 @@ from enum import Enum
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.surface import Surface
-from optics.geometry.tree import PlacedBodies, RigidTree, State
+from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
+from optics.geometry.tree import Motion, PlacedBodies, RigidTree, State
 from optics.numerics.frozen_map import FrozenMap
 
 
@@ -48,6 +48,40 @@ class Element:
     aperture: Aperture | None = None
     index_after: float = 1.0
     solid: str | None = None
+
+    @property
+    def figure_disk(self) -> ZernikeFigure:
+        """The surface's own Zernike figure, to whose terms a state's are added; with no terms, over the clear
+        aperture's disk, when it has none.
+
+        Raises:
+            ValueError: neither a Zernike figure nor an aperture sets the disk.
+        """
+        match self.surface.figure, self.aperture:
+            case ZernikeFigure() as own, _:
+                return own
+            case _, Circle() as circle:
+                return ZernikeFigure(circle.radius, circle.centre)
+            case _, (Rectangle() | Ellipse()) as box:
+                return ZernikeFigure(float(np.hypot(box.half_x, box.half_y)), box.centre)
+            case _:
+                raise ValueError(f"element {self.name!r} needs an aperture to carry a figure: it sets the disk")
+
+    def figured(self, motion: Motion) -> Surface:
+        """The surface with what a motion adds to its figure.
+
+        Raises:
+            ValueError: nothing sets the disk of that figure, or the surface has a grid figure, too.
+        """
+        if not motion.figure:
+            return self.surface
+        disk = self.figure_disk
+        if isinstance(self.surface.figure, GridFigure):
+            raise ValueError(f"element {self.name!r} has a grid figure; as one surface it cannot carry another")
+        terms = {**disk.terms}
+        for j, amplitude in motion.figure.items():
+            terms[j] = terms.get(j, 0.0) + amplitude
+        return self.surface.with_figure(replace(disk, terms=terms))
 
     def with_aperture(self, aperture: Aperture | None) -> Element:
         """The same element with another aperture."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics.numerics.backend import Backend
+from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import Traced, make_rays, rows, trace
 
@@ -84,12 +85,12 @@ class RayCotangents:
     """Derivatives of S_b = sum_n w_bn . r_bn, with r the rays at the last element of system b and w given weights.
 
     Attributes:
-        values: per element, parameter name -> dS_b/d(number of system b), (B,), for the names that were asked for.
+        values: per element, path of a number -> dS_b/d(number of system b), (B,), for those that were asked for.
         position: dS_b/d(launch point), (B, N, 3), per metre.
         direction: dS_b/d(launch direction), (B, N, 3); its part along the ray means nothing by itself.
     """
 
-    values: tuple[Mapping[str, np.ndarray], ...]
+    values: tuple[Mapping[Path, np.ndarray], ...]
     position: np.ndarray
     direction: np.ndarray
 
@@ -100,7 +101,7 @@ def pull_back(
     position: np.ndarray,
     direction: np.ndarray,
     weight: np.ndarray,
-    names: Sequence[Collection[str]],
+    names: Sequence[Collection[Path]],
 ) -> RayCotangents:
     """Trace rays and differentiate a weighted sum of where they end by everything they depend on.
 
@@ -110,16 +111,16 @@ def pull_back(
         position: launch points, world, (B, N, 3), metres.
         direction: unit directions, (B, N, 3).
         weight: of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
-        names: per element, names of the numbers in ``systems.values`` to differentiate by (poses in the world, W and P,
-            do not enter the trace and have no derivative).
+        names: per element, paths of the numbers in ``systems.values`` to differentiate by.
 
     Returns:
         Derivatives; rays that are stopped or lost count as if they went on.
     """
     import drjit as dr
 
-    uploaded = replace(replace(systems, tangents=None).upload(backend), differentiable=True)
-    wanted = [numbers[name] for numbers, own in zip(uploaded.values, names, strict=True) for name in own]
+    alone = replace(systems, tangents=None, world_tangents=None)
+    uploaded = replace(alone.upload(backend), differentiable=True)
+    wanted = [leaves(numbers)[path] for numbers, own in zip(uploaded.values, names, strict=True) for path in own]
     rays = make_rays(backend, position, direction)
     for variable in (*wanted, rays.position, rays.direction):
         dr.enable_grad(variable)
@@ -131,5 +132,5 @@ def pull_back(
     slopes = [dr.grad(variable) for variable in (*wanted, rays.position, rays.direction)]
     dr.eval(slopes)  # one launch for all
     at = iter(slope.numpy() for slope in slopes[:-2])
-    values = tuple({name: next(at) for name in own} for own in names)
+    values = tuple({path: next(at) for path in own} for own in names)
     return RayCotangents(values, rows(slopes[-2], systems.count), rows(slopes[-1], systems.count))

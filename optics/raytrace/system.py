@@ -6,18 +6,21 @@ order) can be batched together: the two cameras of an instrument, left and right
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from optics.geometry import zernike
-from optics.geometry.aperture import Circle, Ellipse
-from optics.geometry.surface import GridFigure, ZernikeFigure
+from optics.geometry.aperture import ApertureNumbers
+from optics.geometry.surface import FigureNumbers, GridFigure, SurfaceNumbers, ZernikeFigure
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
 from optics.numerics.backend import Backend
+from optics.numerics.number_tree import map_leaves
 from optics.raytrace.assembly import Assembly, Element, Interaction
+
+Numbers = TypeVar("Numbers", "ElementNumbers", "FrameNumbers")
 
 
 @dataclass(frozen=True)
@@ -29,72 +32,137 @@ class Structure:
     even: int
     figure_order: int  # radial order of the Zernike figure, -1 for none
     grid: bool
-    aperture: str  # "", "circle", "ring", "rectangle" or "ellipse"
+    aperture: type[ApertureNumbers] | None
     graded: tuple[bool, bool] = (False, False)  # whether the medium before and the one after has an index gradient
 
 
 @dataclass(frozen=True, eq=False)
-class SystemBatch:
-    """Numbers of B systems: element by element, name -> array of shape (B,).
+class CoordinateNumbers:
+    """One coordinate of a rigid transform: ``shift`` + ``turn`` . p, metres."""
 
-    ``R00..R22``, ``T0..T2`` take the ray from the frame of the element before (the world for the first) into the
-    frame of this element; ``W...``/``P...`` are the element's world pose, ``S`` the size of its body.
+    shift: Any
+    turn: tuple[Any, Any, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameNumbers:
+    """A rigid transform of points, coordinate by coordinate."""
+
+    x: CoordinateNumbers
+    y: CoordinateNumbers
+    z: CoordinateNumbers
+
+    @classmethod
+    def of(cls, rotation: np.ndarray, translation: np.ndarray) -> FrameNumbers:
+        """From arrays (S, 3, 3) and (S, 3)."""
+        rows = ((rotation[:, a, 0], rotation[:, a, 1], rotation[:, a, 2]) for a in range(3))
+        return cls(*(CoordinateNumbers(translation[:, a], row) for a, row in enumerate(rows)))
+
+    @property
+    def coordinates(self) -> tuple[CoordinateNumbers, CoordinateNumbers, CoordinateNumbers]:
+        """Of x, y and z."""
+        return self.x, self.y, self.z
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (B, 3, 3) and translation (B, 3), NumPy."""
+        rotation = np.array([c.turn for c in self.coordinates])
+        return np.moveaxis(rotation, -1, 0), np.stack([c.shift for c in self.coordinates], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class IndexNumbers:
+    """Refractive index of a medium: ``index`` + ``gradient`` . p at p in the element's frame; no gradient: None."""
+
+    index: Any
+    gradient: tuple[Any, Any, Any] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ElementNumbers:
+    """All that the trace reads of one element.
+
+    Attributes:
+        frame: from the frame of the element before (the world for the first) into this element's.
+        surface: its shape; aperture: its clear aperture, None for an unlimited one.
+        before, after: refractive index on the side that light comes from and on the one that it goes to.
+    """
+
+    frame: FrameNumbers
+    surface: SurfaceNumbers
+    aperture: ApertureNumbers | None
+    before: IndexNumbers
+    after: IndexNumbers
+
+
+@dataclass(frozen=True, eq=False)
+class SystemBatch:
+    """Numbers of B systems: element by element, each an array of shape (B,), float64.
 
     Attributes:
         structure: per element.
-        values: per element, parameter name -> (B,) float64.
-        tangents: the same for the derivative that was asked for, or None.
+        values: per element, what the trace reads.
+        world: per element, its pose in the world.
+        tangents: ``values`` for the derivative that was asked for (None for a number that has none), or None.
+        world_tangents: likewise of ``world``.
+        size: of the last element's body relative to nominal, (B,).
         grids: per element, spline tables (grid figures are not perturbed), flattened with their size.
         count: B.
         states: number of states S; systems are ordered sequence by sequence, B = sequences * S.
     """
 
     structure: tuple[Structure, ...]
-    values: tuple[Mapping[str, np.ndarray], ...]
-    tangents: tuple[Mapping[str, np.ndarray], ...] | None
+    values: tuple[ElementNumbers, ...]
+    world: tuple[FrameNumbers, ...]
+    tangents: tuple[ElementNumbers, ...] | None
+    world_tangents: tuple[FrameNumbers, ...] | None
+    size: np.ndarray
     grids: tuple[np.ndarray | None, ...]
     count: int
     states: int
-
-    @property
-    def size(self) -> np.ndarray:
-        """Size of the last element's body relative to nominal, (B,)."""
-        return self.values[-1]["S"]
 
     def upload(self, backend: Backend) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients."""
         import drjit as dr
 
-        uploaded = []
-        for i, values in enumerate(self.values):
-            arrays = {}
-            for name, value in values.items():
-                array = backend.opaque(value)
-                if self.tangents is not None:
-                    tangent = self.tangents[i].get(name)
-                    if tangent is not None:
-                        dr.enable_grad(array)
-                        dr.set_grad(array, backend.opaque(tangent))
-                arrays[name] = array
-            uploaded.append(arrays)
+        def copied(value: np.ndarray, tangent: np.ndarray | None = None) -> Any:
+            array = backend.opaque(value)
+            if tangent is not None:
+                dr.enable_grad(array)
+                dr.set_grad(array, backend.opaque(tangent))
+            return array
+
+        values = map_leaves(copied, self.values, self.tangents)
+        last = None if self.world_tangents is None else self.world_tangents[-1]
+        world = map_leaves(copied, self.world[-1], last)
         grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
-        return UploadedSystems(self.structure, tuple(uploaded), grids, self.count, self.tangents is not None)
+        return UploadedSystems(self.structure, values, world, grids, self.count, self.tangents is not None)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
         """The systems of the given indices."""
-        tangents = (
-            None if self.tangents is None else tuple({k: v[systems] for k, v in t.items()} for t in self.tangents)
+
+        def taken(value: np.ndarray) -> np.ndarray:
+            return np.asarray(value[systems])
+
+        return SystemBatch(
+            self.structure,
+            map_leaves(taken, self.values),
+            map_leaves(taken, self.world),
+            map_leaves(taken, self.tangents),
+            map_leaves(taken, self.world_tangents),
+            self.size[systems],
+            self.grids,
+            len(systems),
+            len(systems),
         )
-        values = tuple({k: v[systems] for k, v in e.items()} for e in self.values)
-        return SystemBatch(self.structure, values, tangents, self.grids, len(systems), len(systems))
 
 
 @dataclass(frozen=True, eq=False)
 class UploadedSystems:
-    """A ``SystemBatch`` in the memory of a backend (Dr.Jit arrays)."""
+    """A ``SystemBatch`` in the memory of a backend (Dr.Jit arrays); ``world`` is the last element's pose."""
 
     structure: tuple[Structure, ...]
-    values: tuple[Mapping[str, Any], ...]
+    values: tuple[ElementNumbers, ...]
+    world: FrameNumbers
     grids: tuple[Any, ...]
     count: int
     differentiable: bool
@@ -139,32 +207,38 @@ def assemble(
             any(m[i + 1].solid in graded for m in media),
         )
         structures.append(_structures([chain[i] for chain in chains], states, gradients))
-    per_chain = []
-    for chain, along in zip(chains, media, strict=True):
-        per_chain.append(
-            [
-                {
-                    **_numbers(chain, i, structures[i], states, placed, step),
-                    **_media_numbers(assembly, chain[i], along[i : i + 2], structures[i], states, placed),
-                }
-                for i in range(len(chain))
-            ]
-        )
-    values = []
-    tangents = []
-    for i in range(len(chains[0])):
-        joined = {k: np.concatenate([numbers[i][k] for numbers in per_chain]) for k in per_chain[0][i]}
-        values.append({k: np.ascontiguousarray(v.real) for k, v in joined.items()})
-        tangents.append({k: v.imag / COMPLEX_STEP for k, v in joined.items() if np.iscomplexobj(v)})
-    grids = tuple(_grid(chains[0][i]) for i in range(len(chains[0])))
+    poses = [[_world(element, placed) for element in chain] for chain in chains]
+    numbers = [
+        [_numbers(assembly, chain, i, along, structures[i], states, placed, step) for i in range(len(chain))]
+        for chain, along in zip(chains, media, strict=True)
+    ]
+    values = [_joined([chain[i] for chain in numbers]) for i in range(len(chains[0]))]
+    world = [_joined([chain[i] for chain in poses]) for i in range(len(chains[0]))]
+    size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
     return SystemBatch(
         tuple(structures),
-        tuple(values),
-        tuple(tangents) if step is not None else None,
-        grids,
+        tuple(map_leaves(_real, value) for value in values),
+        tuple(map_leaves(_real, pose) for pose in world),
+        tuple(map_leaves(_tangent, value) for value in values) if step is not None else None,
+        tuple(map_leaves(_tangent, pose) for pose in world) if step is not None else None,
+        size,
+        tuple(_grid(chains[0][i]) for i in range(len(chains[0]))),
         len(chains) * len(states),
         len(states),
     )
+
+
+def _joined(parts: Sequence[Numbers]) -> Numbers:
+    """The numbers of all chains, (S,) each, one after the other."""
+    return map_leaves(lambda *arrays: np.concatenate(arrays), parts[0], *parts[1:])
+
+
+def _real(value: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(value.real)
+
+
+def _tangent(value: np.ndarray) -> np.ndarray | None:
+    return value.imag / COMPLEX_STEP if np.iscomplexobj(value) else None
 
 
 @dataclass(frozen=True)
@@ -189,38 +263,30 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
     return out
 
 
-def _media_numbers(
+def _index_numbers(
     assembly: Assembly,
     element: Element,
-    media: Sequence[Medium],
-    structure: Structure,
+    medium: Medium,
+    graded: bool,
     states: Sequence[State],
     placed: PlacedBodies,
-) -> dict[str, np.ndarray]:
-    """Indices before (n) and after (n_after) an element, (S,) each.
-
-    Where the medium is graded the index is n + (nx, ny, nz) . p at p in the element's frame, likewise after it.
-    """
-    out = {}
+) -> IndexNumbers:
+    """Index (S,) of a medium beside an element, with its gradient in the element's frame where it is graded."""
     here = placed.index[element.body]
     turn, origin = placed.rotation[:, here], placed.translation[:, here]
-    for name, medium, graded in zip(("n", "n_after"), media, structure.graded, strict=True):
-        if medium.solid is None:
-            index = np.full(len(states), medium.index)
-            gradient = np.zeros((len(states), 3))
-        else:
-            motions = [state.get(medium.solid, AT_REST) for state in states]
-            index = assembly.media[medium.solid] + np.array([m.index for m in motions])
-            glass = placed.index[medium.solid]
-            own = np.array([m.index_gradient for m in motions])
-            world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
-            gradient = np.einsum("sji,sj->si", turn, world)
-            if graded:
-                index = index + np.einsum("si,si->s", world, origin - placed.translation[:, glass])
-        out[name] = index
+    if medium.solid is None:
+        index = np.full(len(states), medium.index)
+        gradient = np.zeros((len(states), 3))
+    else:
+        motions = [state.get(medium.solid, AT_REST) for state in states]
+        index = assembly.media[medium.solid] + np.array([m.index for m in motions])
+        glass = placed.index[medium.solid]
+        own = np.array([m.index_gradient for m in motions])
+        world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
+        gradient = np.einsum("sji,sj->si", turn, world)
         if graded:
-            out.update({f"{name}{axis}": gradient[:, a] for a, axis in enumerate("xyz")})
-    return out
+            index = index + np.einsum("si,si->s", world, origin - placed.translation[:, glass])
+    return IndexNumbers(index, (gradient[:, 0], gradient[:, 1], gradient[:, 2]) if graded else None)
 
 
 def _structures(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
@@ -230,7 +296,7 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
             e.interaction,
             e.surface.is_plane,
             isinstance(e.surface.figure, GridFigure),
-            _aperture_kind(e),
+            None if e.aperture is None else type(e.aperture.numbers()),
         )
         for e in elements
     }
@@ -252,30 +318,29 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
     return Structure(interaction, is_plane, even, order, grid, aperture, graded)
 
 
-def _aperture_kind(element: Element) -> str:
-    if element.aperture is None:
-        return ""
-    if isinstance(element.aperture, Circle):
-        return "ring" if element.aperture.inner else "circle"
-    return "ellipse" if isinstance(element.aperture, Ellipse) else "rectangle"
-
-
 def _grid(element: Element) -> np.ndarray | None:
     figure = element.surface.figure
     return figure.spline.ravel() if isinstance(figure, GridFigure) else None
 
 
+def _world(element: Element, placed: PlacedBodies) -> FrameNumbers:
+    """Pose of an element in the world, (S,) each, complex when a derivative is carried."""
+    body = placed.index[element.body]
+    return FrameNumbers.of(placed.rotation[:, body], placed.translation[:, body])
+
+
 def _numbers(
+    assembly: Assembly,
     chain: Sequence[Element],
     i: int,
+    media: Sequence[Medium],
     structure: Structure,
     states: Sequence[State],
     placed: PlacedBodies,
     step: Sequence[tuple[str, str, int]] | None,
-) -> dict[str, np.ndarray]:
-    """Parameters of element i of a chain, each of shape (S,), complex when a derivative is carried."""
+) -> ElementNumbers:
+    """Numbers of element i of a chain, each of shape (S,), complex when a derivative is carried."""
     element = chain[i]
-    count = len(states)
     body = placed.index[element.body]
     rotation, translation = placed.rotation[:, body], placed.translation[:, body]
     if i == 0:
@@ -285,69 +350,53 @@ def _numbers(
         before = placed.index[chain[i - 1].body]
         relative = np.einsum("ski,skj->sij", rotation, placed.rotation[:, before])
         offset = np.einsum("ski,sk->si", rotation, placed.translation[:, before] - translation)
-    out: dict[str, np.ndarray] = {}
-    for a in range(3):
-        out[f"T{a}"] = offset[:, a]
-        out[f"P{a}"] = translation[:, a]
-        for b in range(3):
-            out[f"R{a}{b}"] = relative[:, a, b]
-            out[f"W{a}{b}"] = rotation[:, a, b]
     scale = placed.scale[:, body]
-    out["S"] = scale.real
-    surface = element.surface
+    sides = zip(media[i : i + 2], structure.graded, strict=True)
+    outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
+    return ElementNumbers(
+        FrameNumbers.of(relative, offset),
+        _surface_numbers(element, structure, scale, states, step),
+        # an edge has no derivative: it lets a ray pass or stops it
+        None if element.aperture is None else element.aperture.numbers(scale.real),
+        outer,
+        inner,
+    )
+
+
+def _surface_numbers(
+    element: Element,
+    structure: Structure,
+    scale: np.ndarray,
+    states: Sequence[State],
+    step: Sequence[tuple[str, str, int]] | None,
+) -> SurfaceNumbers:
+    surface, count = element.surface, len(states)
+    curvature, conic, even = None, None, []
     if not structure.plane:
-        out["c"] = surface.curvature / scale
-        out["k"] = np.full(count, surface.conic)
+        curvature, conic = surface.curvature / scale, np.full(count, surface.conic)
         for n in range(structure.even):
             term = surface.even[n] if n < len(surface.even) else 0.0
-            out[f"A{n}"] = term / scale ** (2 * n + 3)
-    if structure.figure_order >= 0:
-        out.update(_figure_numbers(element, structure.figure_order, states, step))
+            even.append(term / scale ** (2 * n + 3))
+    figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
+    grid = None
     if isinstance(surface.figure, GridFigure):
-        x0, _, y0, _ = surface.figure.bounds
-        dx, dy = surface.figure.spacing
-        rows, columns = surface.figure.values.shape
-        grid = {"gx0": x0, "gy0": y0, "gix": 1.0 / dx, "giy": 1.0 / dy, "gnx": float(columns), "gny": float(rows)}
-        out.update({name: np.full(count, value) for name, value in grid.items()})
-    aperture = element.aperture
-    if aperture is not None:
-        # an edge has no derivative: it lets a ray pass or stops it
-        grown = scale.real
-        out["ax"], out["ay"] = grown * aperture.centre[0], grown * aperture.centre[1]
-        if isinstance(aperture, Circle):
-            out["ar2"], out["ai2"] = (grown * aperture.radius) ** 2, (grown * aperture.inner) ** 2
-        else:
-            out["ahx"], out["ahy"] = grown * aperture.half_x, grown * aperture.half_y
-    return out
+        grid = map_leaves(lambda number: np.full(count, number), surface.figure.numbers)
+    return SurfaceNumbers(curvature, conic, tuple(even), figure, grid)
 
 
 def _figure_numbers(
     element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
-) -> dict[str, np.ndarray]:
-    """Monomial coefficients of the Zernike figure of each state, named F0, F1, ...; centre fx, fy."""
-    figure = element.surface.figure
-    if isinstance(figure, ZernikeFigure):
-        radius, centre, base = figure.radius, figure.centre, dict(figure.terms)
-    elif isinstance(element.aperture, Circle):
-        radius, centre, base = element.aperture.radius, element.aperture.centre, {}
-    elif element.aperture is not None:
-        radius, centre, base = (
-            float(np.hypot(element.aperture.half_x, element.aperture.half_y)),
-            element.aperture.centre,
-            {},
-        )
-    else:
-        raise ValueError(f"element {element.name!r} needs an aperture to carry a figure: it sets the disk")
+) -> FigureNumbers:
+    """Monomial coefficients of the Zernike figure of each state."""
+    figure = element.figure_disk
     kind = np.float64 if step is None else np.complex128
     table = np.empty((len(states), zernike.triangle_size(order)), kind)
     for s, state in enumerate(states):
-        terms: dict[int, Any] = dict(base)
+        terms: dict[int, Any] = dict(figure.terms)
         for j, amplitude in state.get(element.body, AT_REST).figure.items():
             terms[j] = terms.get(j, 0.0) + amplitude
         if step is not None and step[s][:2] == (element.body, FIGURE):
             terms[step[s][2]] = terms.get(step[s][2], 0.0) + 1j * COMPLEX_STEP
-        table[s] = zernike.monomials(terms, order, radius)
-    out = {f"F{m}": table[:, m] for m in range(table.shape[1])}
-    out["fx"] = np.full(len(states), centre[0])
-    out["fy"] = np.full(len(states), centre[1])
-    return out
+        table[s] = zernike.monomials(terms, order, figure.radius)
+    x, y = (np.full(len(states), c) for c in figure.centre)
+    return FigureNumbers(x, y, tuple(table[:, m] for m in range(table.shape[1])))

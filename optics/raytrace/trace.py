@@ -8,12 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from optics.geometry.surface import grid_figure, polynomial_figure
-from optics.geometry.zernike import triangle_size
+from optics.geometry.surface import SurfaceNumbers, level
 from optics.numerics.backend import Backend
+from optics.numerics.number_tree import map_leaves
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.graded_ray import GradedRay
-from optics.raytrace.system import Structure, SystemBatch, UploadedSystems
+from optics.raytrace.system import (
+    CoordinateNumbers,
+    ElementNumbers,
+    FrameNumbers,
+    IndexNumbers,
+    SystemBatch,
+    UploadedSystems,
+)
 
 NEWTON_STEPS = 3
 """Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope
@@ -135,20 +142,23 @@ def trace(
     hits: dict[int, Any] = {}
     differentiable = uploaded.differentiable or dr.grad_enabled(p) or dr.grad_enabled(d)
     for i, structure in enumerate(uploaded.structure):
-        g = {name: lookup(array) for name, array in uploaded.values[i].items() if name[0] not in "WPS"}
-        p, d = _into_frame(backend, p, d, g)
-        t, ok = _distance(backend, p, d, g, structure, uploaded.grids[i], differentiable)
-        if structure.graded[0]:
-            curve = GradedRay.start(p, d, g["n"], (g["nx"], g["ny"], g["nz"]))
-            tau = _solve(curve, t / curve.index, g, structure, uploaded.grids[i], differentiable)
-            p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
-            ok = _reached(p, g, structure, uploaded.grids[i])
-        else:
+        element, table = map_leaves(lookup, uploaded.values[i]), uploaded.grids[i]
+        surface = element.surface
+        p, d = _into_frame(backend, p, d, element.frame)
+        t, ok = _distance(p, d, surface, table, differentiable)
+        if element.before.gradient is None:
             p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
-            path = dr.fma(g["n"], t, path)
-        valid = valid & ok & _inside(p, g, structure)
+            path = dr.fma(element.before.index, t, path)
+        else:
+            curve = GradedRay.start(p, d, element.before.index, element.before.gradient)
+            tau = _solve(curve, t / curve.index, surface, table, differentiable)
+            p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
+            ok = _reached(p, surface, table)
+        valid = valid & ok
+        if element.aperture is not None:
+            valid = valid & element.aperture.contains(p.x, p.y)
         if structure.interaction is not Interaction.PASS:
-            d, ok = _redirect(backend, p, d, g, structure, uploaded.grids[i])
+            d, ok = _redirect(backend, p, d, element, structure.interaction, table)
             valid = valid & ok
         if i in keep:
             hits[i] = p
@@ -156,12 +166,10 @@ def trace(
     local = Rays(p, d, path, valid, uploaded.count)
     outside = None
     if world:
-        g = {name: lookup(array) for name, array in uploaded.values[-1].items() if name[0] in "WP"}
+        to_world = map_leaves(lookup, uploaded.world).coordinates
         outside = Rays(
-            backend.Vector3(
-                *(g[f"W{a}0"] * p.x + g[f"W{a}1"] * p.y + g[f"W{a}2"] * p.z + g[f"P{a}"] for a in range(3))
-            ),
-            backend.Vector3(*(g[f"W{a}0"] * d.x + g[f"W{a}1"] * d.y + g[f"W{a}2"] * d.z for a in range(3))),
+            backend.Vector3(*(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)),
+            backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
             path,
             valid,
             uploaded.count,
@@ -209,32 +217,29 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
     return rays, lambda array: dr.gather(backend.Float, array, system)
 
 
-def _into_frame(backend: Backend, p: Any, d: Any, g: Mapping[str, Any]) -> tuple[Any, Any]:
+def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
     import drjit as dr
 
-    position = backend.Vector3(
-        *(dr.fma(g[f"R{a}0"], p.x, dr.fma(g[f"R{a}1"], p.y, dr.fma(g[f"R{a}2"], p.z, g[f"T{a}"]))) for a in range(3))
-    )
-    direction = backend.Vector3(
-        *(dr.fma(g[f"R{a}0"], d.x, dr.fma(g[f"R{a}1"], d.y, g[f"R{a}2"] * d.z)) for a in range(3))
-    )
-    return position, direction
+    def point(c: CoordinateNumbers) -> Any:
+        return dr.fma(c.turn[0], p.x, dr.fma(c.turn[1], p.y, dr.fma(c.turn[2], p.z, c.shift)))
+
+    def vector(c: CoordinateNumbers) -> Any:
+        return dr.fma(c.turn[0], d.x, dr.fma(c.turn[1], d.y, c.turn[2] * d.z))
+
+    return backend.Vector3(*map(point, frame.coordinates)), backend.Vector3(*map(vector, frame.coordinates))
 
 
-def _distance(
-    backend: Backend, p: Any, d: Any, g: Mapping[str, Any], structure: Structure, grid: Any, differentiable: bool
-) -> tuple[Any, Any]:
+def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiable: bool) -> tuple[Any, Any]:
     """Path from p along d to the surface (may be negative) and whether it exists."""
     import drjit as dr
 
-    bent = structure.even or structure.figure_order >= 0 or structure.grid
-    if structure.plane:
+    if surface.curvature is None:
         ok = dr.abs(d.z) > 1e-12
         t = -p.z / dr.select(ok, d.z, 1.0)
-        if not bent:
+        if surface.is_conic:
             return t, ok
     else:
-        c, q = g["c"], 1.0 + g["k"]
+        c, q = surface.curvature, 1.0 + surface.conic
         a = c * dr.fma(d.x, d.x, dr.fma(d.y, d.y, q * d.z * d.z))
         b = c * dr.fma(p.x, d.x, dr.fma(p.y, d.y, q * p.z * d.z)) - d.z
         e = c * dr.fma(p.x, p.x, dr.fma(p.y, p.y, q * p.z * p.z)) - 2.0 * p.z
@@ -243,48 +248,51 @@ def _distance(
         root = dr.sqrt(dr.select(ok, discriminant, 1.0))
         # of the two crossings the one on the vertex sheet: the denominator keeps d.z's sign and never cancels there
         t = e / (dr.copysign(root, d.z) - b)
-        if not bent:
+        if surface.is_conic:
             return t, ok & (q * c * dr.fma(t, d.z, p.z) < 1.0)
-    numbers = g
+    numbers = surface
     origin, direction = p, d
     if differentiable:
         # solve without derivatives; one attached step from the solution carries the exact derivative (implicit
         # functions)
-        numbers = {name: dr.detach(value) for name, value in g.items()}
+        numbers = map_leaves(dr.detach, surface)
         origin, direction, t = dr.detach(p), dr.detach(d), dr.detach(t)
     for _ in range(NEWTON_STEPS):
-        t = _newton_step(origin, direction, t, numbers, structure, grid)
+        t = newton_step(origin, direction, t, numbers, table)
     if differentiable:
-        t = _newton_step(p, d, t, g, structure, grid)
-    level, _, _, nz = _level(*_along(origin, direction, t), numbers, structure, grid)
-    # level / nz is the height above the surface to first order
-    return t, ok & (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
+        t = newton_step(p, d, t, surface, table)
+    return t, ok & _on_sheet(level(*_along(origin, direction, t), numbers, table))
 
 
-def _solve(curve: GradedRay, tau: Any, g: Mapping[str, Any], structure: Structure, grid: Any, attached: bool) -> Any:
+def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool) -> Any:
     """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
     import drjit as dr
 
-    def step(ray: GradedRay, tau: Any, numbers: Mapping[str, Any]) -> Any:
+    def step(ray: GradedRay, tau: Any, numbers: SurfaceNumbers) -> Any:
         p, slope = ray.position(tau), ray.slope(tau)
-        level, nx, ny, nz = _level(p.x, p.y, p.z, numbers, structure, grid)
-        return tau - level / dr.fma(nx, slope.x, dr.fma(ny, slope.y, nz * slope.z))
+        value, nx, ny, nz = level(p.x, p.y, p.z, numbers, table)
+        return tau - value / dr.fma(nx, slope.x, dr.fma(ny, slope.y, nz * slope.z))
 
-    numbers, ray = g, curve
+    numbers, ray = surface, curve
     if attached:
-        numbers = {name: dr.detach(value) for name, value in g.items()}
+        numbers = map_leaves(dr.detach, surface)
         ray, tau = curve.detached(), dr.detach(tau)
     for _ in range(NEWTON_STEPS):
         tau = step(ray, tau, numbers)
-    return step(curve, tau, g) if attached else tau
+    return step(curve, tau, surface) if attached else tau
 
 
-def _reached(p: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> Any:
+def _reached(p: Any, surface: SurfaceNumbers, table: Any) -> Any:
     """Whether p lies on the surface's sheet through the vertex."""
+    return _on_sheet(level(p.x, p.y, p.z, surface, table))
+
+
+def _on_sheet(found: tuple[Any, Any, Any, Any]) -> Any:
+    """Whether a point with that level and gradient lies on the sheet: level / nz is its height to first order."""
     import drjit as dr
 
-    level, _, _, nz = _level(p.x, p.y, p.z, g, structure, grid)
-    return (nz > 0.0) & (dr.abs(level) < CONVERGED * nz)
+    value, _, _, nz = found
+    return (nz > 0.0) & (dr.abs(value) < CONVERGED * nz)
 
 
 def _along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
@@ -293,93 +301,32 @@ def _along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
     return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
 
 
-def _newton_step(p: Any, d: Any, t: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> Any:
+def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True) -> Any:
+    """A better distance from p along d to a surface than t; arguments as ``optics.geometry.surface.level``."""
     import drjit as dr
 
-    level, nx, ny, nz = _level(*_along(p, d, t), g, structure, grid)
-    return t - level / dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
-
-
-def _level(x: Any, y: Any, z: Any, g: Mapping[str, Any], structure: Structure, grid: Any) -> tuple[Any, Any, Any, Any]:
-    """Level function of the surface and its gradient.
-
-    With h the aspheric terms and the figure and w = z - h(x, y), the surface is where
-
-        G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
-
-    the conic's own equation in w: no square root and no division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
-    positive on the sheet of the vertex.
-    """
-    import drjit as dr
-
-    height: Any = None
-    sx: Any = None
-    sy: Any = None
-    r2 = dr.fma(x, x, y * y)
-    if structure.even:
-        # h and dh/d(r^2) of sum A_n r^(2n+4) by Horner, from the highest term down
-        last = structure.even - 1
-        polynomial: Any = g[f"A{last}"]
-        slope: Any = float(last + 2) * g[f"A{last}"]
-        for n in range(last - 1, -1, -1):
-            polynomial = dr.fma(polynomial, r2, g[f"A{n}"])
-            slope = dr.fma(slope, r2, float(n + 2) * g[f"A{n}"])
-        radial = 2.0 * slope * r2
-        height, sx, sy = polynomial * r2 * r2, radial * x, radial * y
-    if structure.figure_order >= 0:
-        coefficients = [g[f"F{m}"] for m in range(triangle_size(structure.figure_order))]
-        added = polynomial_figure(x - g["fx"], y - g["fy"], coefficients, structure.figure_order)
-        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
-    if structure.grid:
-        added = grid_figure(x, y, g, grid)
-        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
-    w = z if height is None else z - height
-    if structure.plane:
-        return w, (0.0 * x if sx is None else -sx), (0.0 * x if sy is None else -sy), 1.0 + 0.0 * x
-    c = g["c"]
-    qw = (1.0 + g["k"]) * w
-    level = dr.fma(-0.5 * c, dr.fma(qw, w, r2), w)
-    nz = dr.fma(-c, qw, 1.0)
-    nx, ny = -c * x, -c * y
-    if sx is not None:
-        nx, ny = dr.fma(-nz, sx, nx), dr.fma(-nz, sy, ny)
-    return level, nx, ny, nz
-
-
-def _inside(p: Any, g: Mapping[str, Any], structure: Structure) -> Any:
-    import drjit as dr
-
-    if structure.aperture in ("circle", "ring"):
-        x, y = p.x - g["ax"], p.y - g["ay"]
-        r2 = x * x + y * y
-        inside = r2 <= g["ar2"]
-        return inside & (r2 >= g["ai2"]) if structure.aperture == "ring" else inside
-    if structure.aperture == "ellipse":
-        u, v = (p.x - g["ax"]) / g["ahx"], (p.y - g["ay"]) / g["ahy"]
-        return u * u + v * v <= 1.0
-    if structure.aperture == "rectangle":
-        return (dr.abs(p.x - g["ax"]) <= g["ahx"]) & (dr.abs(p.y - g["ay"]) <= g["ahy"])
-    return True
+    value, nx, ny, nz = level(*_along(p, d, t), surface, table, active)
+    return t - value / dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
 
 
 def _redirect(
-    backend: Backend, p: Any, d: Any, g: Mapping[str, Any], structure: Structure, grid: Any
+    backend: Backend, p: Any, d: Any, element: ElementNumbers, interaction: Interaction, table: Any
 ) -> tuple[Any, Any]:
     """Direction after reflection or refraction (Snell), and whether it exists."""
     import drjit as dr
 
-    _, nx, ny, nz = _level(p.x, p.y, p.z, g, structure, grid)
+    _, nx, ny, nz = level(p.x, p.y, p.z, element.surface, table)
     square = dr.fma(nx, nx, dr.fma(ny, ny, nz * nz))
     along = dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
-    before, after = (
-        _index_at(p, g, name, graded) for name, graded in zip(("n", "n_after"), structure.graded, strict=True)
-    )
-    if structure.interaction in (Interaction.REFLECT, Interaction.TOTAL):
+    before, after = _index_at(p, element.before), _index_at(p, element.after)
+    if interaction in (Interaction.REFLECT, Interaction.TOTAL):
         beyond: Any = True
-        if structure.interaction is Interaction.TOTAL:
+        if interaction is Interaction.TOTAL:
             beyond = before * before * (1.0 - along * along / square) > 1.0
         f = -2.0 * along / square
         return backend.Vector3(dr.fma(f, nx, d.x), dr.fma(f, ny, d.y), dr.fma(f, nz, d.z)), beyond
+    if interaction is not Interaction.REFRACT:
+        raise ValueError(f"the trace knows no interaction {interaction}")
     norm = dr.rsqrt(square)
     cosine = along * norm
     ratio = before / after
@@ -390,10 +337,11 @@ def _redirect(
     return backend.Vector3(dr.fma(f, nx, ratio * d.x), dr.fma(f, ny, ratio * d.y), dr.fma(f, nz, ratio * d.z)), ok
 
 
-def _index_at(p: Any, g: Mapping[str, Any], name: str, graded: bool) -> Any:
-    """Refractive index at a point of the surface, before (``n``) or after it (``n_after``)."""
+def _index_at(p: Any, medium: IndexNumbers) -> Any:
+    """Refractive index at a point of the surface."""
     import drjit as dr
 
-    if not graded:
-        return g[name]
-    return dr.fma(g[f"{name}x"], p.x, dr.fma(g[f"{name}y"], p.y, dr.fma(g[f"{name}z"], p.z, g[name])))
+    if medium.gradient is None:
+        return medium.index
+    gx, gy, gz = medium.gradient
+    return dr.fma(gx, p.x, dr.fma(gy, p.y, dr.fma(gz, p.z, medium.index)))

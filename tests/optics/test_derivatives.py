@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
+from optics.numerics.number_tree import Path, leaves, with_leaf
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
@@ -19,6 +20,7 @@ MOTIONS = [
     for kind, axes in (("rotate", 3), ("shift", 3), ("scale", 1))
     for axis in range(axes)
 ]
+NUMBERS: dict[str, Path] = {"c": ("surface", "curvature"), "k": ("surface", "conic"), "A0": ("surface", "even", 0)}
 STEP = {"rotate": 1e-5, "shift": 1e-5, "scale": 1e-5}
 BASE: State = {
     "M2": Motion(rotate=(1e-4, -5e-5, 2e-4), shift=(5e-5, -2e-5, 3e-5)),
@@ -85,7 +87,7 @@ def test_forward_mode_for_every_motion(backend, bare, rays) -> None:
 def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str) -> None:
     systems = assemble(bare, ["imaging"], [BASE])
     uploaded = replace(systems.upload(backend), differentiable=True)
-    parameter = uploaded.values[mirror][name]
+    parameter = leaves(uploaded.values[mirror])[NUMBERS[name]]
     dr.enable_grad(parameter)
     dr.set_grad(parameter, backend.opaque([1.0]))
     out = trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local
@@ -95,9 +97,9 @@ def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str)
     h = {"c": 1e-6, "k": 1e-5, "A0": 1e-6}[name]
     sides = []
     for sign in (1, -1):
-        values = list(systems.values)
-        values[mirror] = {**values[mirror], name: values[mirror][name] + sign * h}
-        sides.append(columns(trace(backend, replace(systems, values=tuple(values)), make_rays(backend, *rays))))
+        path = (mirror, *NUMBERS[name])
+        values = with_leaf(systems.values, path, leaves(systems.values)[path] + sign * h)
+        sides.append(columns(trace(backend, replace(systems, values=values), make_rays(backend, *rays))))
     np.testing.assert_allclose(exact, (sides[0][0][0] - sides[1][0][0]) / (2 * h), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
 
@@ -107,21 +109,30 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> N
     systems = assemble(bare, ["imaging"], [BASE])
     weight = np.random.default_rng(1).normal(size=(len(rays[0]), 4))
     uploaded = replace(systems.upload(backend), differentiable=True)
-    wanted = [(0, "c"), (0, "A1"), (1, "T1"), (1, "k"), (2, "c"), (2, "R12")]
-    for i, n in wanted:
-        dr.enable_grad(uploaded.values[i][n])
+    wanted: list[Path] = [
+        (0, *NUMBERS["c"]),
+        (0, "surface", "even", 1),
+        (1, "frame", "y", "shift"),
+        (1, *NUMBERS["k"]),
+        (2, *NUMBERS["c"]),
+        (2, "frame", "y", "turn", 2),
+    ]
+    numbers = leaves(uploaded.values)
+    for path in wanted:
+        dr.enable_grad(numbers[path])
 
     def loss(local):
         terms = [c * backend.opaque(weight[:, j]) for j, c in enumerate((*local.position, local.path))]
         return dr.sum(terms[0] + terms[1] + terms[2] + terms[3])
 
     dr.backward(loss(trace(backend, uploaded, make_rays(backend, *rays), evaluate=False).local))
-    reverse = np.array([dr.grad(uploaded.values[i][n])[0] for i, n in wanted])
+    reverse = np.array([dr.grad(numbers[path])[0] for path in wanted])
     forward = []
-    for i, n in wanted:
+    for path in wanted:
         fresh = replace(systems.upload(backend), differentiable=True)
-        dr.enable_grad(fresh.values[i][n])
-        dr.set_grad(fresh.values[i][n], backend.opaque([1.0]))
+        number = leaves(fresh.values)[path]
+        dr.enable_grad(number)
+        dr.set_grad(number, backend.opaque([1.0]))
         value = loss(trace(backend, fresh, make_rays(backend, *rays), evaluate=False).local)
         dr.forward_to(value)
         forward.append(dr.grad(value)[0])

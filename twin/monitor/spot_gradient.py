@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State
+from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.aim import RayFan, aim
 from optics.raytrace.derivatives import pull_back
 from optics.raytrace.system import SystemBatch, assemble
@@ -112,9 +113,9 @@ def spot_gradient(
 
 @dataclass(frozen=True, eq=False)
 class _Tangents:
-    """Derivatives of one sequence's numbers by M motions, for C channels: per element, name -> (C, M)."""
+    """Derivatives of one sequence's numbers by M motions, for C channels: per element, path -> (C, M)."""
 
-    values: tuple[Mapping[str, np.ndarray], ...]
+    values: tuple[Mapping[Path, np.ndarray], ...]
 
     @classmethod
     def of(cls, systems: SystemBatch, channels: int) -> _Tangents:
@@ -122,12 +123,12 @@ class _Tangents:
         assert systems.tangents is not None
         return cls(
             tuple(
-                {k: v.reshape(channels, -1) for k, v in own.items() if k[0] not in "WPS" and np.any(v)}
+                {path: v.reshape(channels, -1) for path, v in leaves(own).items() if np.any(v)}
                 for own in systems.tangents
             )
         )
 
-    def dot(self, slopes: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray:
+    def dot(self, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np.ndarray:
         """Sum over numbers of slope (C, 2) times derivative by the motions: (C, 2, M)."""
         parts = [
             slope[name].reshape(len(table), 2)[:, :, None] * table[:, None]
@@ -137,8 +138,8 @@ class _Tangents:
         return np.asarray(sum(parts))
 
     @property
-    def names(self) -> list[tuple[str, ...]]:
-        """Names of the numbers that some motion changes, per element."""
+    def names(self) -> list[tuple[Path, ...]]:
+        """Paths of the numbers that some motion changes, per element."""
         return [tuple(own) for own in self.values]
 
 

@@ -198,17 +198,11 @@ def sight_gradient(
     pushed = push_forward(backend, to_object, place, heading, moved, heading_step)
     local = pushed.traced.numpy()[1]
     # from the frame of the last element, which moves too, to the world
-    assert to_object.tangents is not None
-    pose = _rotation(to_object.values[-1], to_object.count)
-    pose_step = _rotation(to_object.tangents[-1], to_object.count)
+    assert to_object.world_tangents is not None
+    pose, _ = to_object.world[-1].arrays()
+    pose_step, _ = to_object.world_tangents[-1].arrays()
     world = np.einsum("bij,bnj->bni", pose, pushed.direction) + np.einsum("bij,bnj->bni", pose_step, local)
     return np.asarray(world).reshape(len(names), m, LINE_POINTS, 3)
-
-
-def _rotation(numbers: object, count: int) -> np.ndarray:
-    """World rotation of an element in B systems, or its derivative, (B, 3, 3)."""
-    assert isinstance(numbers, dict)
-    return np.stack([np.stack([numbers[f"W{a}{b}"] for b in range(3)], -1) for a in range(3)], -2).reshape(count, 3, 3)
 
 
 def _named(motion: ElementaryMotion, about: State) -> State:
