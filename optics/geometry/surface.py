@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
 from optics.geometry import zernike
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.zernike import triangle_index, triangle_order
 from optics.numerics.frozen_map import FrozenMap
 
@@ -31,6 +32,15 @@ class ZernikeFigure:
         if not self.radius > 0.0:
             raise ValueError(f"a figure needs a positive radius, found {self.radius}")
         object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))
+
+    def numbers(self, order: int) -> FigureNumbers:
+        """The same as a polynomial of an order that is at least the figure's own, ``order``."""
+        return FigureNumbers(*self.centre, tuple(zernike.monomials(self.terms, order, self.radius)))
+
+    @property
+    def order(self) -> int:
+        """Highest radial order, -1 without terms."""
+        return zernike.order_of(self.terms)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
         """Sag error at x, y (metres), NumPy."""
@@ -205,6 +215,21 @@ def level(
     return value, nx, ny, nz
 
 
+def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True) -> Any:
+    """A better distance from p along d to a surface than t; the other arguments as for ``level``."""
+    import drjit as dr
+
+    value, nx, ny, nz = level(*along(p, d, t), surface, table, active)
+    return t - value / dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
+
+
+def along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
+    """Coordinates of p + t d."""
+    import drjit as dr
+
+    return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
+
+
 def polynomial_figure(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
     """Sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
 
@@ -294,6 +319,24 @@ class Surface:
     def with_figure(self, figure: Figure | None) -> Surface:
         """The same shape with another figure."""
         return replace(self, figure=figure)
+
+    def figure_disk(self, aperture: Aperture | None) -> ZernikeFigure:
+        """The Zernike figure that terms are added to: the surface's own, or one without terms over the aperture's disk.
+
+        Raises:
+            ValueError: neither a Zernike figure nor an aperture sets the disk.
+        """
+        if isinstance(self.figure, ZernikeFigure):
+            return self.figure
+        match aperture:
+            case Circle(radius, centre):
+                return ZernikeFigure(radius, centre)
+            case Rectangle(half_x, half_y, centre) | Ellipse(half_x, half_y, centre):
+                return ZernikeFigure(float(np.hypot(half_x, half_y)), centre)
+            case None:
+                raise ValueError("a surface without an aperture has no disk for a figure")
+            case _:
+                assert_never(aperture)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
         """Height z at x, y (metres, any shape); NaN outside the conic's domain."""

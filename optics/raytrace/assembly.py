@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
 from optics.geometry.tree import Motion, PlacedBodies, RigidTree, State
@@ -51,21 +51,14 @@ class Element:
 
     @property
     def figure_disk(self) -> ZernikeFigure:
-        """The surface's own Zernike figure, to whose terms a state's are added; with no terms, over the clear
-        aperture's disk, when it has none.
+        """What the terms of a state's figure are added to: ``Surface.figure_disk`` over the clear aperture.
 
         Raises:
             ValueError: neither a Zernike figure nor an aperture sets the disk.
         """
-        match self.surface.figure, self.aperture:
-            case ZernikeFigure() as own, _:
-                return own
-            case _, Circle() as circle:
-                return ZernikeFigure(circle.radius, circle.centre)
-            case _, (Rectangle() | Ellipse()) as box:
-                return ZernikeFigure(float(np.hypot(box.half_x, box.half_y)), box.centre)
-            case _:
-                raise ValueError(f"element {self.name!r} needs an aperture to carry a figure: it sets the disk")
+        if self.aperture is None and not isinstance(self.surface.figure, ZernikeFigure):
+            raise ValueError(f"element {self.name!r} needs an aperture to carry a figure: it sets the disk")
+        return self.surface.figure_disk(self.aperture)
 
     def figured(self, motion: Motion) -> Surface:
         """The surface with what a motion adds to its figure.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.geometry.surface import SurfaceNumbers, level
+from optics.geometry.surface import SurfaceNumbers, along, level, newton_step
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
 from optics.raytrace.assembly import Interaction
@@ -261,7 +261,7 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
         t = newton_step(origin, direction, t, numbers, table)
     if differentiable:
         t = newton_step(p, d, t, surface, table)
-    return t, ok & _on_sheet(level(*_along(origin, direction, t), numbers, table))
+    return t, ok & _on_sheet(level(*along(origin, direction, t), numbers, table))
 
 
 def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool) -> Any:
@@ -293,20 +293,6 @@ def _on_sheet(found: tuple[Any, Any, Any, Any]) -> Any:
 
     value, _, _, nz = found
     return (nz > 0.0) & (dr.abs(value) < CONVERGED * nz)
-
-
-def _along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
-    import drjit as dr
-
-    return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
-
-
-def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True) -> Any:
-    """A better distance from p along d to a surface than t; arguments as ``optics.geometry.surface.level``."""
-    import drjit as dr
-
-    value, nx, ny, nz = level(*_along(p, d, t), surface, table, active)
-    return t - value / dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
 
 
 def _redirect(

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 from scipy.spatial import cKDTree
 from skfem import MeshHex2, MeshTet1
 
 from optics.geometry import zernike
-from optics.geometry.aperture import Aperture, Circle, Ellipse
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.surface import Surface
 from optics.numerics import quadrature
 from optics.numerics.frozen_map import FrozenMap
 
@@ -167,7 +167,8 @@ def face_change(
     if not 3 <= terms <= zernike.MAX_NOLL:
         raise ValueError(f"a face's terms must end between Z3 and Z{zernike.MAX_NOLL}, found {terms}")
     x, y, weight = _samples(aperture)
-    radius, centre = _figure_disk(surface, aperture)
+    disk = surface.figure_disk(aperture)
+    radius, centre = disk.radius, disk.centre
     points = np.stack([x, y, surface.sag(x, y)], axis=-1)
     moved = displacement.at(pose.apply(points)) @ pose.rotation
     root = np.sqrt(weight)
@@ -201,25 +202,19 @@ def face_change(
 
 def _samples(aperture: Aperture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Quadrature nodes x, y over an aperture and weights of a mean, each shape (P,)."""
-    if isinstance(aperture, Circle):
-        nodes = quadrature.disk(10, inner=aperture.inner / aperture.radius)
-        half = (aperture.radius, aperture.radius)
-        u, v, weight = nodes.x, nodes.y, nodes.share
-    elif isinstance(aperture, Ellipse):
-        nodes = quadrature.disk(10)
-        half = (aperture.half_x, aperture.half_y)
-        u, v, weight = nodes.x, nodes.y, nodes.share
-    else:
-        s, w = quadrature.gauss(16)
-        half = (aperture.half_x, aperture.half_y)
-        u, v, weight = np.tile(s, 16), np.repeat(s, 16), np.outer(w, w).ravel() / 4.0
+    match aperture:
+        case Circle():
+            nodes = quadrature.disk(10, inner=aperture.inner / aperture.radius)
+            half = (aperture.radius, aperture.radius)
+            u, v, weight = nodes.x, nodes.y, nodes.share
+        case Ellipse():
+            nodes = quadrature.disk(10)
+            half = (aperture.half_x, aperture.half_y)
+            u, v, weight = nodes.x, nodes.y, nodes.share
+        case Rectangle():
+            s, w = quadrature.gauss(16)
+            half = (aperture.half_x, aperture.half_y)
+            u, v, weight = np.tile(s, 16), np.repeat(s, 16), np.outer(w, w).ravel() / 4.0
+        case _:
+            assert_never(aperture)
     return aperture.centre[0] + half[0] * u, aperture.centre[1] + half[1] * v, weight
-
-
-def _figure_disk(surface: Surface, aperture: Aperture) -> tuple[float, tuple[float, float]]:
-    """Radius and centre of the disk on which the trace counts a figure's terms."""
-    if isinstance(surface.figure, ZernikeFigure):
-        return surface.figure.radius, surface.figure.centre
-    if isinstance(aperture, Circle):
-        return aperture.radius, aperture.centre
-    return float(np.hypot(aperture.half_x, aperture.half_y)), aperture.centre

@@ -13,7 +13,7 @@ from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Face, Solid, solid_mesh
 from optics.geometry.surface import Surface, plane
-from optics.geometry.tree import AT_REST, PlacedBodies, State
+from optics.geometry.tree import AT_REST, Motion, PlacedBodies, State
 from optics.materials.finish import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.meshes import polygon_mesh, sheet_mesh
@@ -124,12 +124,18 @@ class SceneSurface:
 
 
 def grown(surface: Surface, scale: float) -> Surface:
-    """A surface grown by a scale, without figure, as ``optics.raytrace.system`` takes it."""
+    """A surface grown by a scale, its figure as it was, as ``optics.raytrace.system`` takes it."""
     even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(surface.even))
-    return Surface(surface.curvature / scale, surface.conic, even)
+    return replace(surface, curvature=surface.curvature / scale, even=even)
 
 
-def mirror_surface(element: Element, placed: PlacedBodies, finishes: Finishes, lit_side: float = 1.0) -> SceneSurface:
+def mirror_surface(
+    element: Element,
+    placed: PlacedBodies,
+    finishes: Finishes,
+    lit_side: float = 1.0,
+    motion: Motion = AT_REST,
+) -> SceneSurface:
     """The surface of a reflecting element that is not a face of a solid.
 
     Args:
@@ -137,11 +143,15 @@ def mirror_surface(element: Element, placed: PlacedBodies, finishes: Finishes, l
         placed: bodies of one state.
         finishes: what surfaces do with light.
         lit_side: +1 when the optical side is +z, -1 when it is -z; the other one is the substrate's back.
+        motion: of the mirror's body in that state; only what it adds to the figure is taken from it.
+
+    Raises:
+        ValueError: no clear aperture, or a figure that cannot be added (``Element.figured``).
     """
     if element.aperture is None:
         raise ValueError(f"{element.name}: a mirror without a clear aperture cannot stand in a scene")
     size = float(placed.size(element.body)[0])
-    surface, aperture = grown(element.surface, size), element.aperture.grown(size)
+    surface, aperture = grown(element.figured(motion), size), element.aperture.grown(size)
     vertices, triangles, apart = sheet_mesh(surface, aperture)
     optical, rear = finishes.mirror, finishes.mirror_back
     return SceneSurface(

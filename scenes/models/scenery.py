@@ -14,7 +14,7 @@ import numpy as np
 
 from optics.geometry.aperture import Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.tree import PlacedBodies, State
+from optics.geometry.tree import AT_REST, PlacedBodies, State
 from optics.materials.finish import BLACK, Finish
 from optics.raytrace.assembly import Element, Interaction
 from scenes.models.camera_assembly import line_body
@@ -95,7 +95,7 @@ def build_scenery(
     ]
     on_glass = {name for surface in glass for name in surface.elements}
     surfaces = [
-        mirror_surface(element, placed, finishes, _lit_side(instrument, element))
+        mirror_surface(element, placed, finishes, _lit_side(instrument, element), state.get(element.body, AT_REST))
         for element in assembly.elements.values()
         if element.interaction is Interaction.REFLECT and element.name not in on_glass
     ]

@@ -14,12 +14,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from optics.geometry.surface import along, level, newton_step
 from optics.materials import finish
 from optics.numerics.backend import Backend
 from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
-from twin.path_tracing.shading import Leaving, level, nearest_face, spread, within
+from twin.path_tracing.shading import Leaving, nearest_face, spread
 from twin.path_tracing.sinks import Arrival, Sinks, record
-from twin.path_tracing.tables import APERTURES, CLEARANCE, INDEX, PART, ROWS_PER_SURFACE, Kind, SceneTables
+from twin.path_tracing.tables import (
+    APERTURE,
+    APERTURES,
+    CLEARANCE,
+    INDEX,
+    PART,
+    ROWS_PER_SURFACE,
+    Kind,
+    SceneTables,
+    SurfaceForm,
+    within,
+)
 
 REFINEMENTS = 3
 """Newton steps from the triangle to the surface: from below a millimetre to 1e-7 and 1e-13 m and to rounding, also at
@@ -34,7 +46,7 @@ class Features:
     """What decides the kernel's code.
 
     Attributes:
-        even: number of aspheric terms, -1 when all surfaces are flat.
+        form: what the surfaces' shapes consist of.
         glass: there are glass bodies.
         branching: some finish does more than one thing with light that goes on.
         roulette: weak paths are ended at random.
@@ -42,7 +54,7 @@ class Features:
         log: the events of every path are written down.
     """
 
-    even: int
+    form: SurfaceForm
     glass: bool
     branching: bool
     roulette: bool = False
@@ -166,29 +178,28 @@ def _step(
         # where exactly, in the surface's own frame
         g = tables.geometry(surface, active)
         kind = dr.gather(UInt, tables.kind, surface, active)
-        x, y, z = (
-            dr.fma(g[3 * a], p.x, dr.fma(g[3 * a + 1], p.y, dr.fma(g[3 * a + 2], p.z, g[9 + a]))) for a in range(3)
+        local = Vector3(
+            *(dr.fma(g[3 * a], p.x, dr.fma(g[3 * a + 1], p.y, dr.fma(g[3 * a + 2], p.z, g[9 + a]))) for a in range(3))
         )
-        dx, dy, dz = (dr.fma(g[3 * a], d.x, dr.fma(g[3 * a + 1], d.y, g[3 * a + 2] * d.z)) for a in range(3))
-        if features.even < 0:
-            t = -z / dz
-            x, y = dr.fma(t, dx, x), dr.fma(t, dy, y)
-            cosine, normal = dz, Vector3(g[6], g[7], g[8])
+        toward = Vector3(*(dr.fma(g[3 * a], d.x, dr.fma(g[3 * a + 1], d.y, g[3 * a + 2] * d.z)) for a in range(3)))
+        if features.form.flat:
+            t = -local.z / toward.z
+            x, y = dr.fma(t, toward.x, local.x), dr.fma(t, toward.y, local.y)
+            cosine, normal = toward.z, Vector3(g[6], g[7], g[8])
         else:
-            t = near
+            t, shape = near, tables.surface(surface, g, features.form, active)
             for _ in range(REFINEMENTS):
-                value, nx, ny, nz = level(dr.fma(t, dx, x), dr.fma(t, dy, y), dr.fma(t, dz, z), g, features.even)
-                t = t - value / dr.fma(nx, dx, dr.fma(ny, dy, nz * dz))
-            x, y, z = dr.fma(t, dx, x), dr.fma(t, dy, y), dr.fma(t, dz, z)
-            _, nx, ny, nz = level(x, y, z, g, features.even)
+                t = newton_step(local, toward, t, shape, tables.samples, active)
+            x, y, z = along(local, toward, t)
+            _, nx, ny, nz = level(x, y, z, shape, tables.samples, active)
             unit = dr.rsqrt(dr.fma(nx, nx, dr.fma(ny, ny, nz * nz)))
             nx, ny, nz = nx * unit, ny * unit, nz * unit
-            cosine = dr.fma(nx, dx, dr.fma(ny, dy, nz * dz))
+            cosine = dr.fma(nx, toward.x, dr.fma(ny, toward.y, nz * toward.z))
             normal = Vector3(*(dr.fma(g[a], nx, dr.fma(g[3 + a], ny, g[6 + a] * nz)) for a in range(3)))
         front = cosine < 0.0
-        clear = within(x, y, g[APERTURES : APERTURES + 6])
+        clear = within(x, y, g[APERTURES : APERTURES + APERTURE])
         if glass:
-            clear |= within(x, y, g[APERTURES + 6 : APERTURES + 12])
+            clear |= within(x, y, g[APERTURES + APERTURE : APERTURES + 2 * APERTURE])
         # what is there only by rounding and faceting
         skip = ~clear & (kind & Kind.ENDS != 0)
         again = t <= 0.5 * ahead
@@ -209,12 +220,12 @@ def _step(
         f = tables.finish(row, met)
         reflected, transmitted, diffused = f[0], f[1], f[3]
         if glass:
-            toward = dr.abs(cosine)
+            incidence = dr.abs(cosine)
             after = dr.select(inside, 1.0, g[INDEX])
-            bent = finish.cosine_after(toward, before, after)
+            bent = finish.cosine_after(incidence, before, after)
             total = bent <= 0.0
             bare, opaque = f[2] > 0.5, (f[2] <= 0.5) & (transmitted <= 0.0)
-            plain = finish.reflectance(toward, before, after)
+            plain = finish.reflectance(incidence, before, after)
             transmitted = dr.select(bare, 1.0 - plain, dr.select(total, 0.0, transmitted))
             reflected = dr.select(bare, plain, dr.select(total & ~opaque, 1.0, reflected))
         going_on = reflected + transmitted + diffused
@@ -246,8 +257,8 @@ def _step(
             out_index = Float(1.0)
             if glass:
                 ratio = before / after
-                along = dr.copysign(bent, cosine)
-                refracted = dr.fma(normal, along - ratio * cosine, ratio * d)
+                cosine_after = dr.copysign(bent, cosine)
+                refracted = dr.fma(normal, cosine_after - ratio * cosine, ratio * d)
                 turned = dr.select(through, refracted, turned)
                 own = kind >> Kind.BODY_SHIFT & Kind.BODY_MASK
                 medium = dr.select(met & through, dr.select(inside, 0, own), medium)

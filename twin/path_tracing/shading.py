@@ -1,4 +1,4 @@
-"""Pieces of the path tracer's loop: the nearest face ahead inside a glass body, surfaces, apertures, scattering."""
+"""Pieces of the path tracer's loop: the nearest face ahead inside a glass body, scattering."""
 
 from __future__ import annotations
 
@@ -34,40 +34,6 @@ def nearest_face(backend: Backend, tables: SceneTables, p: Any, d: Any, body: An
     start = (dr.zeros(backend.UInt, 1) + 0 * body, backend.Float(dr.inf) + 0.0 * p.x, 0 * body)
     _, best, face = dr.while_loop(start, lambda k, best, face: k < count, step, label="faces", mode="symbolic")
     return best, face
-
-
-def level(x: Any, y: Any, z: Any, g: Sequence[Any], even: int) -> tuple[Any, Any, Any, Any]:
-    """Level function of an asphere and its gradient, as ``optics.raytrace.trace`` has it, from a row of the geometry
-    table.
-    """
-    import drjit as dr
-
-    r2 = dr.fma(x, x, y * y)
-    w, radial = z, None
-    if even:
-        last = even - 1
-        polynomial, slope = g[14 + last], float(last + 2) * g[14 + last]
-        for k in range(last - 1, -1, -1):
-            polynomial = dr.fma(polynomial, r2, g[14 + k])
-            slope = dr.fma(slope, r2, float(k + 2) * g[14 + k])
-        w = dr.fma(-polynomial * r2, r2, z)
-        radial = 2.0 * slope * r2
-    c = g[12]
-    qw = g[13] * w
-    value = dr.fma(-0.5 * c, dr.fma(qw, w, r2), w)
-    nz = dr.fma(-c, qw, 1.0)
-    factor = c if radial is None else dr.fma(nz, radial, c)
-    return value, -factor * x, -factor * y, nz
-
-
-def within(x: Any, y: Any, a: Sequence[Any]) -> Any:
-    """Inside a clear aperture: ``a`` holds centre x, y, inverse half-sizes, 1 for round, the hole's size squared."""
-    import drjit as dr
-
-    u, v = (x - a[0]) * a[2], (y - a[1]) * a[3]
-    u2, v2 = u * u, v * v
-    r2 = dr.fma(dr.minimum(u2, v2), a[4], dr.maximum(u2, v2))
-    return (r2 <= 1.0) & (r2 >= a[5])
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle, Rectangle
+from optics.geometry.aperture import Aperture, DiskNumbers, EllipseNumbers, RectangleNumbers, RingNumbers
+from optics.geometry.surface import FigureNumbers, GridFigure, GridNumbers, SurfaceNumbers, ZernikeFigure
+from optics.geometry.zernike import triangle_size
 from optics.numerics.backend import Backend
+from optics.numerics.number_tree import leaves
 from scenes.models.scene_surface import SceneSurface
 from scenes.models.scenery import Scenery
 
 BLOCK = 4
 BLOCKS = 8
 ROW = BLOCK * BLOCKS
-"""Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 curvature, 13 1 + conic, 14-16 A4, A6, A8,
-17 clearance, 18-29 two clear apertures, 30 refractive index behind, 31 number of the part plus one."""
+"""Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 curvature, 13 conic, 14-16 A4, A6, A8,
+17 clearance, 18-27 two clear apertures, 28 refractive index behind, 29 number of the part plus one."""
 
-CLEARANCE, APERTURES, INDEX, PART = 17, 18, 30, 31
+CLEARANCE, APERTURES, INDEX, PART = 17, 18, 28, 29
+
+APERTURE = 5
+"""Numbers of a clear aperture: four that its shape has, and which shape it is."""
+RING, RECTANGLE, ELLIPSE = 0.0, 1.0, 2.0
+
+GRID_ROW = 8
+_NO_GRID = (0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 0.0)
+"""Numbers of a grid for surfaces without one: four by four samples of 0, whose 8 x 8 coefficients head the table."""
 
 FINISH_ROW = 8
 ROWS_PER_SURFACE = 3
@@ -43,12 +54,40 @@ class Kind:
     DETECTOR_SHIFT, DETECTOR_MASK = 16, 0xFF
 
 
+@dataclass(frozen=True)
+class SurfaceForm:
+    """What the shapes of a scene's surfaces consist of, and with it the kernel's code.
+
+    Attributes:
+        even: number of aspheric terms.
+        figure_order: highest order of a polynomial figure, -1 when there is none.
+        grid: some surface has a figure on a grid.
+        flat: all surfaces are planes without figure.
+    """
+
+    even: int
+    figure_order: int
+    grid: bool
+    flat: bool
+
+    @classmethod
+    def of(cls, surfaces: Sequence[SceneSurface]) -> SurfaceForm:
+        """What is needed for all of them."""
+        shapes = [s.surface for s in surfaces]
+        order = max((f.order for s in shapes if isinstance(f := s.figure, ZernikeFigure)), default=-1)
+        grid = any(isinstance(s.figure, GridFigure) for s in shapes)
+        flat = order < 0 and not grid and all(s.is_plane for s in shapes)
+        return cls(max((len(s.even) for s in shapes), default=0), order, grid, flat)
+
+
 @dataclass(frozen=True, eq=False)
 class SceneTables:
     """Numbers of a scene (Dr.Jit arrays).
 
     Attributes:
         rows: (surfaces * ROW) geometry; finishes: (surfaces * 3 * FINISH_ROW).
+        figures: (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
+        grids, samples: (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
         kind: (surfaces,) bits; planes: (surfaces * 4) world normal and offset of flat faces.
         body_first, body_faces: (bodies + 1,) first surface and number of faces of each glass body.
         detectors: (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
@@ -57,6 +96,9 @@ class SceneTables:
     """
 
     rows: Any
+    figures: Any
+    grids: Any
+    samples: Any
     finishes: Any
     kind: Any
     planes: Any
@@ -70,6 +112,17 @@ class SceneTables:
     def geometry(self, surface: Any, active: Any) -> list[Any]:
         """The row of each path's surface, ``ROW`` numbers."""
         return self._row(self.rows, surface, BLOCKS, active)
+
+    def surface(self, number: Any, row: list[Any], form: SurfaceForm, active: Any) -> SurfaceNumbers:
+        """The shape of each path's surface, whose row of the geometry is given."""
+        figure = grid = None
+        if form.figure_order >= 0:
+            size = triangle_size(form.figure_order)
+            f = self._row(self.figures, number, _blocks(2 + size), active)
+            figure = FigureNumbers(f[0], f[1], tuple(f[2 : 2 + size]))
+        if form.grid:
+            grid = GridNumbers(*self._row(self.grids, number, GRID_ROW // BLOCK, active)[:7])
+        return SurfaceNumbers(row[12], row[13], tuple(row[14 : 14 + form.even]), figure, grid)
 
     def finish(self, row: Any, active: Any) -> list[Any]:
         """The finish of each path's row, ``FINISH_ROW`` numbers."""
@@ -140,9 +193,14 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
     for i, d in enumerate(detectors):
         grids[i, :5] = [1.0 / d.pitch[0], 1.0 / d.pitch[1], d.columns, d.rows, place]
         place += d.columns * d.rows
+    form = SurfaceForm.of(surfaces)
+    figures, placements, samples = _figures(surfaces, form)
     signatures = np.array([nominal.get(d.name, 0) for d in detectors] or [0], np.uint64)
     out = SceneTables(
         backend.opaque(rows),
+        backend.opaque(figures),
+        backend.opaque(placements),
+        backend.opaque(samples),
         backend.opaque(finishes),
         backend.UInt(kind),
         backend.opaque(planes),
@@ -165,19 +223,62 @@ def _geometry(s: SceneSurface) -> np.ndarray:
     even = s.surface.even
     if len(even) > MOST_EVEN:
         raise ValueError(f"{s.name}: the path tracer takes {MOST_EVEN} aspheric terms, found {len(even)}")
-    row[12], row[13] = s.surface.curvature, 1.0 + s.surface.conic
+    row[12], row[13] = s.surface.curvature, s.surface.conic
     row[14 : 14 + len(even)] = even
     row[CLEARANCE], row[INDEX] = s.clearance, s.index
-    row[APERTURES : APERTURES + 6] = _aperture(s.apertures[0] if s.apertures else None)
-    row[APERTURES + 6 : APERTURES + 12] = _aperture(s.apertures[-1] if s.apertures else None)
+    for k in range(2):  # one alone counts twice
+        start = APERTURES + k * APERTURE
+        row[start : start + APERTURE] = _aperture(s.apertures[-k] if s.apertures else None)
     return row
 
 
+def _blocks(numbers: int) -> int:
+    """Blocks that a row of so many numbers takes."""
+    return -(-numbers // BLOCK)
+
+
+def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of polynomial figures and of grids, and the coefficients of all grids."""
+    polynomials, grids, samples = np.zeros(1), np.zeros(1), np.zeros(1)
+    if form.figure_order >= 0:
+        size = 2 + triangle_size(form.figure_order)
+        polynomials = np.zeros((len(surfaces), BLOCK * _blocks(size)))
+        for i, s in enumerate(surfaces):
+            if isinstance(s.surface.figure, ZernikeFigure):
+                numbers = s.surface.figure.numbers(form.figure_order)
+                polynomials[i, :size] = [numbers.x, numbers.y, *numbers.coefficients]
+    if form.grid:
+        grids, tables = np.zeros((len(surfaces), GRID_ROW)), [np.zeros(64)]
+        grids[:, :7] = _NO_GRID
+        for i, s in enumerate(surfaces):
+            if isinstance(s.surface.figure, GridFigure):
+                grids[i, :7] = list(leaves(s.surface.figure.numbers).values())
+                grids[i, 6] = sum(len(table) for table in tables)
+                tables.append(s.surface.figure.spline.ravel())
+        samples = np.concatenate(tables)
+    return polynomials, grids, samples
+
+
 def _aperture(aperture: Aperture | None) -> tuple[float, ...]:
-    """Centre, inverse half-sizes, 1 for round, square of the hole's relative radius."""
+    """The numbers that ``within`` reads; nothing is outside of no aperture."""
     if aperture is None:
-        return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    x, y = aperture.centre
-    if isinstance(aperture, Circle):
-        return (x, y, 1.0 / aperture.radius, 1.0 / aperture.radius, 1.0, (aperture.inner / aperture.radius) ** 2)
-    return (x, y, 1.0 / aperture.half_x, 1.0 / aperture.half_y, float(not isinstance(aperture, Rectangle)), 0.0)
+        return (0.0, 0.0, np.inf, 0.0, RING)
+    match aperture.numbers():
+        case DiskNumbers() as disk:
+            return (disk.x, disk.y, disk.radius_squared, 0.0, RING)
+        case RingNumbers() as ring:
+            return (ring.x, ring.y, ring.radius_squared, ring.hole_squared, RING)
+        case RectangleNumbers() as box:
+            return (box.x, box.y, box.half_x, box.half_y, RECTANGLE)
+        case EllipseNumbers() as ellipse:
+            return (ellipse.x, ellipse.y, ellipse.half_x, ellipse.half_y, ELLIPSE)
+        case other:
+            assert_never(other)
+
+
+def within(x: Any, y: Any, a: Sequence[Any]) -> Any:
+    """Inside a clear aperture, whose numbers (``APERTURE`` of a row) may be those of another shape for each path."""
+    import drjit as dr
+
+    box, ellipse = RectangleNumbers(*a[:4]).contains(x, y), EllipseNumbers(*a[:4]).contains(x, y)
+    return dr.select(a[4] == RING, RingNumbers(*a[:4]).contains(x, y), dr.select(a[4] == RECTANGLE, box, ellipse))

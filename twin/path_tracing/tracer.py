@@ -15,7 +15,7 @@ from twin.path_tracing.kernel import Features, Launch, PreparedScene
 from twin.path_tracing.path_result import PathResult
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, draw, pieces, take
-from twin.path_tracing.tables import ROWS_PER_SURFACE, upload
+from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload
 
 CHUNK = 1 << 20
 """Paths of one launch: about 200 MB at work."""
@@ -59,10 +59,9 @@ class PathTracer:
     def features(self, keep_nominal: bool = False, log: bool = False) -> Features:
         """What the kernel must be able to do for this scene."""
         surfaces = self.scenery.surfaces
-        flat = all(s.surface.is_plane for s in surfaces)
         finishes = [f for s in surfaces for f in (s.front, s.back, s.outside)]
         return Features(
-            even=-1 if flat else max(len(s.surface.even) for s in surfaces),
+            form=SurfaceForm.of(surfaces),
             glass=any(s.solid is not None for s in surfaces),
             branching=any(f.bare or f.transmission or f.diffuse or f.scatter for f in finishes),
             roulette=self.sampling.roulette > 0.0,
