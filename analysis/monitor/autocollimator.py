@@ -59,6 +59,8 @@ def column_component(axis: str) -> int:
 
     For Z it is 1: mirror 2 turns about its own Y.
     """
+    if axis not in AXES:
+        raise ValueError(f"readings: axis must be X, Y or Z, found {axis!r}")
     return 0 if axis == "X" else 1
 
 

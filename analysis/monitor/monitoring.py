@@ -161,7 +161,7 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
     beta = delta * (math.cos(geometry.field_beta_rad) ** 2 if paper else 1.0) / (2 * f) / 2
     alpha = delta * (math.cos(geometry.field_alpha_rad) ** 2 if paper else 1.0) / (2 * f_x) / 2
     gamma = delta / length if paper else delta / (2 * length) * f / f_x
-    scale = delta * f / (length * (4 if name == "paper_joint" else 2))
+    scale = delta * f / (length * {"paper_single": 2, "paper_joint": 4, "derived": 2}[name])
     matrix = np.array(
         [
             [0.0, -alpha, 0.0, -alpha],

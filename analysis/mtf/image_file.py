@@ -307,10 +307,16 @@ def _png_header(path: Path) -> ImageFile:
             file.seek(length + 4, 1)
     if not (rows and columns and ended):
         raise ImageError(f"{path} cannot be read as an image: it is cut off or damaged")
-    channels = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}.get(colour, 4)
+    if colour not in _PNG_CHANNELS:
+        raise ImageError(f"{path} cannot be read as an image: PNG has no colour type {colour}")
+    channels = _PNG_CHANNELS[colour]
     dtype = np.dtype(np.uint16 if depth == 16 else np.uint8)
     size = rows * columns * channels * dtype.itemsize
     return ImageFile(path, "PNG", (0,), rows, columns, size, _full_scale(dtype), coded)
+
+
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
+"""Colour type of a PNG -> channels that it is decoded to."""
 
 
 def _jpeg_header(path: Path) -> ImageFile:

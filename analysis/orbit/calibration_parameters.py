@@ -209,6 +209,22 @@ class Unknowns:
     drift: Literal["field", "none"] = "none"
     rate: Literal["common", "none"] = "none"
 
+    def __post_init__(self) -> None:
+        """Refuse words that mean nothing: they would count as none."""
+        for name, known in _EXTENT.items():
+            if getattr(self, name) not in known:
+                raise CalibrationError(
+                    f"calibration: {name} must be {' or '.join(known)}, found {getattr(self, name)!r}"
+                )
+
+
+_EXTENT = {
+    "bias": ("field", "common", "none"),
+    "offset": ("field", "none"),
+    "drift": ("field", "none"),
+    "rate": ("common", "none"),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Prior:

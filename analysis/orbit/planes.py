@@ -202,11 +202,10 @@ def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> Pla
     noise = np.linalg.solve(matrix, spread[:2, :2])
     shrink = np.linalg.solve(matrix, spread[:2, 2]) - noise @ slopes
     bias = across @ shrink / length
+    seen = normal
     if method == "printed":
         half_turn = np.array([-1.0, -1.0, 1.0])
         seen, gain, bias = half_turn * normal, half_turn[:, None] * gain, half_turn * bias
-    else:
-        seen = normal
     residual = arm @ seen
     return PlaneFit(
         method=method,

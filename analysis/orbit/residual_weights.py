@@ -70,6 +70,8 @@ def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
     weight = np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
     if kind == "huber":
         return np.asarray(weight)
+    if kind != "igg":
+        raise ValueError(f"robust weights: kind must be huber, igg or accept, found {kind!r}")
     fall = np.clip((REJECT - size) / (REJECT - HUBER), 0.0, 1.0)
     return np.asarray(np.where(size <= HUBER, 1.0, weight * fall**2))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, assert_never
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -158,7 +158,7 @@ def judge(statement: Statement, table: Sequence[Sensitivity]) -> Judgement:
         holds = all(v > 0 for v in chosen)
     elif statement.kind == "decreases":
         holds = all(v < 0 for v in chosen)
-    elif statement.kind in ("largest", "far_larger"):
+    elif statement.kind == "largest" or statement.kind == "far_larger":
         ratio = min(size) / rest
         holds = ratio > (1.0 if statement.kind == "largest" else _FAR)
     elif statement.kind == "close":
@@ -172,8 +172,10 @@ def judge(statement: Statement, table: Sequence[Sensitivity]) -> Judgement:
         numbers = {axis: float(rows[axis].curvature[at]) for axis in statement.axes}
         ratio = min(numbers.values())
         holds = ratio > 0
-    else:
+    elif statement.kind == "opposite":
         holds = all(rows[a].slope_of("alpha") * rows[a].slope_of("beta") < 0 for a in statement.axes)
+    else:
+        assert_never(statement.kind)
     return Judgement(statement, holds, numbers, ratio)
 
 

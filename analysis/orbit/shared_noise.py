@@ -49,7 +49,7 @@ def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> A
     unit = np.eye(2) if rays.spread is None else rays.spread
     spread = np.broadcast_to(noise.image**2 * unit, (len(rays.point), 2, 2))
     for term in noise.terms:
-        part = by.attitude if term.kind == "attitude" else by.ground
+        part = {"attitude": by.attitude, "station": by.ground}[term.kind]
         variance = np.full(len(rays.point), term.sigma**2)
         if term.interval is not None and rays.time is not None:
             variance = variance * (reading_variance(rays.time, term.interval) if shared else 0.0)
@@ -173,7 +173,7 @@ class SharedNoise:
         for one in self.series[name]:
             if line not in one.places:
                 continue
-            part = white @ (by.attitude if one.term.kind == "attitude" else -by.ground) * one.term.sigma
+            part = white @ {"attitude": by.attitude, "station": -by.ground}[one.term.kind] * one.term.sigma
             data.append((part[:, :, None, :] * one.blends[line][:, None, :, None]).reshape(count, 2, 12))
             columns.append(np.repeat(one.columns(line).reshape(count, 1, 12), 2, axis=1))
         width = 12 * len(data)

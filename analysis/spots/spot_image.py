@@ -159,6 +159,8 @@ def soft_window(place: Array, height: int, width: int, radius: float, kind: str)
         mask = np.clip(radius + 0.5 - distance, 0.0, 1.0)
         edge = (mask > 0) & (mask < 1)
         return mask, arm * (edge / np.maximum(distance, 1e-9))[:, None]
+    if kind != "square":
+        raise ValueError(f"a window is a circle or a square, found {kind!r}")
     side = np.clip(radius + 0.5 - np.abs(arm), 0.0, 1.0)
     edge2 = np.where((side > 0) & (side < 1), np.sign(arm), 0.0)
     return side[:, 0] * side[:, 1], edge2 * side[:, ::-1]
@@ -199,6 +201,8 @@ def gaussian(
 
 def variance(level: Array, noise: NoiseModel, frames: int, weights: str) -> Array:
     """Variance of a mean of frames at grey value `level`, DN^2: "temporal" only, or "total" with the fixed pattern."""
+    if weights not in ("total", "temporal"):
+        raise ValueError(f"weights must be 'total' or 'temporal', found {weights!r}")
     out: Array = noise.temporal_variance_dn2(level, frames)
     if weights == "total":
         out += noise.fixed_variance_dn2(level)

@@ -153,6 +153,8 @@ class Judge:
             assert rays.d_position is not None
             slope = (project @ rays.d_position[:, :, own, :2]) * weight[:, None] / unit
             return value.ravel(), slope.reshape(len(slope), -1), errors
+        if self.goals.measure != "wavefront":
+            raise ValueError(f"a design has no measure {self.goals.measure!r}; there are wavefront and spot")
         # eikonal about the chief ray's image; the exit pupil is taken as far away, which matters by offset^2 / (2 R):
         # some 1e-12 m for spots of 1 um
         offset = rays.position[:, own] - rays.position[:, :1]

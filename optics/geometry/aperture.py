@@ -102,6 +102,11 @@ class Circle:
         (cx, cy), r = self.centre, self.radius
         return cx - r, cx + r, cy - r, cy + r
 
+    @property
+    def inscribed(self) -> float:
+        """Radius of the largest disk about the centre that lies inside the outer edge, metres."""
+        return self.radius
+
     def grown(self, size: float) -> Circle:
         """The same on a body of another size, 1 being the nominal one."""
         return Circle(size * self.radius, (size * self.centre[0], size * self.centre[1]), size * self.inner)
@@ -140,6 +145,11 @@ class Rectangle:
         """x_min, x_max, y_min, y_max, metres."""
         (cx, cy) = self.centre
         return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    @property
+    def inscribed(self) -> float:
+        """Radius of the largest disk about the centre that lies inside, metres."""
+        return min(self.half_x, self.half_y)
 
     def grown(self, size: float) -> Rectangle:
         """The same on a body of another size, 1 being the nominal one."""
@@ -182,6 +192,11 @@ class Ellipse:
         """x_min, x_max, y_min, y_max, metres."""
         (cx, cy) = self.centre
         return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    @property
+    def inscribed(self) -> float:
+        """Radius of the largest disk about the centre that lies inside, metres."""
+        return min(self.half_x, self.half_y)
 
     def grown(self, size: float) -> Ellipse:
         """The same on a body of another size, 1 being the nominal one."""

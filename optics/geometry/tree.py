@@ -77,6 +77,24 @@ class Motion:
         """Freeze the figure."""
         object.__setattr__(self, "figure", FrozenMap(self.figure))
 
+    def component(self, kind: str, axis: int) -> float:
+        """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, ``scale``, or a ``figure`` term.
+
+        Raises:
+            ValueError: there is no such kind of motion.
+        """
+        match kind:
+            case "rotate":
+                return float(self.rotate[axis])
+            case "shift":
+                return float(self.shift[axis])
+            case "scale":
+                return float(self.scale)
+            case "figure":
+                return float(self.figure.get(axis, 0.0))
+            case _:
+                raise ValueError(f"a motion is a rotate, shift, scale or figure, not a {kind!r}")
+
 
 AT_REST = Motion()
 """Of a body that a state does not name."""

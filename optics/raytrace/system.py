@@ -14,7 +14,7 @@ import numpy as np
 
 from optics.geometry import zernike
 from optics.geometry.aperture import ApertureNumbers
-from optics.geometry.surface import FigureNumbers, GridFigure, SurfaceNumbers, ZernikeFigure
+from optics.geometry.surface import Figure, FigureNumbers, GridFigure, SurfaceNumbers, ZernikeFigure
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
@@ -295,7 +295,7 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
         (
             e.interaction,
             e.surface.is_plane,
-            isinstance(e.surface.figure, GridFigure),
+            isinstance(_known_figure(e), GridFigure),
             None if e.aperture is None else type(e.aperture.numbers()),
         )
         for e in elements
@@ -316,6 +316,15 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
             if motion is not None and motion.figure:
                 order = max(order, zernike.order_of(motion.figure))
     return Structure(interaction, is_plane, even, order, grid, aperture, graded)
+
+
+def _known_figure(element: Element) -> Figure | None:
+    """The figure of an element's surface; ValueError for one that the trace would leave out."""
+    match element.surface.figure:
+        case None | ZernikeFigure() | GridFigure() as figure:
+            return figure
+        case other:
+            raise ValueError(f"element {element.name!r}: the trace knows no figure of type {type(other).__name__}")
 
 
 def _grid(element: Element) -> np.ndarray | None:

@@ -13,11 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import assert_never
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from optics.geometry.vector_shape import FiniteShape, HalfPlane
+from optics.geometry.vector_shape import Disk, FiniteShape, HalfPlane, Polygon
 from optics.numerics.quadrature import gauss
 from optics.numerics.threads import one_blas_thread
 from optics.targets.target_shapes import Target
@@ -187,12 +188,15 @@ def target_image(
     out = np.full((y.count, x.count), target.background * level)
     finite: list[tuple[float, FiniteShape]] = []
     for share, shape in target.parts:
-        if isinstance(shape, HalfPlane):
-            reach = float(np.max(np.abs(shape.distance(x.points()[[0, -1]], y.points()[[0, -1], None]))))
-            profile = EdgeProfile.build(transfer, shape.normal, cutoff, max(reach, 1.0 / cutoff))
-            out += share * profile.image(shape, x, y)
-        else:
-            finite.append((share, shape))
+        match shape:
+            case HalfPlane():
+                reach = float(np.max(np.abs(shape.distance(x.points()[[0, -1]], y.points()[[0, -1], None]))))
+                profile = EdgeProfile.build(transfer, shape.normal, cutoff, max(reach, 1.0 / cutoff))
+                out += share * profile.image(shape, x, y)
+            case Polygon() | Disk():
+                finite.append((share, shape))
+            case _:
+                assert_never(shape)
     if finite:
         out += _finite_image(finite, transfer, cutoff, x, y, guard)
     return out

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from skfem import MeshHex1, MeshHex2, MeshTet1
 
-from optics.geometry.aperture import Aperture, Circle
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
 
 CLOSE = 1e-3
@@ -29,7 +29,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: 
 
     Args:
         surface: the optical face, in its own frame (metres), with its figure.
-        aperture: the outline of the substrate (its edge is a cylinder or box along z).
+        aperture: the outline of the substrate (its edge is a cylinder or, also about an ellipse, a box along z).
         thickness: least distance along z from the face to the back, metres.
         behind: side of the face where the substrate lies: +1 toward +z, -1 toward -z.
         cells: number of cells across the longer width; the layers through the thickness follow from it (at least 2).
@@ -43,14 +43,18 @@ def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: 
         raise ValueError(f"a substrate needs a positive thickness and 2 cells or more, found {thickness} m and {cells}")
     x0, x1, y0, y1 = aperture.bounds
     layers = max(2, round(cells * thickness / max(x1 - x0, y1 - y0)))
-    plane, quads = _disk_blocks(cells, aperture.inner > 0.0) if isinstance(aperture, Circle) else _grid(aperture, cells)
-    mesh = MeshHex2.from_mesh(_extruded(plane, quads, layers))
-    u, v, depth = mesh.doflocs
-    if isinstance(aperture, Circle):
-        x, y = _on_disk(u, v, aperture.inner / aperture.radius)
-        x, y = aperture.centre[0] + aperture.radius * x, aperture.centre[1] + aperture.radius * y
-    else:
-        x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
+    match aperture:
+        case Circle():
+            mesh = MeshHex2.from_mesh(_extruded(*_disk_blocks(cells, aperture.inner > 0.0), layers))
+            u, v, depth = mesh.doflocs
+            x, y = _on_disk(u, v, aperture.inner / aperture.radius)
+            x, y = aperture.centre[0] + aperture.radius * x, aperture.centre[1] + aperture.radius * y
+        case Rectangle() | Ellipse():
+            mesh = MeshHex2.from_mesh(_extruded(*_grid(aperture, cells), layers))
+            u, v, depth = mesh.doflocs
+            x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
+        case _:
+            assert_never(aperture)
     sag = surface.sag(x, y)
     if not np.all(np.isfinite(sag)):
         raise ValueError("the aperture reaches beyond the domain of its surface")

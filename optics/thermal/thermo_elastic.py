@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 from scipy.linalg import qr
@@ -153,16 +153,20 @@ class ElasticBody:
         out = []
         for temperature, held in zip(temperatures, supports, strict=True):
             load = self._load(temperature)
-            if isinstance(held, Bonded):
-                glued = self._glued(held)
-                moved = held.expansion * held.change * (self.nodes[glued] - np.asarray(held.about))
-                fixed = (3 * glued[:, None] + np.arange(3)).ravel()
-                values = self._solved(load, fixed, moved.ravel())
-            else:
-                # thermal loads are in balance, so any six components may be held to solve; the support's own come after
-                modes = rigid_modes(self.nodes)
-                fixed = np.sort(qr(modes, mode="r", pivoting=True)[1][:6])
-                values = self._supported(self._solved(load, fixed, np.zeros(6)), held)
+            match held:
+                case Bonded():
+                    glued = self._glued(held)
+                    moved = held.expansion * held.change * (self.nodes[glued] - np.asarray(held.about))
+                    fixed = (3 * glued[:, None] + np.arange(3)).ravel()
+                    values = self._solved(load, fixed, moved.ravel())
+                case Kinematic():
+                    # thermal loads are in balance, so any six components may be held to solve; the support's own come
+                    # after
+                    modes = rigid_modes(self.nodes)
+                    fixed = np.sort(qr(modes, mode="r", pivoting=True)[1][:6])
+                    values = self._supported(self._solved(load, fixed, np.zeros(6)), held)
+                case _:
+                    assert_never(held)
             out.append(Displacement(self.nodes, values, self._finder))
         return tuple(out)
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -25,6 +26,8 @@ from scipy.ndimage import map_coordinates, spline_filter
 from optics.numerics.quadrature import gauss
 from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.pupil_function import PupilFunction
+
+Part = Literal["all", "clear", "shadow"]
 
 _AT_ONCE = 2**17
 """Phases (shifts x defocus x nodes) or frequencies worked on together: some arrays of 1 MB that stay in the cache."""
@@ -117,12 +120,14 @@ LEAST_ACROSS = 13
 
 
 def _correlate(
-    pupil: PupilFunction, shift: np.ndarray, wavelength: np.ndarray, defocus: np.ndarray, part: str = "all"
+    pupil: PupilFunction, shift: np.ndarray, wavelength: np.ndarray, defocus: np.ndarray, part: Part = "all"
 ) -> np.ndarray:
     """Transfer function at normalised shifts (S,), wavelengths (S,) and defocus (Z,): (S, Z).
 
     Its ``part`` may be "clear", that of the clear pupil, or "shadow", what the shadow adds, both normalised as a whole.
     """
+    if part not in get_args(Part):
+        raise ValueError(f"a transfer function has no part {part!r}; there are {', '.join(get_args(Part))}")
     out = np.zeros((len(shift), len(defocus)), complex)
     if not len(shift) or not len(defocus):
         return out
@@ -342,7 +347,7 @@ def _polar_terms(
 
 
 def _about(
-    pupil: PupilFunction, shift: np.ndarray, wavelengths: np.ndarray, defocus: float, centroid: np.ndarray, part: str
+    pupil: PupilFunction, shift: np.ndarray, wavelengths: np.ndarray, defocus: float, centroid: np.ndarray, part: Part
 ) -> np.ndarray:
     """``part`` of the transfer function about ``centroid`` at normalised shifts of any shape, (K, *shape)."""
     every = np.repeat(wavelengths, shift.size)

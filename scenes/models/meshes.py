@@ -5,10 +5,12 @@ Prescriptions say nothing about substrates; these have a thickness that is usual
 
 from __future__ import annotations
 
+from typing import assert_never
+
 import numpy as np
 import trimesh
 
-from optics.geometry.aperture import Aperture, Circle
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
 from scenes.models.camera_model import CameraModel
 
@@ -40,9 +42,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
     x0, x1, y0, y1 = aperture.bounds
     s = np.linspace(-1.0, 1.0, cells + 1)
     u, v = np.meshgrid(s, s)
-    if isinstance(aperture, Circle):  # square onto disk, ring by ring
-        ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
-        u, v = ring * np.cos(angle), ring * np.sin(angle)
+    u, v = _onto(aperture, u, v)
     x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
     z = surface.sag(x, y)
     thickness = THICKNESS * max(x1 - x0, y1 - y0)
@@ -60,6 +60,18 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
     edge = np.concatenate([np.stack([rim, rim + offset, after], 1), np.stack([after, rim + offset, after + offset], 1)])
     faces = np.concatenate([face, face[:, ::-1] + offset, edge])
     return trimesh.Trimesh(np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces, process=False)
+
+
+def _onto(aperture: Aperture, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places of a square grid over [-1, 1]^2 on the outline of an aperture's mesh: a disk ring by ring, or a box."""
+    match aperture:
+        case Circle():
+            ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
+            return ring * np.cos(angle), ring * np.sin(angle)
+        case Rectangle() | Ellipse():
+            return u, v
+        case _:
+            assert_never(aperture)
 
 
 def behind(model: CameraModel, mirror: str) -> float:
@@ -112,9 +124,7 @@ def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.nda
     half_x, half_y = (max((1.0 + MARGIN) * h, h + LEAST_MARGIN) for h in (half_x, half_y))
     s = np.linspace(-1.0, 1.0, cells + 1)
     u, v = np.meshgrid(s, s)
-    if isinstance(aperture, Circle):  # square onto disk, ring by ring
-        ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
-        u, v = ring * np.cos(angle), ring * np.sin(angle)
+    u, v = _onto(aperture, u, v)
     x, y = 0.5 * (x0 + x1) + half_x * u, 0.5 * (y0 + y1) + half_y * v
     z = surface.sag(x, y)
     if not np.all(np.isfinite(z)):

@@ -109,7 +109,7 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str) -> l
     points = points_to_world(placed, line_body(f"{BASE}/{camera}"), line)[0]
     stop = assembly.elements[f"{camera}/{model.spec.stop}"].aperture
     assert stop is not None
-    radius = stop.radius if isinstance(stop, Circle) else min(stop.half_x, stop.half_y)
+    radius = stop.inscribed
     start = np.repeat(points, RAYS, axis=0)[None]
     chain = assembly.sequences[f"{camera}/image_to_object"]
     position, direction = _aimed(

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from optics.geometry.aperture import Circle
+from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.polygon import area, hull, intersect
 from optics.geometry.tree import PlacedBodies
 from optics.numerics.backend import Backend
@@ -130,16 +130,19 @@ def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
 
 def _plate(plate: Plate) -> list[Caster]:
     """A plate as one convex polygon, or a ring as several."""
-    if isinstance(plate.outline, Circle):
-        angle = 2.0 * np.pi * np.arange(RING_SIDES + 1) / RING_SIDES
-        turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        outer, inner = (np.array(plate.outline.centre) + r * turn for r in (plate.outline.radius, plate.outline.inner))
-        parts = [outer[:-1]]
-        if plate.outline.inner:
-            parts = [np.concatenate([outer[k : k + 2], inner[k : k + 2]]) for k in range(RING_SIDES)]
-    else:
-        x0, x1, y0, y1 = plate.outline.bounds
-        parts = [np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])]
+    match plate.outline:
+        case Circle() as disk:
+            angle = 2.0 * np.pi * np.arange(RING_SIDES + 1) / RING_SIDES
+            turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            outer, inner = (np.array(disk.centre) + r * turn for r in (disk.radius, disk.inner))
+            parts = [outer[:-1]]
+            if disk.inner:
+                parts = [np.concatenate([outer[k : k + 2], inner[k : k + 2]]) for k in range(RING_SIDES)]
+        case Rectangle() as box:
+            x0, x1, y0, y1 = box.bounds
+            parts = [np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])]
+        case _:
+            assert_never(plate.outline)
     flat = [np.column_stack([part, np.zeros(len(part))]) for part in parts]
     return [Caster(plate.name, plate.body, plate.pose.apply(part)) for part in flat]
 

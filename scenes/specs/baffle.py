@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, assert_never
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -144,10 +144,14 @@ class BaffleSpec(Spec):
         pose = Pose(rotation_matrix(self.rotate), self.position)  # type: ignore[arg-type]
         width, height, length = self.width or 0.0, self.height or 0.0, self.length or 0.0
         radius = 0.5 * (self.diameter or 0.0)
-        if self.shape == "box":
-            return box(name, self.body, pose, (width, height, length))
-        if self.shape == "tube":
-            return tube(name, self.body, pose, radius, length)
-        if self.shape == "ring":
-            return ring(name, self.body, pose, 0.5 * (self.hole or 0.0), radius)
-        return (Plate(name, self.body, pose, Rectangle(0.5 * width, 0.5 * height)),)
+        match self.shape:
+            case "box":
+                return box(name, self.body, pose, (width, height, length))
+            case "tube":
+                return tube(name, self.body, pose, radius, length)
+            case "ring":
+                return ring(name, self.body, pose, 0.5 * (self.hole or 0.0), radius)
+            case "plate":
+                return (Plate(name, self.body, pose, Rectangle(0.5 * width, 0.5 * height)),)
+            case _:
+                assert_never(self.shape)

@@ -12,7 +12,7 @@ from analysis.orbit.calibration_parameters import CalibrationError, CalibrationF
 from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import Gauge, RankError, solved
-from analysis.orbit.residual_weights import LARGEST_FACTOR, REJECT, standardised
+from analysis.orbit.residual_weights import LARGEST_FACTOR, REJECT, robust_weights, standardised
 from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.stepwise import stepwise
 from tests.analysis.test_three_line_model import (
@@ -563,3 +563,15 @@ def test_standardised_residuals_do_not_depend_on_the_own_weight():
     # rounding of the covariances, and the little that the system bends over a millionth of a radian
     for one in sizes[1:]:
         assert one == pytest.approx(sizes[0], rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize(("name", "word"), [("bias", "fields"), ("offset", "common"), ("drift", ""), ("rate", "field")])
+def test_words_that_are_no_unknowns_are_refused(name: str, word: str) -> None:
+    """They would count as none."""
+    with pytest.raises(CalibrationError, match=f"{name} must be"):
+        Unknowns(**{name: word})
+
+
+def test_weights_of_no_known_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match="huber, igg or accept"):
+        robust_weights(np.zeros((2, 2)), "tukey")

@@ -64,6 +64,9 @@ def test_second_order_terms_are_as_large_as_documented() -> None:
 def test_unknown_names(axis: str, unit: int) -> None:
     with pytest.raises(ValueError, match="axis must be X, Y or Z and unit 1 or 2"):
         relation_factor(axis, unit, 0.5)
+    if axis != "X":
+        with pytest.raises(ValueError, match="axis must be X, Y or Z"):
+            column_component(axis)
 
 
 def test_a_reading_map_recovers_a_distorting_lens() -> None:

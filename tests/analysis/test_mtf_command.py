@@ -211,6 +211,19 @@ def test_a_png_that_names_its_curve_gives_a_warning(tmp_path):
     assert run(tmp_path / "plain.png", "--roi", ROI, "--pixel-size", "7 um").stderr == ""
 
 
+def test_a_png_of_no_known_colour_type_is_refused(tmp_path):
+    """Its channels would be guessed."""
+    path = tmp_path / "odd.png"
+    cv2.imwrite(str(path), edge_frame())
+    data = bytearray(path.read_bytes())
+    data[25] = 5
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    path.write_bytes(bytes(data))
+    result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+    assert result.exit_code == 2
+    assert "no colour type 5" in " ".join(result.stderr.split())
+
+
 def black_png(side):
     """8 bits, grey, all black: some 400 kB for 400 million pixels."""
 

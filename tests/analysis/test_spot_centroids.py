@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 from scipy.special import j1
 
+from analysis.spots import spot_image
 from analysis.spots.centroid import (
     _GAUSS_MOVE_PX,
     SpotError,
@@ -314,3 +315,10 @@ def test_faint_and_narrow_gaussians_are_still_gaussians():
     assert sane(good).all()
     assert not sane(good * [[1, 1, -1, 1, 1]]).any()
     assert not sane(good * [[1, 1, 1, 1, -1]]).any()
+
+
+def test_windows_and_weights_that_do_not_exist_are_refused():
+    with pytest.raises(ValueError, match="a circle or a square"):
+        spot_image.soft_window(np.array([[8.0, 8.0]]), 16, 16, 4.0, "disc")
+    with pytest.raises(ValueError, match="'total' or 'temporal'"):
+        spot_image.variance(np.ones(3), None, 1, "fixed")

@@ -107,3 +107,13 @@ def test_bad_figures_are_refused(backend) -> None:
         GridFigure(np.zeros((5, 5)), (1, 0, 0, 1))
     with pytest.raises(ValueError, match="needs an aperture"):
         run(backend, build(Stage(plane())), np.zeros((1, 3)), Z[None], {"e0": Motion(figure={4: 1e-9})})
+
+
+def test_a_figure_that_the_trace_does_not_know_is_refused(backend) -> None:
+    """It would be left out without a word."""
+
+    class Bump:
+        pass
+
+    with pytest.raises(ValueError, match="no figure of type Bump"):
+        run(backend, build(Stage(plane().with_figure(Bump()))), np.zeros((1, 3)), Z[None])  # type: ignore[arg-type]

@@ -115,3 +115,12 @@ def test_bad_trees_and_states_are_refused(tree: RigidTree) -> None:
         tree.place([{"a": Motion(pivot="nowhere")}])
     with pytest.raises(ValueError, match="bend"):
         tree.place([{}], [("a", "bend", 0)])
+
+
+def test_numbers_of_a_motion_by_name() -> None:
+    motion = Motion(rotate=(1.0, 2.0, 3.0), shift=(4.0, 5.0, 6.0), scale=7.0, figure={8: 9.0})
+    found = [motion.component(*which) for which in (("rotate", 1), ("shift", 2), ("scale", 0), ("figure", 8))]
+    assert found == [2.0, 6.0, 7.0, 9.0]
+    assert motion.component("figure", 5) == 0.0
+    with pytest.raises(ValueError, match="not a 'stretch'"):
+        motion.component("stretch", 0)

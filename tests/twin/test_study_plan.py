@@ -11,6 +11,7 @@ from tests.twin.study_bench import STUDY, write_study
 from twin.study.runs.config_tree import leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK
+from twin.study.runs.sampling import unit_cube
 from twin.study.runs.setup import StudySetup, resolve_study, study_from_text
 
 FACTORS = STUDY[STUDY.index("factors:") : STUDY.index("design:")]
@@ -203,3 +204,9 @@ def test_every_base_command_is_known(tmp_path) -> None:
         setup = resolve_study(path)
         assert isinstance(setup, StudySetup)
         assert Plan.of(setup).runs == 2
+
+
+def test_a_design_that_does_not_exist_draws_no_points() -> None:
+    """It was drawn as monte_carlo."""
+    with pytest.raises(ValueError, match="no design of kind 'halton'"):
+        unit_cube("halton", 4, 2, 0)

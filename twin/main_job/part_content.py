@@ -180,6 +180,8 @@ def _target_content_camera(name: str, camera: CameraTargets, kinds: list[str]) -
 
 def _readings(targets: PlaceTargets, direction: str, kind: str) -> list[tuple[str, EdgeReading | BarReading]]:
     """Before and after."""
+    if kind not in ("edge", "bars"):
+        raise ValueError(f"a target measures an edge or bars, not {kind!r}")
     return [
         (when, shots.edges[direction] if kind == "edge" else shots.bars[direction])
         for when, shots in targets.shots.items()

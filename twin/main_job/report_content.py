@@ -60,15 +60,11 @@ def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
     motion = run.state.get(elementary.body)
     if motion is None:
         return 0.0
-    if elementary.kind == "rotate":
-        value = motion.rotate[elementary.axis]
-    elif elementary.kind == "scale":
-        value = motion.scale
-    elif elementary.kind == "figure":
-        value = motion.figure.get(elementary.axis, 0.0)
+    if elementary.kind == "shift":
+        value = float(_shift_at(run, elementary.body, motion, elementary.pivot)[elementary.axis])
     else:
-        value = _shift_at(run, elementary.body, motion, elementary.pivot)[elementary.axis]
-    return float(value) / elementary.unit_size
+        value = motion.component(elementary.kind, elementary.axis)
+    return value / elementary.unit_size
 
 
 def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from analysis.units import ARCSEC
+from optics.geometry.pose import triple
 from optics.geometry.tree import ORIGIN, Motion, State
 from scenes.models.instrument_model import Instrument
 from scenes.specs.channel import BASE, CENTRAL_PRISM
@@ -51,16 +52,18 @@ class ElementaryMotion:
 
     def motion(self, amount: float) -> Motion:
         """The motion of this size, SI."""
-        if self.kind == "figure":
-            return Motion(figure={self.axis: amount}, pivot=self.pivot)
-        vector = [0.0, 0.0, 0.0]
-        vector[self.axis] = amount
-        triple = (vector[0], vector[1], vector[2])
-        if self.kind == "rotate":
-            return Motion(rotate=triple, pivot=self.pivot)
-        if self.kind == "shift":
-            return Motion(shift=triple, pivot=self.pivot)
-        return Motion(scale=amount, pivot=self.pivot)
+        along = triple(amount if self.axis == a else 0.0 for a in range(3))
+        match self.kind:
+            case "rotate":
+                return Motion(rotate=along, pivot=self.pivot)
+            case "shift":
+                return Motion(shift=along, pivot=self.pivot)
+            case "scale":
+                return Motion(scale=amount, pivot=self.pivot)
+            case "figure":
+                return Motion(figure={self.axis: amount}, pivot=self.pivot)
+            case _:
+                raise ValueError(f"a motion is a rotate, shift, scale or figure, not a {self.kind!r}")
 
     def state(self, amount: float) -> State:
         """The state in which only this motion of the given size, SI, is applied."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import assert_never
 
 from optics.raytrace.assembly import Assembly, Interaction
 from scenes.models.scenery import Scenery
@@ -87,10 +88,16 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
     parts = scenery.parts
     out = []
     for element in assembly.sequence(sequence):
-        if element.interaction is Interaction.PASS:
-            continue
+        match element.interaction:
+            case Interaction.PASS:
+                continue
+            case Interaction.REFRACT:
+                event = Event.TRANSMIT
+            case Interaction.REFLECT | Interaction.TOTAL:
+                event = Event.REFLECT
+            case _:
+                assert_never(element.interaction)
         surface = scenery.surfaces[scenery.of_element(element.name)]
-        event = Event.TRANSMIT if element.interaction is Interaction.REFRACT else Event.REFLECT
         out.append(code(parts.index(surface.part), event))
     return tuple(out)
 

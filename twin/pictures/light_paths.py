@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle
+from optics.geometry.aperture import Aperture
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import RayFan, aim, transverse_axes
@@ -87,10 +87,8 @@ def _circle(radius: float) -> np.ndarray:
 
 
 def _radius(aperture: Aperture | None) -> float:
-    if isinstance(aperture, Circle):
-        return aperture.radius
     assert aperture is not None
-    return min(aperture.half_x, aperture.half_y)
+    return aperture.inscribed
 
 
 def _imaging(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies, reach: float) -> list[Beam]:

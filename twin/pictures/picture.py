@@ -210,7 +210,7 @@ def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View,
     elif shot.shows == "prisms":
         wanted = [name for name in points if name.startswith(CENTRAL_PRISM) or name.endswith("prism_0")]
         azimuth, elevation, field = -66.0, 24.0, 24.0
-    else:
+    elif shot.shows == "focal_plane":
         plane = f"{BASE}/{next(iter(instrument.cameras))}/focal_plane"
         wanted = [name for name in points if name.startswith(plane)]
         # into the housing, against the light, a little from the side
@@ -218,6 +218,8 @@ def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View,
         azimuth = float(np.degrees(np.arctan2(y, x))) + 12.0
         elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y)))) + 5.0
         field = 24.0
+    else:
+        raise ValueError(f"a picture shows the instrument, the prisms or the focal plane, not {shot.shows!r}")
     shown = np.concatenate([points[name] for name in wanted])
     view = framed(shown, azimuth, elevation, field, (shot.width, shot.height))
     return view, studio_parts(instrument, paths, view.pixel_at(shown))

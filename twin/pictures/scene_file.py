@@ -9,12 +9,13 @@ true shape and clear aperture; figure errors, far too small to be seen, are left
 from __future__ import annotations
 
 from pathlib import Path
+from typing import assert_never
 
 import numpy as np
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from optics.geometry.aperture import Circle
+from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.solid import solid_mesh
 from optics.geometry.tree import State
 from scenes.models.instrument_model import Instrument
@@ -128,10 +129,13 @@ def baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Tri
     parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
     for plate in plates:
         outline = plate.outline
-        if isinstance(outline, Circle):
-            mesh = trimesh.creation.annulus(outline.inner, outline.radius, SHEET, sections=64)
-        else:
-            mesh = trimesh.creation.box(extents=(2.0 * outline.half_x, 2.0 * outline.half_y, SHEET))
+        match outline:
+            case Circle():
+                mesh = trimesh.creation.annulus(outline.inner, outline.radius, SHEET, sections=64)
+            case Rectangle():
+                mesh = trimesh.creation.box(extents=(2.0 * outline.half_x, 2.0 * outline.half_y, SHEET))
+            case _:
+                assert_never(outline)
         matrix = np.eye(4)
         matrix[:3, :3] = plate.pose.rotation
         matrix[:3, 3] = plate.pose.apply(np.array([*outline.centre, 0.0]))

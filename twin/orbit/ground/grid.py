@@ -8,7 +8,7 @@ the middle (at 40 degrees of latitude an east metre is 1.3e-4 wrong 1 km to the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, assert_never
 
 import numpy as np
 from scipy import fft
@@ -161,7 +161,7 @@ class SplineGrid:
             self._require_inside(east, north)
         row = (north - self.first[1]) / self.spacing[1]
         column = (east - self.first[0]) / self.spacing[0]
-        mode = "nearest" if self.beyond == "nothing" else self.beyond
+        mode = {"nothing": "nearest", "mirror": "mirror", "grid-wrap": "grid-wrap"}[self.beyond]
         return np.asarray(
             map_coordinates(self.coefficients, [row, column], order=3, prefilter=False, mode=mode, output=np.float64)
         )
@@ -201,11 +201,14 @@ class SplineGrid:
             parts = [s**3 / 6.0, 2.0 / 3.0 - t**2 + 0.5 * t**3, 2.0 / 3.0 - s**2 + 0.5 * s**3, t**3 / 6.0]
             weight = np.hstack(parts)
         column = cell[:, None] + np.arange(-1, 3)
-        if self.beyond == "grid-wrap":
-            column %= count
-        else:
-            column %= 2 * (count - 1)
-            column = np.minimum(column, 2 * (count - 1) - column)
+        match self.beyond:
+            case "grid-wrap":
+                column %= count
+            case "mirror" | "nothing":
+                column %= 2 * (count - 1)
+                column = np.minimum(column, 2 * (count - 1) - column)
+            case _:
+                assert_never(self.beyond)
         row = np.repeat(np.arange(len(place)), 4)
         return csr_array((weight.ravel(), (row, column.ravel())), shape=(len(place), count))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 import numpy as np
 from scipy.ndimage import spline_filter
@@ -40,7 +40,13 @@ class Terrain:
             side: of the ground that is used, metres; a fractal repeats after half as much again, or later.
             seed: of a fractal.
         """
-        return cls.real(spec) if spec.kind == "real" else cls.fractal(spec, side, seed)
+        match spec.kind:
+            case "real":
+                return cls.real(spec)
+            case "fractal":
+                return cls.fractal(spec, side, seed)
+            case _:
+                assert_never(spec.kind)
 
     @classmethod
     def flat(cls, height: float) -> Terrain:

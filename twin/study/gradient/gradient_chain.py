@@ -56,18 +56,12 @@ def motion_slopes(about: State, state: Callable[[float], State], step: float) ->
         terms = sorted({j for motion in several for j in motion.figure})
         kinds = [(kind, axis) for kind in ("rotate", "shift") for axis in range(3)]
         for kind, axis in (*kinds, ("scale", 0), *(("figure", j) for j in terms)):
-            a, b, c, d = (_component(motion, kind, axis) for motion in several)
+            a, b, c, d = (motion.component(kind, axis) for motion in several)
             wide, narrow = (a - b) / (2.0 * step), (c - d) / step
             slope = narrow + (narrow - wide) / 3.0
-            if abs(slope * step) > ROUNDING * max(abs(_component(base, kind, axis)), CAP[kind] * ROUNDING):
+            if abs(slope * step) > ROUNDING * max(abs(base.component(kind, axis)), CAP[kind] * ROUNDING):
                 slopes[ElementaryMotion(path, kind, axis, base.pivot)] = slope
     return slopes
-
-
-def _component(motion: Motion, kind: str, axis: int) -> float:
-    if kind == "figure":
-        return motion.figure.get(axis, 0.0)
-    return motion.scale if kind == "scale" else (motion.rotate if kind == "rotate" else motion.shift)[axis]
 
 
 def _rest(motion: Motion) -> Motion:

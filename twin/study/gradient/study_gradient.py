@@ -73,8 +73,10 @@ class GradientFactor:
         values = numbers.values
         if factor.kind in ("normal", "truncated"):
             spread, spread_of = values[1], "sigma"
-        else:
+        elif factor.kind in ("values", "table", "range", "uniform"):
             spread, spread_of = 0.5 * (max(values) - min(values)), "half of its range"
+        else:
+            raise ValueError(f"a factor of kind {factor.kind!r} has no spread")
         if spread == 0.0:
             spread, spread_of = 1.0, "one unit"
         return cls(setup, name, unit, _in_base(setup, name, factor, unit), spread, spread_of)

@@ -53,7 +53,8 @@ class ParetoFront:
 def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
     """The front of (n,) ``x`` and ``y``."""
     good = np.isfinite(x) & np.isfinite(y)
-    costs = np.stack([x if spec.best_x == "min" else -x, y if spec.best_y == "min" else -y], axis=-1)
+    signs = {"min": 1.0, "max": -1.0}
+    costs = np.stack([signs[spec.best_x] * x, signs[spec.best_y] * y], axis=-1)
     ranks = np.full(len(x), -1)
     ranks[good] = ranks_of(costs[good])
     front = np.flatnonzero(ranks == 0)

@@ -77,14 +77,18 @@ def unit_cube(kind: str, runs: int, dimensions: int, seed: int) -> np.ndarray:
             # the user chose the number of runs; the points are those of the sequence all the same
             warnings.filterwarnings("ignore", message="The balance properties")
             cube = qmc.Sobol(dimensions, scramble=True, rng=generator).random(runs)
-    else:
+    elif kind == "monte_carlo":
         cube = generator.random((runs, dimensions))
+    else:
+        raise ValueError(f"no design of kind {kind!r} draws points: latin_hypercube, sobol and monte_carlo do")
     return np.clip(np.asarray(cube, np.float64), SMALLEST, 1.0 - SMALLEST)
 
 
 def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
     if factor.kind in _LISTS:
         return place
+    if factor.kind != "range":
+        raise ValueError(f"a factor of kind {factor.kind!r} cannot be counted")
     low, high = factor.numbers().values
     return np.asarray(np.linspace(low, high, factor.count or 2)[place])
 
@@ -104,6 +108,8 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
         first, last = (ndtr(-b), ndtr(-a)) if flip else (ndtr(a), ndtr(b))
         z = -ndtri(last - u * (last - first)) if flip else ndtri(first + u * (last - first))
         return np.asarray(np.clip(mean + sigma * z, low, high))
+    if factor.kind not in ("range", "uniform"):
+        raise ValueError(f"a factor of kind {factor.kind!r} has no quantiles")
     low, high = numbers
     return np.asarray(low + u * (high - low))
 
