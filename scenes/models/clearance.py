@@ -19,7 +19,7 @@ from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly, Element
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
-from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 LEAST_GAP = 20e-6
@@ -126,11 +126,11 @@ def _remedy(path: str) -> tuple[int, KeyPath, str]:
     """How willingly a body is moved (the first first), which key moves it, and what to choose there."""
     kind = path.rpartition("/")[2]
     if path == CENTRAL_PRISM:
-        return 2, ("central_prism", "position"), "a position"
-    if kind == "prism_0":
-        return 0, ("monitor", "prism_0", "distance"), "a distance (or width, or shift)"
-    if kind == "prism_180":
-        return 1, ("monitor", "prism_180", "distance"), "a distance (or width, or a monitor field)"
+        return 2, (CENTRAL_KEY, "position"), "a position"
+    if kind == PRISM_0:
+        return 0, ("monitor", PRISM_0, "distance"), "a distance (or width, or shift)"
+    if kind == PRISM_180:
+        return 1, ("monitor", PRISM_180, "distance"), "a distance (or width, or a monitor field)"
     return 3, ("cameras", _camera(path), "position"), "a position"
 
 
@@ -184,5 +184,5 @@ def _key_of_edge(path: str, across: str) -> KeyPath:
     if path != CENTRAL_PRISM:
         return key_of(path)
     if across == "bottom":
-        return ("central_prism", "height")
+        return (CENTRAL_KEY, "height")
     return ("monitor", "return_face", "aperture")

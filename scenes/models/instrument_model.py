@@ -12,7 +12,7 @@ from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, Channel, prism_of
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import NodeInfo
 from scenes.yaml.errors import KeyPath
@@ -79,6 +79,6 @@ class MisplacedError(ValueError):
 def key_of(path: str) -> KeyPath:
     """Key of the instrument's file that a body comes from."""
     if path.startswith(CENTRAL_PRISM):
-        return ("central_prism",)
-    kinds = [part for part in path.split("/") if part in ("prism_180", "prism_0")]
-    return ("monitor", kinds[0]) if kinds else ("cameras", path.split("/")[1], "pupil_offset")
+        return (CENTRAL_KEY,)
+    prism = prism_of(path)
+    return ("monitor", prism) if prism is not None else ("cameras", path.split("/")[1], "pupil_offset")

@@ -31,7 +31,7 @@ from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.models.instrument_model import MisplacedError, key_of
 from scenes.models.prism_model import null_point, prism_0, prism_180, roof_offset
-from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel
 from scenes.yaml.errors import KeyPath
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         raise spec.error(
             f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism; less the "
             f"rhomboid's displacement this leaves {1e3 * transfer:.4g} mm for the 180-deg prism",
-            ("central_prism", "position"),
+            (CENTRAL_KEY, "position"),
             allowed=f"places that leave it at least {1e3 * shortest:.4g} mm",
         )
     into_camera = to_base.inverse()
@@ -167,9 +167,9 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
     pose = pose @ _turn(made.tilt, null_point(length, made.width))
     first = prism_180(
-        channel.prism_body("prism_180"),
+        channel.prism_body(PRISM_180),
         into_camera @ pose,
-        f"{channel.key}/prism_180",
+        channel.prism_elements(PRISM_180),
         made.material,
         length,
         made.width,
@@ -181,16 +181,16 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     pose = pose @ _turn(small.tilt, (0.0, 0.0, 0.0))
     try:
         second = prism_0(
-            channel.prism_body("prism_0"),
+            channel.prism_body(PRISM_0),
             into_camera @ pose,
-            f"{channel.key}/prism_0",
+            channel.prism_elements(PRISM_0),
             small.material,
             small.shift,
             small.width,
             small.angle_errors,
         )
     except ValueError as error:
-        raise spec.error(str(error), ("monitor", "prism_0", "shift")) from error
+        raise spec.error(str(error), ("monitor", PRISM_0, "shift")) from error
     face = Element(
         f"{channel.key}/return_face",
         channel.face_body,
@@ -203,7 +203,7 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         (*first.bodies, *second.bodies, facet),
         (*first.elements, *second.elements, face),
         (first.solid, second.solid),
-        MappingProxyType({"prism_180": first.path_length, "prism_0": second.path_length}),
+        MappingProxyType({PRISM_180: first.path_length, PRISM_0: second.path_length}),
     )
 
 
@@ -220,7 +220,7 @@ def check_prisms(spec: InstrumentSpec) -> None:
         InputError: one of them does not.
     """
     monitor, face = spec.monitor, spec.monitor.return_face.aperture
-    for name, prism in (("prism_180", monitor.prism_180), ("prism_0", monitor.prism_0)):
+    for name, prism in monitor.prisms.items():
         known = glass(prism.material)
         if not known.shortest <= monitor.wavelength <= known.longest:
             raise spec.error(
@@ -263,7 +263,7 @@ def square_facets(
         fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
         arriving = assembly.with_element(Element("arriving", channel.face_body, plane(), Interaction.PASS))
         systems = assemble(arriving, [(*names[:-1], "arriving")])
-        q = _aimed(backend, systems, fan, np.zeros(2), channel.key, ("central_prism", "position"))
+        q = _aimed(backend, systems, fan, np.zeros(2), channel.key, (CENTRAL_KEY, "position"))
         position, direction = fan.at(q)
         traced = trace(backend, systems, make_rays(backend, position, direction), world=True)
         assert traced.world is not None
@@ -314,7 +314,7 @@ def _missed(
             what += ", or is not totally reflected there"
         what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
         return MisplacedError(what, key_of(element.body))
-    return MisplacedError(f"the middle of the beam {channel.key} misses its facet", ("central_prism", "position"))
+    return MisplacedError(f"the middle of the beam {channel.key} misses its facet", (CENTRAL_KEY, "position"))
 
 
 def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import assemble, media_along
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_assembly import line_body
-from scenes.specs.channel import BASE
+from scenes.specs.channel import BASE, PRISM_180
 
 if TYPE_CHECKING:
     from scenes.models.instrument_model import Instrument
@@ -169,7 +169,7 @@ def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray
     """Which imaging rays (N, K, 2, 3) pass the clear aperture through which a channel's beam enters a prism, (N,)."""
     assembly, placed = instrument.assembly, instrument.assembly.place()
     for element in assembly.elements.values():
-        if element.solid == path and element.name.endswith("/prism_180/entry"):
+        if element.solid == path and element.name.endswith(f"/{PRISM_180}/entry"):
             assert element.aperture is not None
             into = placed.pose(element.body).inverse()
             start, end = into.apply(segments[:, -1, 0]), into.apply(segments[:, -1, 1])

@@ -6,7 +6,19 @@ from dataclasses import dataclass
 
 BASE = "base"
 SIDES = ("left", "right")
-CENTRAL_PRISM = f"{BASE}/central_prism"
+PRISM_180, PRISM_0 = "prism_180", "prism_0"
+PRISMS = (PRISM_180, PRISM_0)
+"""Prisms of a channel in the order of the light: keys of an instrument's ``monitor`` section, last part of their bodies'
+paths."""
+CENTRAL_KEY = "central_prism"
+"""Key of the central prism in an instrument's file."""
+CENTRAL_PRISM = f"{BASE}/{CENTRAL_KEY}"
+"""Body path of the central prism."""
+
+
+def prism_of(path: str) -> str | None:
+    """Which of ``PRISMS`` a body is or belongs to, by its path; None for none."""
+    return next((part for part in path.split("/") if part in PRISMS), None)
 
 
 @dataclass(frozen=True)
@@ -39,8 +51,12 @@ class Channel:
         return f"{BASE}/{self.camera}/focal_plane/{self.side}/area_ccd"
 
     def prism_body(self, prism: str) -> str:
-        """Body path of ``prism_180`` or ``prism_0``."""
+        """Body path of one of ``PRISMS``."""
         return f"{BASE}/{self.camera}/monitor/{self.side}/{prism}"
+
+    def prism_elements(self, prism: str) -> str:
+        """What the names of the elements of one of ``PRISMS`` begin with."""
+        return f"{self.key}/{prism}"
 
     @property
     def face_body(self) -> str:

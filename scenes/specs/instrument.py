@@ -8,6 +8,7 @@ from optics.materials.glass import GLASSES, glass
 from optics.materials.material import MATERIALS, material
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.baffle import BaffleSpec
+from scenes.specs.channel import PRISM_0, PRISM_180
 from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
@@ -203,6 +204,11 @@ class MonitorSpec(Spec):
     prism_0: Prism0Spec
     return_face: ReturnFaceSpec
     frames: Frames = 9
+
+    @property
+    def prisms(self) -> dict[str, Prism180Spec | Prism0Spec]:
+        """Both prisms by their keys, in the order of the light."""
+        return {PRISM_180: self.prism_180, PRISM_0: self.prism_0}
 
 
 class InstrumentSpec(Spec):

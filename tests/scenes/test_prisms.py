@@ -14,7 +14,9 @@ from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
+from scenes.models.instrument_model import key_of
 from scenes.models.prism_model import EDGE, prism_0, prism_180, roof_offset
+from scenes.specs.channel import CENTRAL_KEY, CENTRAL_PRISM, PRISMS, prism_of
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 
 N = 1.4565
@@ -285,3 +287,18 @@ def test_what_cannot_be_made() -> None:
         prism_0("glass", Pose(), "p", "fused silica", 0.05, 0.06, {})
     with pytest.raises(ValueError, match="glass/entry"):
         RigidTree((Body("glass/entry"), *parts_0().bodies))
+
+
+def test_names_of_prisms_are_keys_of_the_file(gf7_pair) -> None:
+    """Whoever tells a prism by its body's path finds the key that describes it."""
+    assert tuple(gf7_pair.spec.monitor.prisms) == PRISMS
+    for channel in gf7_pair.channels:
+        for prism in PRISMS:
+            body = channel.prism_body(prism)
+            assert body in gf7_pair.assembly.media
+            assert prism_of(body) == prism_of(f"{body}/window") == prism
+            assert key_of(body) == ("monitor", prism)
+            assert hasattr(gf7_pair.spec.monitor, prism)
+    assert CENTRAL_KEY in type(gf7_pair.spec).model_fields
+    assert key_of(f"{CENTRAL_PRISM}/wall_front") == (CENTRAL_KEY,)
+    assert prism_of(CENTRAL_PRISM) is None

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from optics.geometry.solid import Solid, solid_mesh
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, CENTRAL_PRISM, SIDES
+from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0, SIDES, prism_of
 from twin.pictures.light_paths import RIM, Beam, LightPaths
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 
@@ -96,7 +96,7 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
         if not solid.transparent:
             middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
             _label(axes, "central prism", np.array([middle, outline[:, 1].min()]), (0, -4), "top")
-        elif solid.path.endswith("prism_0"):
+        elif prism_of(solid.path) == PRISM_0:
             small.append(outline)
         elif f"/{SIDES[0]}/" in solid.path:
             _label(axes, "180° prism", outline[np.argmax(outline[:, 1])], (0, 5), "bottom")
