@@ -8,8 +8,8 @@ BASE = "base"
 SIDES = ("left", "right")
 PRISM_180, PRISM_0 = "prism_180", "prism_0"
 PRISMS = (PRISM_180, PRISM_0)
-"""Prisms of a channel in the order of the light: keys of an instrument's ``monitor`` section, last part of their bodies'
-paths."""
+"""Prisms of a channel in the order of the light: keys of ``monitor`` in an instrument's file, and the last part of the
+paths of their bodies."""
 CENTRAL_KEY = "central_prism"
 """Key of the central prism in an instrument's file."""
 CENTRAL_PRISM = f"{BASE}/{CENTRAL_KEY}"
