@@ -1,4 +1,8 @@
-"""Units of angles in measured data and results."""
+"""Units of measured data and results; inside, everything is in radians and metres.
+
+An angle in seconds of arc is ``angle / ARCSEC``, a length in micrometres ``length * UM_PER_M``: the factors are those
+of which one rounding is left.
+"""
 
 from __future__ import annotations
 
@@ -9,3 +13,6 @@ ARCSEC = math.pi / 180 / 3600
 
 ARCMIN = 60.0 * ARCSEC
 """One minute of arc, rad."""
+
+UM_PER_M, MM_PER_M = 1e6, 1e3
+"""Micrometres and millimetres in a metre."""

@@ -18,12 +18,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.monitor.monitoring import CameraParameters
-from analysis.units import ARCSEC
+from analysis.units import ARCSEC, UM_PER_M
 
 __all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "observability"]
 
 Array = NDArray[np.float64]
-_SHOWN = (("d_alpha", 1 / ARCSEC, '"'), ("d_beta", 1 / ARCSEC, '"'), ("d_gamma", 1 / ARCSEC, '"'), ("d_f", 1e6, " um"))
+_SHOWN = (
+    ("d_alpha", 1 / ARCSEC, '"'),
+    ("d_beta", 1 / ARCSEC, '"'),
+    ("d_gamma", 1 / ARCSEC, '"'),
+    ("d_f", UM_PER_M, " um"),
+)
 # Below this shift of any spot, px per unit of motion, a motion is called invisible; monitors resolve some 1e-3 px.
 _INVISIBLE_PX = 1e-5
 # Statements leave out what is smaller than this part of the largest component beside it ...

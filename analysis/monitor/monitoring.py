@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.units import ARCSEC
+from analysis.units import ARCSEC, UM_PER_M
 
 __all__ = [
     "ESTIMATORS",
@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 ESTIMATORS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 """Keys of the parameters in results, which end in their unit."""
-PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, 1e6])
+PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, UM_PER_M])
 """How many of these units make one SI unit (rad, m)."""
 
 

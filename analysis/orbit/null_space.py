@@ -33,6 +33,7 @@ from scipy.linalg import cho_factor, cho_solve, eigh, qr
 
 from analysis.orbit.calibration_parameters import CalibrationError, index
 from analysis.orbit.three_line_model import BIAS, DRIFT
+from analysis.units import ARCSEC
 
 __all__ = [
     "WEAK",
@@ -225,5 +226,5 @@ def _shown(name: str, change: float) -> str:
         return f"{name} {change:+.4g} m"
     if name.split()[-1] in _ANGLES:
         per = "/s" if name.endswith("rate") else ""
-        return f"{name} {np.degrees(change) * 3600:+.4g} arcsec{per}"
+        return f"{name} {change / ARCSEC:+.4g} arcsec{per}"
     return f"{name} {change * 1e3:+.4g} mm"

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.mtf.slanted_edge import measure_edge
+from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment, State
 from twin.laboratory.printed_004 import CONFOCAL_UM
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
@@ -14,7 +15,7 @@ from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 FIELD_COLOURS = (BLUE, GREEN, ORANGE, VERMILION, PURPLE)
 EDGE_COLOURS = {ALONG: BLUE, TRACK: VERMILION}
-UM, PER_MM = 1e6, 1e-3
+PER_MM = 1e-3
 
 
 def through_focus_svg(alignment: Alignment) -> str:

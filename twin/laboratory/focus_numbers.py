@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from analysis.units import ARCMIN, ARCSEC
+from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_vector
 from scenes.specs.lab_setup import FocusSetup, resolve_focus
 from twin.laboratory.focus_alignment import Alignment, Shimming, State, run_focus
@@ -16,8 +17,6 @@ from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 from twin.targets.edge_images import ALONG, TRACK
-
-UM = 1e6
 
 
 @dataclass(frozen=True)

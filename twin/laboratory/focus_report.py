@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from analysis.units import ARCMIN
+from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment
 from twin.laboratory.focus_figures import defocus_svg, edges_svg, mtf_svg, through_focus_svg
-from twin.laboratory.focus_numbers import UM, focus_numbers
+from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.run.artefact import SvgFigure, Table, fixed
 from twin.run.report import Report, Section

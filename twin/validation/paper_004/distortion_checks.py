@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.units import UM_PER_M as UM
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_distortion
 from twin.laboratory import printed_004
@@ -22,7 +23,6 @@ from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
 TEST = "distortion"
-UM = 1e6
 TESTS, FAST_TESTS = 60, 14
 """Simulated tests: another turntable, calibration, zero, axis, detector and noise in each."""
 

@@ -14,6 +14,8 @@ from analysis.orientation.distortion_model import (
     principal_distance_and_point,
     principal_point,
 )
+from analysis.units import MM_PER_M as MM
+from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from scenes.models.camera_assembly import ROOT, build_camera_under_test
@@ -25,7 +27,6 @@ from twin.validation.checks.group import CheckGroup, Context
 
 Array = NDArray[np.float64]
 TEST = "distortion"
-UM, MM = 1e6, 1e3
 
 _ROUNDING = "rounding of float64, 2e-16 f, over tan W of the edge, 0.02, and ten for the sums"
 

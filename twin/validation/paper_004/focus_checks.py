@@ -14,6 +14,8 @@ from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
 from analysis.units import ARCMIN, ARCSEC
+from analysis.units import MM_PER_M as MM
+from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_focus
@@ -106,7 +108,6 @@ def _coupled(change: Array) -> float:
 TEST = "focus"
 ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
 """Alignments from random mis-settings."""
-UM, MM = 1e6, 1e3
 
 _MTF = "10 %: two digits are printed, and neither wavefront error nor detector: "
 _REASONS = {

@@ -21,6 +21,8 @@ from analysis.orientation.distortion_model import (
     principal_point,
 )
 from analysis.units import ARCSEC
+from analysis.units import MM_PER_M as MM
+from analysis.units import UM_PER_M as UM
 from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM
 from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
@@ -28,7 +30,6 @@ from twin.validation.checks.group import Context
 from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
-UM, MM = 1e6, 1e3
 UNEVEN = slice(0, 44)
 """Points from one end of the line to six tenths of the other half: there f and p of (2) hang on each other, and the
 camera's radial distortion makes a p of 54 mm, which no noise hides.

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.units import ARCSEC
+from analysis.units import MM_PER_M as MM
+from analysis.units import UM_PER_M as UM
 from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM, FIT_RMS_ARCSEC, TEST_POINTS
 from twin.validation.checks.check import REFUTED, Check, CheckResult, Explanation
@@ -17,7 +19,6 @@ from twin.validation.paper_004.orientation import SpotTest, rendered
 from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
-UM, MM = 1e6, 1e3
 FEW = 5
 """Every fifth point, for the effect of their number."""
 
