@@ -12,7 +12,7 @@ from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.schemes import GAUGE
+from twin.orbit.calibration.campaign_adjustment import GAUGE
 from twin.orbit.calibration.strip import with_points
 from twin.orbit.flight.earth import east_north_up
 

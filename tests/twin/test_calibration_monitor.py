@@ -26,9 +26,10 @@ from twin.orbit.calibration.camera_drift import (
     with_monitor,
     without_monitor,
 )
-from twin.orbit.calibration.campaign import drifted_payload, fly_fields, line_model
-from twin.orbit.calibration.influences import simultaneous
+from twin.orbit.calibration.campaign import fly_fields, line_model
+from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.schemes import tested as at_checks
+from twin.orbit.flight.payload_changes import drifted_payload
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate_monitor.yaml"

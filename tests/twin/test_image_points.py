@@ -18,8 +18,9 @@ from scenes.specs.orbit_setup import resolve_calibration, resolve_simulate
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign, fly_fields
+from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages
-from twin.orbit.calibration.influences import INNER, simultaneous
+from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.point_judgement import judged, true_ground

@@ -23,10 +23,11 @@ from tests.twin.commands import files, invoke, refused
 from twin.orbit.calibration.calibration_numbers import calibration_numbers
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
 from twin.orbit.calibration.campaign import fly_fields
-from twin.orbit.calibration.influences import INNER, simultaneous, surprises
+from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
+from twin.orbit.calibration.influences import INNER, surprises
 from twin.orbit.calibration.latitude import fitted, latitude_fits, rate_priors
 from twin.orbit.calibration.observations import ImagePoints, PassData, image_sigma, light_shift
-from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, schemes_tested, values_of
+from twin.orbit.calibration.schemes import schemes_tested, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 
 run = partial(invoke, command.app)

@@ -19,8 +19,9 @@ from analysis.orbit.third_difference import third_difference
 from optics.numerics.backend import load_backend
 from tests.validation.undrawn import undrawn
 from twin.orbit.calibration import schemes as calibration_schemes
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.latitude import fitted
-from twin.orbit.ground.grid import stream
+from twin.run.random_streams import stream
 from twin.validation import registry
 from twin.validation.paper_003 import exact, flights, model, rendered, stability
 from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_light
@@ -55,7 +56,7 @@ def campaigns():
 
 @cache
 def alone(campaign, one):
-    return calibration_schemes.calibrated_alone(campaign, one)
+    return calibrated_alone(campaign, one)
 
 
 SEEN = {}

@@ -32,6 +32,7 @@ from scenes.models.camera_assembly import ROOT, build_camera_under_test
 from scenes.specs.lab_setup import DistortionSetup
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 
@@ -341,12 +342,12 @@ class DistortionBench:
             BenchError: a spot falls beside the line.
         """
         test, spec = self.setup.test, self.setup.turntable
-        rng = {key: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_BENCH, _READING)}
+        rng = {key: np.random.default_rng(stream(seed, key)) for key in (_BENCH, _READING)}
         zero = float(rng[_BENCH].normal(0.0, test.zero))
         tilt = rng[_BENCH].normal(0.0, test.axis_tilt, 2)
         axis = np.array([1.0, *tilt]) / np.sqrt(1.0 + tilt @ tilt)
         shape = len(self.turn), test.sets
-        setting = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SETTING,)))
+        setting = np.random.default_rng(stream(seed, _SETTING))
         reading = spec.camera_angle + self.turn[:, None] + setting.normal(0.0, test.setting, shape)
         shock = rng[_READING].random(shape) < spec.reference.gross_probability
         push = shock * rng[_READING].choice([-1.0, 1.0], shape) * spec.reference.gross_error
@@ -374,13 +375,13 @@ class DistortionBench:
         light = np.stack([self.images(w, at) for w, at in zip(self.turn, inside, strict=True)])
         # far tails of the Fourier sum may ring below zero by rounding
         photons = np.maximum(light, 0.0) * (self.ccd.white_photons(test.light) / np.max(light))
-        pattern = self.ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN,)))
+        pattern = self.ccd.pattern(stream(seed, _PATTERN))
         count, sets = column.shape
         frames = np.empty((count, sets, test.frames, test.window, test.window), np.uint16)
         for i in range(count):
             for s in range(sets):
-                stream = np.random.SeedSequence(seed, spawn_key=(_NOISE, i, s))
-                frames[i, s] = self.ccd.expose(photons[i, s], int(column[i, s]), pattern, test.frames, stream)
+                own = stream(seed, _NOISE, i, s)
+                frames[i, s] = self.ccd.expose(photons[i, s], int(column[i, s]), pattern, test.frames, own)
             advance("exposures", i + 1, count)
         return frames, column
 

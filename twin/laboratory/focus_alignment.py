@@ -33,6 +33,7 @@ from twin.laboratory.focus_scan import (
     scan,
 )
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
     """
     test = bench.setup.test
     standing = misset(bench, seed)
-    patterns = {name: ccd.pattern(_stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
+    patterns = {name: ccd.pattern(stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
     mount = mount_of(test)
     present = np.full(len(test.mount.holes), test.mount.thickness)
     states: list[State] = [_look(bench, standing, patterns, seed, 0, advance)]
@@ -169,7 +170,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
         assert plan.thickness is not None
         present = plan.thickness
         shimmings.append(Shimming(plane, plan))
-        setting = np.random.default_rng(_stream(seed, _SETTING, number)).normal(0.0, test.level)
+        setting = np.random.default_rng(stream(seed, _SETTING, number)).normal(0.0, test.level)
         standing = Standing(_moved(standing.pose, plan, mount, float(setting)), standing.heights)
         states.append(_look(bench, standing, patterns, seed, number + 1, advance))
     return Alignment(bench, seed, tuple(states), tuple(shimmings))
@@ -178,7 +179,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
 def misset(bench: FocusBench, seed: int) -> Standing:
     """How the assembly stands at the beginning, drawn from the seed."""
     spec = bench.setup.test.misset
-    random = np.random.default_rng(_stream(seed, _MISSET))
+    random = np.random.default_rng(stream(seed, _MISSET))
     rotation = rotation_matrix(np.array(spec.rotate) * random.standard_normal(3))
     shift = np.array(spec.shift) * random.standard_normal(3)
     heights = {name: float(spec.chips * random.standard_normal()) for name in bench.ccds}
@@ -233,12 +234,12 @@ def _look(
     advance: Advance,
 ) -> State:
     """Measure one standing of the assembly. Only the first one needs to be searched for focus."""
-    recorder = Recorder(bench, standing, _stream(seed, _SCAN, number), patterns)
+    recorder = Recorder(bench, standing, stream(seed, _SCAN, number), patterns)
     name = "through focus, before" if number == 0 else f"through focus, round {number}"
     scans = scan(recorder, lambda _, done, total: advance(name, done, total), search=number == 0)
     sigma = bench.setup.test.level
     true = line_turn(standing.pose)
-    read = true + float(np.random.default_rng(_stream(seed, _LEVEL, number)).normal(0.0, sigma))
+    read = true + float(np.random.default_rng(stream(seed, _LEVEL, number)).normal(0.0, sigma))
     return State(
         standing,
         scans,
@@ -254,8 +255,3 @@ def _moved(pose: Pose, plan: ShimPlan, mount: Mount, setting: float) -> Pose:
     achieved = plan.achieved
     turned = rotation_matrix(setting * mount.normal) @ achieved.matrix
     return pose @ Pose(turned, achieved.shift)
-
-
-def _stream(seed: int, *key: int) -> np.random.SeedSequence:
-    """One of the independent random streams of a seed."""
-    return np.random.SeedSequence(seed, spawn_key=key)

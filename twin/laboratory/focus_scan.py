@@ -15,6 +15,7 @@ from optics.geometry.pose import Pose
 from optics.numerics.threads import cores, one_blas_thread
 from twin.laboratory.focus_bench import FocusBench, Site
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.targets.edge_images import ALONG, DIRECTIONS
 
@@ -119,7 +120,7 @@ class Recorder:
         height = self.standing.heights[site.band]
         ccd = bench.ccds[site.band]
         way = DIRECTIONS.index(edge)
-        offset_seed, frame_seed = (self._stream(which, number, way, take) for which in (_OFFSET, _FRAMES))
+        offset_seed, frame_seed = (stream(self.seed, which, number, way, take) for which in (_OFFSET, _FRAMES))
         offset = float(np.random.default_rng(offset_seed).uniform(-0.5, 0.5)) * ccd.band.pitch
         share = site.image(edge, self.standing.pose, height, shift, offset)
         photons = ccd.white_photons(bench.setup.test.white) * share
@@ -146,9 +147,6 @@ class Recorder:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
             return 0.0, np.inf, np.zeros((1, 1, 1), np.uint16), str(error)
-
-    def _stream(self, *key: int) -> np.random.SeedSequence:
-        return np.random.SeedSequence(self.seed.entropy, spawn_key=(*self.seed.spawn_key, *key))
 
 
 def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> tuple[SiteScan, ...]:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.turntable_test import DividingErrorSpec, TurntableTestSpec
+from twin.run.random_streams import stream
 
 Array = NDArray[np.float64]
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
@@ -71,7 +72,7 @@ class DividingError:
     @classmethod
     def draw(cls, spec: DividingErrorSpec, seed: int) -> DividingError:
         """A table; spec and seed determine it."""
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_TABLE,)))
+        rng = np.random.default_rng(stream(seed, _TABLE))
         g, sub = spec.graduation, spec.subdivision
         lines = np.arange(g.first, g.last + 1)
         fall = lines ** -float(g.slope)
@@ -145,7 +146,7 @@ class TurntableModel:
     def held_out(self) -> CalibrationSeries:
         """The separate series at angles in the middle of the steps, set off by the spread."""
         plan = self.spec.calibration
-        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(_SPREAD,)))
+        rng = np.random.default_rng(stream(self.seed, _SPREAD))
         off = rng.uniform(-plan.held_out.spread, plan.held_out.spread, plan.count - 1)
         return self._compare(self._steps(0.5, plan.count - 1) + off, plan.held_out.repeats, _HELD_OUT)
 
@@ -154,8 +155,8 @@ class TurntableModel:
         plan = self.spec.calibration
         return np.asarray(plan.first + plan.step * (np.arange(count) + start), np.float64)
 
-    def _compare(self, angle: Array, repeats: int, stream: int) -> CalibrationSeries:
-        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(stream,)))
+    def _compare(self, angle: Array, repeats: int, number: int) -> CalibrationSeries:
+        rng = np.random.default_rng(stream(self.seed, number))
         reference = self.spec.reference
         shape = len(angle), repeats
         known = rng.normal(0.0, reference.calibration, len(angle))

@@ -26,6 +26,7 @@ from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus
 from twin.monitor.motions import line_family
 from twin.monitor.truth import Truth, trace_truth, truth_jacobian
+from twin.run.random_streams import stream
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 TEMPLATE_MARGIN = 40
@@ -157,12 +158,12 @@ class MonitorExperiment:
 
     def pattern(self, seed: int) -> FixedPattern:
         """PRNU and DSNU of all area CCDs; the same before and after."""
-        return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), _stream(seed, 0))
+        return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
 
     def frames_before(self, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> np.ndarray:
         """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns)."""
         photons = self.nominal_photons + stray
-        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, _stream(seed, 1))
+        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
 
     def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int = 0) -> np.ndarray:
         """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
@@ -178,8 +179,8 @@ class MonitorExperiment:
         out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
 
         def expose(s: int) -> None:
-            stream = _stream(seed, 2, first + s)
-            out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, stream, threads=1)
+            own = stream(seed, 2, first + s)
+            out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, own, threads=1)
 
         if len(photons) == 1:
             expose(0)
@@ -207,11 +208,6 @@ class MonitorExperiment:
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
         """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""
         return self.detector.expected_dn(photons, self.exposure)
-
-
-def _stream(seed: int, *number: int) -> np.random.SeedSequence:
-    """One of the independent random streams of a seed."""
-    return np.random.SeedSequence(seed, spawn_key=number)
 
 
 def motions_of(job: JobSpec) -> State:

@@ -29,6 +29,7 @@ from analysis.spots.noise import NoiseModel
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec
 from scenes.yaml.errors import Problem
+from twin.run.random_streams import stream
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
@@ -217,9 +218,7 @@ class EmvaDetector:
         scale = self.system_gain_dn_per_e
 
         def image(index: tuple[int, ...], number: int) -> None:
-            key = (*root.spawn_key, number)
-            stream = np.random.SeedSequence(root.entropy, spawn_key=key, pool_size=root.pool_size)
-            rng = np.random.Generator(np.random.SFC64(stream))
+            rng = np.random.Generator(np.random.SFC64(stream(root, number)))
             mean_e = light[index] * gain[index]
             mean_e *= self.quantum_efficiency
             mean_e += dark_e

@@ -15,6 +15,7 @@ from scenes.models.shadow import imaging_shadows
 from scenes.specs.channel import BASE
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, target_band
+from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.edge_images import DIRECTIONS
@@ -110,14 +111,14 @@ def render_targets(
         camera = TargetCamera(path, ccd, settings.region)
         before = camera.views({})
         after = camera.views(state) if state else before
-        pattern = ccd.pattern(np.random.SeedSequence(seed, spawn_key=(_PATTERN, number)))
+        pattern = ccd.pattern(stream(seed, _PATTERN, number))
         places = {}
         for k, place in enumerate(PLACES):
             shooter = _Shooter(settings, frames, images, before[place], pattern)
             shots = []
             for when, view in enumerate((before[place], after[place])):
                 advance(done, total)
-                shots.append(shooter.shoot(view, np.random.SeedSequence(seed, spawn_key=(_EXPOSURE, number, k, when))))
+                shots.append(shooter.shoot(view, stream(seed, _EXPOSURE, number, k, when)))
                 done += 1
             places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
         cameras[name] = CameraTargets(band, ccd.band.pitch, places)

@@ -9,14 +9,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.orbit.calibration_parameters import RATE
+from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, run_calibration
 from twin.orbit.calibration.campaign import FieldPass
 from twin.orbit.calibration.image_numbers import ImageNumbers
-from twin.orbit.calibration.influences import INNER, OFFSET, DatumRow, LightRow, Surprise
+from twin.orbit.calibration.influences import INNER, DatumRow, LightRow, Surprise
 from twin.orbit.calibration.latitude import LatitudeFit
 from twin.orbit.calibration.repeatability import Repeatability, repeatability
 from twin.orbit.calibration.scheme_numbers import (

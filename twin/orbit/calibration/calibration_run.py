@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.orbit.adjustment import Adjustment
-from analysis.orbit.calibration_parameters import RATE
+from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import RankError
 from analysis.orbit.stepwise import Stepwise, stepwise
@@ -21,26 +21,10 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
-from twin.orbit.calibration.influences import (
-    OFFSET,
-    DatumRow,
-    LightRow,
-    Surprise,
-    datum_rows,
-    light_rows,
-    simultaneous,
-    surprises,
-)
+from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
+from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise, datum_rows, light_rows, surprises
 from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
-from twin.orbit.calibration.schemes import (
-    GAUGE,
-    Finding,
-    Repeats,
-    calibrated_alone,
-    repeated,
-    schemes_tested,
-    tested_before,
-)
+from twin.orbit.calibration.schemes import Finding, Repeats, repeated, schemes_tested, tested_before
 from twin.orbit.calibration.screening import screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
 from twin.run.procedure import Advance, BenchError, silent

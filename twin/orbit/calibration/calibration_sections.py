@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from analysis.orbit.calibration_parameters import RATE
+from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
@@ -22,7 +22,7 @@ from twin.orbit.calibration.field_sections import (
     images_section,
     light_section,
 )
-from twin.orbit.calibration.influences import INNER, OFFSET
+from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.scheme_numbers import meets
 from twin.orbit.calibration.schemes import RMS, STATEMENTS, Finding, Repeats, values_of
 from twin.orbit.calibration.strip import Strips

@@ -20,10 +20,11 @@ from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit_angle import LINES
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields, reading_sigma
-from twin.orbit.calibration.influences import simultaneous
+from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS
-from twin.orbit.calibration.schemes import GAUGE, averaged, calibrated_alone, schemes_tested, tested
+from twin.orbit.calibration.schemes import averaged, schemes_tested, tested
 from twin.run.procedure import Advance
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup
@@ -142,8 +143,7 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
     update: dict[str, object] = {"drift": FrozenMap(drift), "strip": None}
     if test.effects.corrected:
         update["effects"] = test.effects.model_copy(update=dict.fromkeys(EFFECTS, False))
-    own = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key, pool_size=seed.pool_size)
-    return fly_fields(setup.model_copy(update={"test": test.model_copy(update=update)}), own).independent
+    return fly_fields(setup.model_copy(update={"test": test.model_copy(update=update)}), stream(seed)).independent
 
 
 def without_monitor(campaign: Campaign) -> Treatment:

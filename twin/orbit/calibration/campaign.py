@@ -26,12 +26,13 @@ from twin.orbit.calibration.field_images import FieldImages, Imager
 from twin.orbit.calibration.observations import FieldPoints, ImagePoints, PassData, image_sigma, light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
+from twin.orbit.flight.line_camera import LineCamera, line_cameras
 from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.payload_changes import changed_payload, drifted_payload
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
-from twin.orbit.ground.grid import stream
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
@@ -79,19 +80,6 @@ def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
     """(4,) standard deviation of the monitor's readings of a camera, radians and metres. The test has a monitor."""
     assert spec.monitor is not None
     return np.array([*spec.monitor.angles, spec.monitor.focal_length])
-
-
-def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray]) -> ThreeLineCameraSpec:
-    """The camera with each line turned in its own axes, Rx(d_beta) Ry(d_alpha) Rz(d_gamma), and with f + d_f."""
-    lines = dict(payload.lines)
-    for name, (alpha, beta, gamma, longer) in drift.items():
-        line = lines[name]
-        turn = (
-            rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha) @ about_axis(2, gamma)
-        )
-        rotate = tuple(Rotation.from_matrix(turn).as_rotvec().tolist())
-        lines[name] = line.model_copy(update={"rotate": rotate, "focal_length": line.focal_length + float(longer)})
-    return payload.model_copy(update={"lines": FrozenMap(lines)})
 
 
 _LEAST_IMAGE = 0.02

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
@@ -13,7 +14,7 @@ from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import BEYOND, FieldImages
 from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
-from twin.orbit.calibration.influences import INNER, OFFSET, SURPRISE, LightRow
+from twin.orbit.calibration.influences import INNER, SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
 from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS
 from twin.orbit.images.point_report import drawn_points

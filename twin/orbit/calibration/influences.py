@@ -10,22 +10,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment, Robust, adjust
-from analysis.orbit.calibration_parameters import Prior, Unknowns
+from analysis.orbit.adjustment import Adjustment
+from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from scenes.specs.orbit_angle import LINES
 from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS
-from twin.orbit.calibration.schemes import GAUGE, RMS, calibrated_alone, schemes_tested, tested_before, values_of
+from twin.orbit.calibration.schemes import RMS, schemes_tested, tested_before, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS
 
 INNER = tuple(f"{line} {name}" for line in LINES for name in INTERIOR)
-OFFSET = ("along", "across", "down")
 SURPRISE = 4.0
 """Sigmas of what is expected of an unknown; one of seventy lies beyond by chance in 1 of 200 campaigns."""
-_LEAST_OFFSET = 1e-3
-"""Metres; sigma of an orbit without a drift along one axis."""
 _TRIAL_SHIFT = 100.0
 """Metres; of a wrong datum where the file has none."""
 
@@ -100,47 +98,6 @@ class Surprise:
     def ratio(self) -> float:
         """In sigmas of what is expected."""
         return abs(self.change) / self.expected
-
-
-def simultaneous(
-    campaign: Campaign,
-    priors: tuple[Prior, ...] = (),
-    robust: Robust | None = None,
-    drift: bool = False,
-    rate: bool = False,
-) -> Adjustment:
-    """All fields at once: one interior, a bias and, where the orbit drifts, an offset with its prior for each field.
-
-    Args:
-        campaign: the fields.
-        priors: what else is known of the unknowns, for example by an on-board monitor in each pass.
-        robust: weights of the image points.
-        drift: whether the cameras' changes in each pass are unknowns, too; priors must tell them.
-        rate: whether a drift of the bias during the passes is; priors must tell it.
-
-    Raises:
-        CalibrationError: it cannot be solved.
-    """
-    errors = campaign.spec.errors
-    offsets = errors.switched_on and any(errors.gps.drift)
-    drifts = tuple(
-        Prior({f"{p.name} offset {axis}": 1.0}, 0.0, max(sigma, _LEAST_OFFSET), "orbit")
-        for p in campaign.passes
-        for axis, sigma in zip(OFFSET, errors.gps.drift, strict=True)
-    )
-    return adjust(
-        [p.control for p in campaign.passes],
-        campaign.laboratory,
-        campaign.noise,
-        unknowns=Unknowns(
-            offset="field" if offsets else "none",
-            drift="field" if drift else "none",
-            rate="common" if rate else "none",
-        ),
-        priors=(*(drifts if offsets else ()), *priors),
-        gauge=GAUGE,
-        robust=robust,
-    )
 
 
 def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow, ...]:

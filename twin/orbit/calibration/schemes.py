@@ -10,22 +10,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment, adjust
-from analysis.orbit.calibration_parameters import Prior
+from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
-from analysis.orbit.null_space import Gauge
 from analysis.orbit.three_line_model import LineModel
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.observations import EFFECTS
 from twin.run.procedure import Advance
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup
 
-GAUGE = Gauge(held=("nadir x", "nadir y"))
-"""The nadir line's principal point stays as the laboratory has it: x is not observable against pitch, y against roll so
-weakly that a field would not know it to a pixel."""
 STATEMENTS = {
     "plan_improves": "plan improves with more fields",
     "plan_evens_out": "plan evens out with more fields",
@@ -120,20 +116,6 @@ class Repeats:
 def values_of(errors: Mapping[str, CheckErrors], what: str) -> np.ndarray:
     """(fields,) RMS of one sort of `RMS`, metres."""
     return np.array([getattr(e, what) for e in errors.values()])
-
-
-def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior] = ()) -> Adjustment:
-    """A field by itself, with paper 003's twelve unknowns less the gauge.
-
-    Args:
-        campaign: for the laboratory's camera and the noise.
-        one: the field.
-        priors: what else is known of its unknowns, for example by an on-board monitor.
-
-    Raises:
-        CalibrationError: it cannot be solved.
-    """
-    return adjust([one.control], campaign.laboratory, campaign.noise, priors=priors, gauge=GAUGE)
 
 
 def schemes_tested(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:

@@ -16,8 +16,8 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.residual_weights import REJECT
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
+from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages, Screening
-from twin.orbit.calibration.influences import simultaneous
 from twin.orbit.calibration.observations import ImagePoints
 from twin.orbit.flight.light_effects import NO_EFFECTS
 

@@ -21,7 +21,8 @@ from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.schemes import GAUGE, averaged
+from twin.orbit.calibration.campaign_adjustment import GAUGE
+from twin.orbit.calibration.schemes import averaged
 from twin.run.procedure import Advance
 
 

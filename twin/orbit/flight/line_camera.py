@@ -17,15 +17,12 @@ from numpy.polynomial import chebyshev
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
 from scenes.models.camera_assembly import line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.channel import BASE
-from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.three_line_camera import LineCameraSpec, ThreeLineCameraSpec
 
 TRACED_POINTS = 49
@@ -222,18 +219,3 @@ def _chopped(coefficients: np.ndarray) -> np.ndarray:
     size = np.max(np.abs(coefficients), axis=-1)
     used = np.flatnonzero(size > _NOISE * np.max(size))
     return coefficients[: used[-1] + 1]
-
-
-def changed_payload(
-    spec: OrbitCalibrationSpec | OrbitSimulateSpec, payload: ThreeLineCameraSpec
-) -> ThreeLineCameraSpec:
-    """The camera as it is after launch."""
-    lines = {}
-    for name, line in payload.lines.items():
-        if name in spec.changes:
-            change = spec.changes[name]
-            point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
-            focal = line.focal_length + change.focal_length
-            line = line.model_copy(update={"focal_length": focal, "principal_point": point})
-        lines[name] = line
-    return payload.model_copy(update={"lines": FrozenMap(lines)})

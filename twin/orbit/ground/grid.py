@@ -57,11 +57,6 @@ _CORRELATION_MARGIN = 4.0
 """Correlation lengths by which a correlated field is drawn larger, so that opposite edges are independent."""
 
 
-def stream(seed: np.random.SeedSequence, number: int) -> np.random.SeedSequence:
-    """A random stream of a seed, by number; unlike ``spawn`` it leaves the seed as it is and can be repeated."""
-    return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number), pool_size=seed.pool_size)
-
-
 def fractal_field(
     shape: tuple[int, int], spacing: float, exponent: float, longest: float, seed: np.random.SeedSequence
 ) -> np.ndarray:

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, stream
+from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import Extent, apparent, reflectance
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_scene import ControlSpec, TextureSpec

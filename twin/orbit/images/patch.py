@@ -21,7 +21,7 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.ground.grid import GroundFrame, stream
+from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Control, make_control
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import apparent, around, reflectance
@@ -37,6 +37,7 @@ from twin.orbit.images.pushbroom import (
     render_patch,
     require_open,
 )
+from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:

@@ -14,15 +14,16 @@ from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
+from twin.orbit.flight.line_camera import LineCamera, line_cameras
 from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.payload_changes import changed_payload
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
-from twin.orbit.ground.grid import stream
 from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

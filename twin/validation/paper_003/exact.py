@@ -19,9 +19,10 @@ from scenes.specs.orbit_angle import LINES, EffectsSpec
 from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from scenes.specs.orbit_spec import ThermalDriftSpec
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields, line_model
-from twin.orbit.calibration.schemes import GAUGE, calibrated_alone
+from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import changed_payload, line_cameras
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.payload_changes import changed_payload
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.validation.checks.chosen import Chosen
 

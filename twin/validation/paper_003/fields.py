@@ -9,8 +9,8 @@ import numpy as np
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
-from twin.orbit.ground.grid import stream
 from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import NOT_CHECKABLE, Check, CheckResult
 from twin.validation.checks.group import CheckGroup, Context

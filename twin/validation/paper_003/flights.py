@@ -11,9 +11,10 @@ from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.latitude import LatitudeFit, fitted
-from twin.orbit.calibration.schemes import calibrated_alone, schemes_tested, tested, tested_before, values_of
+from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
 
 MEDIAN = float(np.sqrt(np.pi / 2.0))
 """Standard deviation of a median over that of a mean, for normal noise and many draws."""

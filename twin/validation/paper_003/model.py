@@ -13,8 +13,8 @@ from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_calibration import CalibrationImagesSpec
 from scenes.specs.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, fly_fields
-from twin.orbit.ground.grid import stream
 from twin.run.artefact import SvgFigure, Table
+from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
 from twin.validation.checks.group import CheckGroup, Context

@@ -16,14 +16,16 @@ from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_scene import TerrainSpec
 from scenes.specs.orbit_setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.calibration.image_numbers import ImageTotals
-from twin.orbit.calibration.schemes import GAUGE, calibrated_alone, tested, tested_before
+from twin.orbit.calibration.schemes import tested, tested_before
 from twin.orbit.calibration.screening import screened
-from twin.orbit.ground.grid import GroundFrame, stream
+from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, render_patch
+from twin.run.random_streams import stream
 from twin.validation.paper_003.exact import TOLERANCE, errors_of, rays_at, true_sensors
 
 PLACES = (700.0, 6000.0, 11300.0)
