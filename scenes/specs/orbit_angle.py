@@ -13,8 +13,8 @@ from scenes.yaml.spec import Name, Named, Number, Paths, Reference, Seed, Spec, 
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT, format_quantity
 
 LINES = ("forward", "nadir", "aft")
-"""The three lines of paper 000."""
-PAPER_ANGLES = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
+"""Of a three-line camera."""
+THREE_LINE_ANGLES = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
 """Its angles: name -> the two lines that it lies between."""
 LEAST_POINTS = 3
 
@@ -51,9 +51,9 @@ Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
 
 
 def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
-    """Angles of a camera whose test names none: the paper's, or that of a camera of two lines; None for others."""
+    """Angles of a camera whose test names none: those of three lines, or that of a camera of two; None for others."""
     if set(LINES) <= set(lines):
-        return PAPER_ANGLES
+        return THREE_LINE_ANGLES
     return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
 
 

@@ -16,16 +16,17 @@ from optics.targets.target_shapes import pinhole
 from optics.waves.diffraction import Grid
 from optics.waves.transfer import TransferTable
 from scenes.specs.lab_setup import resolve_distortion
-from twin.laboratory import printed_004
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_report import distortion_report
 from twin.laboratory.distortion_run import DistortionRun, measure
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import BenchError
+from twin.validation.checks.printed import load_printed
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4
+ACCURACY_UM = load_printed("004").number("distortion.accuracy_um")
 
 
 @cache
@@ -145,8 +146,8 @@ def test_noise_of_the_spots_is_as_stated():
 def test_result_agrees_with_the_truth():
     data = distortion_numbers(run())
     truth = data["truth"]
-    assert len(data["points"]) == printed_004.TEST_POINTS
-    assert truth["error_rms_compensated_um"] < printed_004.DISTORTION_ACCURACY_UM
+    assert len(data["points"]) == load_printed("004").whole("distortion.points")
+    assert truth["error_rms_compensated_um"] < ACCURACY_UM
     assert truth["error_rms_compensated_um"] < truth["error_rms_raw_um"]
     error = data["principal_distance_mm"] - truth["principal_distance_mm"]
     assert abs(error) < 2 * data["principal_distance_mm_sigma"]
@@ -255,6 +256,6 @@ def test_hundred_tests():
         assert np.sum(np.abs(values) < 2) >= stats.binom.ppf(FALSE_ALARM, count, 0.954)
     # points of one test share the calibration's noise; the mean square of one test scatters by 0.2 to 0.3
     assert np.mean(pointwise) == pytest.approx(1.0, abs=4 * np.std(pointwise) / np.sqrt(count) + 0.05)
-    assert np.max(own) < printed_004.DISTORTION_ACCURACY_UM * UM
+    assert np.max(own) < ACCURACY_UM * UM
     # the paper's 35 % is in the range of what tables of this class give
     assert 0.2 < np.median(1.0 - np.array(own) / np.array(raw)) < 0.6

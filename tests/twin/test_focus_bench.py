@@ -17,11 +17,12 @@ from scenes.models.camera_assembly import ROOT
 from scenes.specs.lab_setup import resolve_focus
 from scenes.specs.load import LAB, SCENES
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
-from twin.laboratory.printed_004 import MTF_NYQUIST
 from twin.sensors.line_ccd import band_wavelengths
 from twin.targets.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
+from twin.validation.checks.printed import load_printed
 
 ARCMIN = np.pi / 180 / 60
+MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
 TABLE = 2e-4
 """Error of interpolated transfer functions that twin.targets.edge_images states."""
 OUTSIDE = 1e-4

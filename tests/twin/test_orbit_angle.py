@@ -13,12 +13,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import twin.orbit.__main__ as command
-from analysis.orbit.sensitivity import STATEMENTS, judge
 from analysis.units import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_setup import AngleSetup, resolve_angle
-from tests.analysis.test_sensitivity import REFUTED
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles
@@ -232,14 +230,8 @@ def test_a_datum_shift_is_the_stations_shift_reversed() -> None:
     assert np.abs(datum.bias).max() > ARCSEC
 
 
-def test_sentences_of_the_paper(full) -> None:
-    judged = [judge(statement, full.table) for statement in STATEMENTS]
-    assert {j.statement.text for j in judged if not j.holds} == REFUTED
-
-
 def test_planes_and_resection_agree(full) -> None:
-    """They share station and points, so that they differ by less than the sigma of either, and far less than in the
-    paper's table."""
+    """They share station and points, so that they differ by less than the sigma of either."""
     assert np.abs(full.difference).max() < 5.0 * full.difference_sigma.max()
     assert full.difference_sigma.max() < 0.25 * full.planes.sigma.min()
 
@@ -290,14 +282,13 @@ def test_contract(done) -> None:
         (what, axis) for what in ("station", *LINES) for axis in "xyz"
     ]
     assert {"what", "axis", "alpha_arcsec_per_10m", "beta_arcsec_per_10m"} == set(data["sensitivity"][0])
-    assert len(data["statements"]) == len(STATEMENTS)
     assert [row["what"] for row in data["effects"]] == ["light_time", "aberration", "refraction", "all"]
     assert data["height_m_per_arcsec"]["alpha"] > 5.0
 
 
 def test_run_folder(done) -> None:
     folder, _ = done
-    tables = {"methods", "change", "scatter", "difference", "frames", "effects", "sensitivity", "statements"}
+    tables = {"methods", "change", "scatter", "difference", "frames", "effects", "sensitivity"}
     drawings = {
         "geometry",
         "scatter-passes",

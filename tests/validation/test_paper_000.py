@@ -1,15 +1,21 @@
 """The checks of paper 000: what is compared with what, what comes out, and that only what is asked for runs."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
+from analysis.orbit.planes import Station
+from analysis.orbit.sensitivity import sensitivity
 from optics.numerics.backend import load_backend
+from scenes.specs.orbit_angle import LINES, THREE_LINE_ANGLES
+from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
 from tests.validation.undrawn import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
 from twin.validation.paper_000 import figures, suppositions, table1
 from twin.validation.paper_000.equations_000 import derivatives, least_slopes, numerical_derivatives, sum_of_squares
 from twin.validation.paper_000.groups import GROUPS
-from twin.validation.paper_000.sentences import AXES, SENTENCES
+from twin.validation.paper_000.sentences import AXES, SENTENCES, Sentence
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -155,6 +161,33 @@ def test_a_sentence_can_fail():
             assert not sentence.holds({key: 0.5 if key[2] in sentence.axes else 1.0 for key in keys}, flat)
         else:
             assert not sentence.holds(alike, flat)
+
+
+def false_on(scene: Pass, lines: Sequence[str] = LINES) -> set[Sentence]:
+    """Sentences that do not hold for a pass made by hand, without the orbit of the library's test."""
+    strips = dict(zip(lines, scene.strips(1.5), strict=True))
+    found = figures.Answers.of(sensitivity(Station.of(scene.station, 0.5), strips, THREE_LINE_ANGLES))
+    return {sentence for sentence in SENTENCES if not sentence.holds(found.rises, found.growth)}
+
+
+@pytest.mark.parametrize("yaw", [True, False], ids=["yaw-steered", "inertial"])
+def test_sentences_over_40_north_116_east(yaw):
+    """Every sign and every ranking of the text, whatever the heading, but not what the checks expect to be wrong."""
+    wrong = {s for s in SENTENCES if s.expected in (CORRECTED, REFUTED)}
+    assert false_on(descending_pass(yaw=yaw)) == wrong
+    assert len(wrong) == 3
+
+
+@pytest.mark.parametrize(("lat", "lon"), [(45, 120), (40, 126), (48, 120)])
+def test_farther_to_the_north_east_the_sentence_on_x_and_z_holds_too(lat, lon):
+    """Which axes are alike depends on the place of the test field; the paper does not name it."""
+    assert {s.kind for s in false_on(descending_pass(lat=lat * DEG, lon=lon * DEG))} == {"grows"}
+
+
+def test_sentences_fail_elsewhere():
+    """The southern hemisphere, and forward and aft points exchanged, contradict the paper."""
+    assert "signs" in {s.kind for s in false_on(descending_pass(lat=-40 * DEG))}
+    assert {s.kind for s in false_on(SCENE, LINES[::-1])} >= {"signs", "largest", "far"}
 
 
 @pytest.mark.slow

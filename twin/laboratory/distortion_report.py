@@ -13,7 +13,6 @@ from analysis.spots.centroid import mean_frames
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.laboratory import printed_004
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.turntable_report import FIT_NAMES
@@ -38,8 +37,6 @@ def curve_svg(run: DistortionRun) -> str:
             style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
             above.errorbar(field + shift, 1e6 * measured.distortion, 1e6 * measured.sigma, **style)
             below.errorbar(field + shift, 1e6 * run.error(measured), 1e6 * measured.sigma, **style)
-        accuracy = printed_004.DISTORTION_ACCURACY_UM
-        below.axhspan(-accuracy, accuracy, color="#eef3f8", lw=0, label=f"±{accuracy} µm (paper 004)")
         below.axhline(0.0, color=GREY, lw=0.8)
         above.set_title("Distortion D = L − c − f tan W + p tan² W", loc="left")
         below.set_title("Measured − true", loc="left")
@@ -51,17 +48,13 @@ def curve_svg(run: DistortionRun) -> str:
 
 
 def points_svg(run: DistortionRun) -> str:
-    """Each point's error and its departure from a smooth curve, raw and compensated, and Table 2 of the paper."""
+    """Each point's error and its departure from a smooth curve, raw and compensated."""
     with look("distortion-points"):
-        figure = new_figure(6.6)
+        figure = new_figure(4.6)
         both = run.raw, run.compensated
         panels = {
-            "Here: error of the distortion against the truth": [1e6 * np.abs(run.error(one)) for one in both],
-            "Here: distance from the smooth curve": [1e6 * np.abs(one.smooth.residual) for one in both],
-            "Paper 004, Table 2: “RMS of distortion”": [
-                np.array(printed_004.DISTORTION_RAW_UM),
-                np.array(printed_004.DISTORTION_COMPENSATED_UM),
-            ],
+            "Error of the distortion against the truth": [1e6 * np.abs(run.error(one)) for one in both],
+            "Distance from the smooth curve": [1e6 * np.abs(one.smooth.residual) for one in both],
         }
         every = figure.subplots(len(panels), 1)
         for axes, (title, (raw, compensated)) in zip(every, panels.items(), strict=True):
@@ -136,8 +129,7 @@ def distortion_report(run: DistortionRun) -> Report:
             f"(truth {truth['principal_distance_mm']:.3f} mm).",
             typeset(fit.point.statement),
             f"Distortion is measured to {truth['error_rms_compensated_um']:.2f} µm rms with compensated angles and "
-            f"{truth['error_rms_raw_um']:.2f} µm with angles as read (paper 004 claims "
-            f"{printed_004.DISTORTION_ACCURACY_UM} µm).",
+            f"{truth['error_rms_raw_um']:.2f} µm with angles as read.",
         ),
         facts=(
             ("camera", f"{test.camera}, band {test.band}"),
@@ -210,8 +202,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
         ("error of distortion, compensated, µm rms", truth["error_rms_compensated_um"], None, None),
     ]
     caption = (
-        "f and p with compensated angles, by least squares with a constant: paper 004, eq. 2, with an unknown zero of "
-        "the angles."
+        "f and p with compensated angles, by least squares with a constant, which is the unknown zero of the angles."
     )
     return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows, (None, 3, 3, 3))
 
@@ -238,28 +229,22 @@ def _curve(run: DistortionRun) -> Section:
 
 def _compensation(run: DistortionRun) -> Section:
     raw, own = run.raw, run.compensated
-    printed = [np.array(v) for v in (printed_004.DISTORTION_RAW_UM, printed_004.DISTORTION_COMPENSATED_UM)]
     pairs: tuple[tuple[str, Array, Array], ...] = (
         ("error of the distortion (needs the truth)", 1e6 * run.error(raw), 1e6 * run.error(own)),
         ("distance from the smooth curve", 1e6 * raw.smooth.residual, 1e6 * own.smooth.residual),
         ("RMS of distortion over the sets", 1e6 * raw.rms_over_sets, 1e6 * own.rms_over_sets),
-        ("paper 004, Table 2", printed[0], printed[1]),
     )
     rows: list[tuple[Cell, ...]] = [
         (name, a, b, 100.0 * (1.0 - b / a), float(np.max(np.abs(first))), float(np.max(np.abs(second))))
         for name, first, second in pairs
         for a, b in ((rms(first), rms(second)),)
     ]
-    lower = [100.0 * (1.0 - size(printed[1]) / size(printed[0])) for size in (rms, np.sum, np.max)]
     text = (
-        "Paper 004 says that compensated angles lower the RMS of the distortion by "
-        f"{100 * printed_004.REDUCTION:.0f}%. Its own table gives {lower[0]:.0f}% in the RMS of all points, "
-        f"{lower[1]:.0f}% in their sum and {lower[2]:.0f}% in the largest.",
-        "How much an RMS falls depends on what else is in it. That of the distortion itself holds the design's "
-        "distortion, which a dividing error may even cancel in part, so that it can rise. The distance from a "
-        "smooth curve does not see the long waves of the dividing error. Only the error against the truth tells "
-        "what compensation brings. It differs from table to table: the constant, f and p take up what is longer "
-        "than the field.",
+        "How much an RMS falls with compensated angles depends on what else is in it. That of the distortion itself "
+        "holds the design's distortion, which a dividing error may even cancel in part, so that it can rise. The "
+        "distance from a smooth curve does not see the long waves of the dividing error. Only the error against the "
+        "truth tells what compensation brings. It differs from table to table: the constant, f and p take up what is "
+        "longer than the field.",
     )
     table = Table(
         "distortion-reduction",
@@ -272,7 +257,7 @@ def _compensation(run: DistortionRun) -> Section:
     figure = SvgFigure(
         "distortion-points",
         "Point by point",
-        "Here without the design's distortion; the paper's table holds whatever distortion its camera has.",
+        "Without the design's distortion.",
         points_svg(run),
     )
     return Section("Raw and compensated angles", text, (figure, table))
@@ -306,10 +291,11 @@ def _estimates(run: DistortionRun) -> Section:
     smooth = run.compensated.smooth
     zero = (run.compensated.zero - run.truth.zero) / ARCSEC
     text = (
-        "The printed equations (1) to (4) have no constant: W has to count exactly from the direction that is "
-        f"imaged to the line's middle. The middle was put on the pinhole to {run.truth.zero / ARCSEC:.2f}″, and the "
-        "compensation at that reading has an error of its own. (2) turns such an offset into a principal point, (3) "
-        f"leaves it in the distortion of every point. The constant finds it: {run.compensated.zero / ARCSEC:.2f}″, "
+        "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
+        "direction that is imaged to the line's middle. The middle was put on the pinhole to "
+        f"{run.truth.zero / ARCSEC:.2f}″, and the compensation at that reading has an error of its own. (2) turns such "
+        "an offset into a principal point, (3) leaves it in the distortion of every point. The constant finds it: "
+        f"{run.compensated.zero / ARCSEC:.2f}″, "
         f"{zero:+.3f}″ from the truth.",
         "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
         "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
@@ -318,7 +304,7 @@ def _estimates(run: DistortionRun) -> Section:
     )
     estimates = Table(
         "distortion-estimates",
-        "The printed equations and fits with a constant",
+        "Equations (1) to (4) and fits with a constant",
         "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
         (
             *("estimate", "f, mm", "sigma of f, mm", "error of f, mm"),

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from analysis.mtf.slanted_edge import measure_edge
 from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment, State
-from twin.laboratory.printed_004 import CONFOCAL_UM
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 FIELD_COLOURS = (BLUE, GREEN, ORANGE, VERMILION, PURPLE)
@@ -86,7 +85,6 @@ def _defocus(alignment: Alignment) -> Figure:
     ):
         _defocus_panel(axes, alignment, state)
         axes.set_title(f"{title}: CCDs against best focus")
-        axes.axhspan(-CONFOCAL_UM, CONFOCAL_UM, color=LIGHT, alpha=0.6, lw=0, zorder=0)
         axes.set(xlabel="along the line Y′ [mm]", ylabel="CCD downstream of focus [µm]")
         plain_axes(axes)
     handles, labels = panels[0].get_legend_handles_labels()

@@ -12,7 +12,6 @@ from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment
 from twin.laboratory.focus_figures import defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.laboratory.focus_numbers import focus_numbers
-from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.run.artefact import SvgFigure, Table, fixed
 from twin.run.report import Report, Section
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
@@ -27,8 +26,7 @@ def focus_report(alignment: Alignment) -> Report:
     lead = (
         f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
         f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} µm from best focus, in every "
-        f"field and band (the paper reached {CONFOCAL_UM:.0f} µm), "
-        f"and the line to {abs(end['line_level_arcmin']):.2f}′ of level (the paper: {LINE_LEVEL_ARCMIN:g}′).",
+        f"field and band, and the line to {abs(end['line_level_arcmin']):.2f}′ of level.",
     )
     images = {
         f"{bench.sites[i].band}_field{k}_{edge}": scan.frames[edge]
@@ -102,7 +100,6 @@ def _summary(data: Mapping[str, Any]) -> Table:
                 fixed(true["line_level_arcmin"], 2),
             )
         )
-    rows.append(("paper 004", f"{CONFOCAL_UM:.0f}", "", f"{LINE_LEVEL_ARCMIN:g}", ""))
     return Table(
         "alignment",
         "Before and after",
@@ -130,7 +127,7 @@ def _alignment_section(alignment: Alignment) -> Section:
         SvgFigure(
             "defocus",
             "Where the CCDs stand",
-            "Points: measured with one sigma. Dashes: truth from the traced pupils. Grey band: what the paper reached.",
+            "Points: measured with one sigma. Dashes: truth from the traced pupils.",
             defocus_svg(alignment),
         ),
     )
@@ -147,7 +144,6 @@ def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
     rows = [
         (
             band,
-            f"{MTF_NYQUIST[band]:.2f}" if band in MTF_NYQUIST else "",
             f"{end['mtf_nyquist'][band]:.4f} ± {end['mtf_nyquist_sigma'][band]:.4f}",
             f"{true['mtf_nyquist'][band]:.4f}",
             f"{end['mtf_nyquist_along_line'][band]:.4f} ± {end['mtf_nyquist_along_line_sigma'][band]:.4f}",
@@ -165,11 +161,10 @@ def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
         for line in data["mtf_budget"]
     ]
     text = (
-        "The paper's values are compared with the MTF along the track, which has everything in it: optics, pixel, "
-        "charge diffusion and the motion of the image over the stages.",
+        "The MTF along the track has everything in it: optics, pixel, charge diffusion and the motion of the image "
+        "over the stages.",
         "The camera as designed would have the product of diffraction, design and pixel. The others are the "
-        "degradations that bring it to the paper's class; the paper names none of them, so that they are one "
-        "plausible set among others.",
+        "degradations that camera and test declare.",
     )
     return Section(
         "MTF at the Nyquist frequency",
@@ -179,7 +174,7 @@ def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
                 "mtf",
                 "Measured in focus, mean over the fields",
                 "The noise's sigma; truth from the traced pupils at the places where the CCDs really stand.",
-                ("band", "paper 004", "along the track", "along the track, true", "along the line"),
+                ("band", "along the track", "along the track, true", "along the line"),
                 rows,
             ),
             Table(

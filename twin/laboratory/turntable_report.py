@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, format_quantity
-from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC
 from twin.laboratory.turntable_numbers import turntable_numbers
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import SvgFigure, Table
@@ -160,8 +159,6 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         f"{result['rejected_expected_of_good']:.0f} on average if all were good: it trims normal noise, and the RMS "
         f"that remains is that of trimmed readings. All angles together, corrected for this, one comparison has "
         f"σ = {result['repeatability_arcsec']:.4f}″.",
-        "The paper's 0.037″ is the RMS of the single readings that were kept. It is not an RMS of their mean: "
-        "averaging alone would give the mean 0.081″/√10 = 0.026″ at worst, with the gross errors in it.",
     ]
     if result["suspect_angles"]:
         text.append(
@@ -169,21 +166,20 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
             "gross errors that hide each other. Those angles are given the sigma of their own repeats; "
             "measure them again."
         )
-    paper = {"repeat_rms_arcsec": REPEAT_RMS_ARCSEC, "chauvenet_rms_arcsec": CHAUVENET_RMS_ARCSEC}
     names = {
         "repeat_rms_arcsec": "repeats, as read",
         "chauvenet_rms_arcsec": "repeats, after Chauvenet's criterion",
         "averaging_alone_rms_arcsec": "mean of all repeats, nothing rejected",
         "mean_rms_arcsec": "mean of the kept repeats",
     }
-    rows = [(text_, result[key], paper.get(key)) for key, text_ in names.items()]
+    rows = [(text_, result[key]) for key, text_ in names.items()]
     table = Table(
         "turntable-repeats",
         "Repeats: the largest RMS of any angle",
-        "The paper prints no RMS of a mean.",
-        ("RMS of", "here, arcsec", "paper 004, arcsec"),
+        "An RMS of the kept repeats is one of single readings, not of their mean.",
+        ("RMS of", "arcsec"),
         rows,
-        (None, 3, 3),
+        (None, 3),
     )
     figure = SvgFigure(
         "turntable-comparisons",
@@ -204,8 +200,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         f"Five fits of the means, ranked at {len(run.held_out.angle)} held-out readings in the middle of the steps, "
         f"measured in a series of their own with σ = {result['heldout_sigma_arcsec']:.4f}″ each. Cross-validation "
         f"on the calibration points alone chooses the {FIT_NAMES[chosen]}; it has {held:.4f}″ at the held-out "
-        f"readings, {'below' if held < FIT_RMS_ARCSEC else 'not below'} the paper's {FIT_RMS_ARCSEC}″."
-        + ("" if best == chosen else f" There the {FIT_NAMES[best]} is the best.")
+        "readings." + ("" if best == chosen else f" There the {FIT_NAMES[best]} is the best.")
     ]
     if abs(periods - round(periods)) < 1e-6:
         text.append(
@@ -270,15 +265,14 @@ def turntable_report(run: TurntableRun) -> Report:
         f"{held:.3f}″ RMS.{also}",
     )
     rows = [
-        ("repeats, largest RMS of an angle", _text(data["repeat_rms_arcsec"]), _text(REPEAT_RMS_ARCSEC)),
-        ("the same after Chauvenet's criterion", _text(data["chauvenet_rms_arcsec"]), _text(CHAUVENET_RMS_ARCSEC)),
-        ("what averaging alone gives", _text(data["averaging_alone_rms_arcsec"]), ""),
+        ("repeats, largest RMS of an angle", _text(data["repeat_rms_arcsec"])),
+        ("the same after Chauvenet's criterion", _text(data["chauvenet_rms_arcsec"])),
+        ("what averaging alone gives", _text(data["averaging_alone_rms_arcsec"])),
     ]
     rows += [
         (
             f"{FIT_NAMES[name]} on held-out angles{', chosen' if name == chosen else ''}",
             _text(data["fits"][name]["heldout_rms_arcsec"]),
-            f"below {FIT_RMS_ARCSEC:g}" if name == "network" else "",
         )
         for name in data["ranking"]
     ]
@@ -297,7 +291,7 @@ def turntable_report(run: TurntableRun) -> Report:
             "dividing-error",
             "Result",
             "Fits in the order of their RMS on held-out angles.",
-            ("RMS", "here, arcsec", "paper 004, arcsec"),
+            ("RMS", "arcsec"),
             rows,
         ),
         sections(run),

@@ -42,7 +42,7 @@ add_test(
     space resection as the second method.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
-    station and of the points, with the paper's sentences on it judged.
+    station and of the points.
     """,
 )
 

@@ -12,10 +12,12 @@ from typing import Any
 
 from optics.numerics.frozen_map import FrozenMap
 
-__all__ = ["FRAMES", "SCHEMA", "described", "frames_text"]
+__all__ = ["FRAMES", "described", "frames_text", "schema"]
 
-SCHEMA = 2
-"""Version of the files' keys; 1 had no statement of frames."""
+_VERSION = 2
+"""Of the files' keys; 1 had no statement of frames."""
+_LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3})
+"""Kind of file -> version, where keys went since then: what a paper prints and whether it holds."""
 _CAMERA = (
     "d_alpha, d_beta and d_gamma turn the camera about Y, X and Z of its own nominal axes (Z the line of sight toward "
     "the scene, Y along the line CCD, X = Y x Z), right-handed; changes are perturbed minus nominal"
@@ -119,13 +121,18 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
 """Kind of file -> quantity -> what it refers to."""
 
 
+def schema(kind: str) -> str:
+    """Kind and version of a file's keys."""
+    return f"{kind} {_LATER.get(kind, _VERSION)}"
+
+
 def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """The data of a file with its schema and its frames before them.
 
     Raises:
         KeyError: a kind without an entry in `FRAMES`.
     """
-    return {"schema": f"{kind} {SCHEMA}", "reference_frames": dict(FRAMES[kind]), **data}
+    return {"schema": schema(kind), "reference_frames": dict(FRAMES[kind]), **data}
 
 
 def frames_text(kind: str) -> str:

@@ -1,4 +1,4 @@
-"""Figures of the intersection angle test: planes and strips, the paper's Figs. 3-5, the scatter over many passes."""
+"""Figures of the intersection angle test: planes and strips, their answers to errors, the scatter over many passes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def geometry_figure(run: AngleRun) -> Figure:
 
 
 def sensitivity_figure(run: AngleRun, name: str) -> Figure:
-    """Difference of the angles, resection minus planes, over a move of 0 to 10 m, as the paper draws it."""
+    """Difference of the angles, resection minus planes, over a move of 0 to 10 m, per axis."""
     rows = {(row.what, row.axis): row for row in run.table}
     shows = panels(run)[name]
     wide = min(len(shows), 2)

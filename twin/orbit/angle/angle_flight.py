@@ -1,8 +1,8 @@
 """The lines whose angles are tested, and one moment of a pass as it truly is and as it is measured.
 
-The measurement has the errors that the paper discusses: of the orbit at the station, and of the ground points from
-matching and aerial triangulation. Beside the coordinates the analysis gets what the laboratory measured of each line
-before launch, nothing else.
+The measurement has errors of the orbit at the station, and of the ground points from matching and aerial
+triangulation. Beside the coordinates the analysis gets what the laboratory measured of each line before launch, nothing
+else.
 """
 
 from __future__ import annotations

@@ -8,16 +8,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from analysis.orbit.sensitivity import STATEMENTS, judge
 from analysis.units import ARCSEC
 from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_run import AngleRun, Scatter, run_angle, values_of
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
-
-PRINTED_DIFFERENCE_ARCSEC = {"alpha": 0.44, "beta": 1.53}
-"""Resection and planes, paper 000, Table 1."""
-
 
 ByAngle = Mapping[str, float | None]
 """A number for each angle of the test's file; what could not be computed is None."""
@@ -79,32 +74,6 @@ class ChangeNumbers:
 
 
 @dataclass(frozen=True)
-class StatementNumbers:
-    """A sentence of the paper on its figures, judged."""
-
-    figure: str
-    text: str
-    holds: bool
-    ratio: float | None
-    numbers: Mapping[str, float | None]
-
-    @classmethod
-    def of(cls, run: AngleRun) -> tuple[Self, ...]:
-        """All sentences; none where the angles are not the paper's."""
-        judged = [judge(statement, run.table) for statement in STATEMENTS if run.of_paper]
-        return tuple(
-            cls(
-                figure=j.statement.figure,
-                text=j.statement.text,
-                holds=bool(j.holds),
-                ratio=_number(j.ratio),
-                numbers={axis: _number(v) for axis, v in j.numbers.items()},
-            )
-            for j in judged
-        )
-
-
-@dataclass(frozen=True)
 class EffectNumbers:
     """What an effect on the light does to the angles, and what its correction leaves."""
 
@@ -161,9 +130,7 @@ class AngleNumbers:
     change_arcsec: ChangeNumbers
     difference_arcsec: ByAngle
     difference_sigma_arcsec: ByAngle
-    difference_printed_arcsec: ByAngle
     sensitivity: Sequence[Mapping[str, Any]]
-    statements: Sequence[StatementNumbers]
     effects: Sequence[EffectNumbers]
     frames: Sequence[Mapping[str, Any]]
     scatter: PassesNumbers
@@ -191,9 +158,7 @@ class AngleNumbers:
             change_arcsec=ChangeNumbers.of(run),
             difference_arcsec=_arcsec(names, run.difference),
             difference_sigma_arcsec=_arcsec(names, run.difference_sigma),
-            difference_printed_arcsec=PRINTED_DIFFERENCE_ARCSEC if run.of_paper else {},
             sensitivity=[row.to_dict() for row in run.table],
-            statements=StatementNumbers.of(run),
             effects=[
                 EffectNumbers(row.what, _arcsec(names, row.bias), _arcsec(names, row.left)) for row in run.effects
             ],

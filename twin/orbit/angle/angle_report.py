@@ -10,7 +10,6 @@ from analysis.units import ARCSEC
 from scenes.specs.job import DEFAULT_PIVOT, PerturbationSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.orbit.angle.angle_figures import signs
-from twin.orbit.angle.angle_numbers import PRINTED_DIFFERENCE_ARCSEC
 from twin.orbit.angle.angle_run import AngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections
 from twin.run.artefact import Cell, Table, fixed
@@ -55,9 +54,6 @@ def _lead(run: AngleRun) -> tuple[str, ...]:
             f"{listed([f'{fixed(off[k], 2)}″' for k in which])} from the truth. "
             f"Planes minus resection: {listed([f'{fixed(difference[k], 3)}″' for k in which])}"
         )
-        if run.of_paper and by == "by planes":
-            printed = PRINTED_DIFFERENCE_ARCSEC
-            said += f"; the paper prints {printed['alpha']}″ and {printed['beta']}″"
         lead.append(f"{said}.")
     if flight.trace:
         (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC

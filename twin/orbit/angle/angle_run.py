@@ -31,7 +31,6 @@ from analysis.orbit.resection import ObservedLine, Resection, ResectionError, re
 from analysis.orbit.sensitivity import Sensitivity, sensitivity
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit_angle import PAPER_ANGLES
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.run.procedure import Advance, BenchError, silent
@@ -170,11 +169,6 @@ class AngleRun:
     difference_sigma: np.ndarray
     table: tuple[Sensitivity, ...]
     height: Mapping[str, float | None]
-
-    @property
-    def of_paper(self) -> bool:
-        """Whether alpha and beta are the paper's, so that its sentences and numbers can be held against them."""
-        return all(self.flight.pairs.get(name) == pair for name, pair in PAPER_ANGLES.items())
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.orbit.sensitivity import STATEMENTS, Judgement, judge
 from analysis.units import ARCSEC
 from twin.orbit.angle.angle_figures import drawn, panels, signs
-from twin.orbit.angle.angle_numbers import PRINTED_DIFFERENCE_ARCSEC
 from twin.orbit.angle.angle_run import AngleRun, Scatter, values_of
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT
 from twin.run.artefact import Cell, SvgFigure, Table, fixed
@@ -32,7 +30,7 @@ def _geometry(run: AngleRun) -> Section:
     between = [f"{n} between {a} and {b}" for n, (a, b) in zip(names, flight.pairs.values(), strict=True)]
     text = [
         "At one moment the station O and the ground points that one line sees lie in a plane. The angles between these "
-        f"planes (paper 000, Fig. 2, eqs. 6 and 7): {listed(between)}.".replace("_", " "),
+        f"planes (Liu and Huang, 2014, eqs. 6 and 7): {listed(between)}.".replace("_", " "),
         "The planes give dihedral angles. The angles between the lines of sight of the lines' centres differ from them "
         f"by {listed([f'{fixed(v, 4)}″' for v in apart])} for this camera, because its lines are not quite parallel "
         "and do not begin at one place across the track. Heights are made by their part along the track.",
@@ -48,7 +46,7 @@ def _geometry(run: AngleRun) -> Section:
     if heights:
         text.append(
             f"An angle that is wrong by 1″ moves intersected heights by {listed(heights)}: the true line turned "
-            f"by 1″ and its ray intersected with the other line's on the ground.{_heights_said(run)}"
+            "by 1″ and its ray intersected with the other line's on the ground."
         )
     figure = SvgFigure("geometry", "Planes and strips", "In the orbital frame at the station.", drawn("geometry", run))
     return Section("Geometry", tuple(text), (figure,))
@@ -56,10 +54,6 @@ def _geometry(run: AngleRun) -> Section:
 
 def _bow(run: AngleRun) -> float:
     return max(float(np.max(np.linalg.norm(bow, axis=1))) for bow in run.measurement.bow.values()) / ARCSEC
-
-
-def _heights_said(run: AngleRun) -> str:
-    return " The paper says more than 5 m." if run.of_paper else ""
 
 
 def _change(run: AngleRun) -> Section:
@@ -102,25 +96,20 @@ def _sections_scatter(run: AngleRun) -> Section:
         rows,
         (None, None, 4, 4, 4, 4, 3),
     )
-    printed = PRINTED_DIFFERENCE_ARCSEC if run.of_paper else {}
     both = Table(
         "difference",
         "Planes minus resection",
         "Dihedral angle of tls planes minus the size of the resection's angle; below 5° the signed angles along the "
-        "track. The spread is that of the difference over the passes."
-        f"{' The paper prints the size of its one difference.' if printed else ''}",
-        ("angle", "here, arcsec", "spread, arcsec", *(["paper 000, arcsec"] if printed else [])),
-        [
-            (sign, float(difference[k]), float(spread[k]), *([printed.get(run.names[k])] if printed else []))
-            for k, sign in enumerate(names)
-        ],
-        (None, 3, 3, *([2] if printed else [])),
+        "track. The spread is that of the difference over the passes.",
+        ("angle", "difference, arcsec", "spread, arcsec"),
+        [(sign, float(difference[k]), float(spread[k])) for k, sign in enumerate(names)],
+        (None, 3, 3),
     )
     text = (
         "Both methods use the same station and points. The resection also uses where on its line a point lies and one "
         "attitude for all lines, which the laboratory's interior orientation must then be right for; the planes "
         "use neither. Most of the error of an angle is common to both, so that their difference scatters less than "
-        f"either.{_printed_said(run)}",
+        "either.",
     )
     figure = SvgFigure(
         "scatter-passes",
@@ -129,15 +118,6 @@ def _sections_scatter(run: AngleRun) -> Section:
         drawn("scatter", run),
     )
     return Section("Planes and resection", text, (both, table, figure))
-
-
-def _printed_said(run: AngleRun) -> str:
-    if not run.of_paper:
-        return ""
-    return (
-        " Errors of the points and of the station as they are drawn here do not make a difference as large as "
-        "the paper's; what the two methods assume can, and so can eq. 5 in an unfit frame (below)."
-    )
 
 
 def _shared(run: AngleRun) -> str:
@@ -175,8 +155,9 @@ def _frames(run: AngleRun) -> Section:
         "noise alone "
         f"decides: the printed form {_failure(worst)}. Total least squares does not depend on the frame: "
         f"its angles agree to {spread / ARCSEC:.1g}″.",
-        "Eq. 5 is printed with the wrong sign on its right side. Both slopes of every plane then come out negated, "
-        "which is one half turn of all planes about the frame's z axis: the angles are right, the planes are not.",
+        "Eq. 5 of Liu and Huang has the wrong sign on its right side. Both slopes of every plane then come out "
+        "negated, which is one half turn of all planes about the frame's z axis: the angles are right, the planes are "
+        "not.",
     ]
     table = Table(
         "frames",
@@ -222,13 +203,11 @@ def _effects(run: AngleRun) -> Section:
         rows,
         (None, *[4] * len(run.names), *[6] * len(run.names)),
     )
-    turned = " α and β change oppositely by the first and alike by the second, half an arcsecond each."
     speed = float(np.linalg.norm(run.flight.velocity) / SPEED_OF_LIGHT / ARCSEC)
     text = (
-        "The paper does not speak of what happens to the light. Aberration tilts every line of sight toward the "
+        "Aberration tilts every line of sight toward the "
         f"flight direction by v/c = {speed:.1f}″ times the sine of its angle from it, so that a plane near the nadir "
-        "turns more than others; refraction lets the inclined looks arrive nearer to the nadir."
-        f"{turned if run.of_paper else ''}",
+        "turns more than others; refraction lets the inclined looks arrive nearer to the nadir.",
         "The corrections use the measured station, the velocity and the standard atmosphere, which here is also the "
         "true one: what is left shows that the correction is the inverse, not how well the atmosphere is known.",
     )
@@ -236,15 +215,13 @@ def _effects(run: AngleRun) -> Section:
 
 
 def _sensitivity(run: AngleRun) -> Section:
-    numbers = {"station": 3, "alpha-points": 4, "beta-points": 5} if run.of_paper else {}
     figures = []
     for name in panels(run):
         moved = "The station" if name == "station" else f"Points, {signs([name.removesuffix('-points')])[0]}"
-        title = f"As Fig. {numbers[name]} of the paper" if name in numbers else moved
         caption = (
             "All planes move with the station." if name == "station" else "All points of one strip moved together."
         )
-        figures.append(SvgFigure(f"sensitivity-{name}", title, caption, drawn(name, run)))
+        figures.append(SvgFigure(f"sensitivity-{name}", moved, caption, drawn(name, run)))
     rows: list[tuple[Cell, ...]] = []
     for entry in (row.to_dict() for row in run.table):
         what = "station" if entry["what"] == "station" else f"{entry['what']} points".replace("_", " ")
@@ -259,28 +236,7 @@ def _sensitivity(run: AngleRun) -> Section:
     )
     moving = (
         "The station, or all points of one strip, is moved by 0 to 10 m along one axis of the Earth-fixed frame. The "
-        "ordinate is the paper's: resection, which stays, minus planes."
+        "ordinate is resection, which stays, minus planes."
     )
     straight = "The answer to 10 m is a straight line: second-order terms are of the size 10 m over 500 km."
-    heading = "Errors of the station and of the points"
-    if not run.of_paper:
-        return Section(heading, (moving, straight), (*figures, table))
-    found = [judge(statement, run.table) for statement in STATEMENTS]
-    held = sum(j.holds for j in found)
-    sentences = Table(
-        "statements",
-        "The paper's sentences on its figures",
-        "Numbers: arcsec per 10 m along each axis, or the relative growth of the slope from 0 to 10 m. Far more: at "
-        "least twice. Alike: within a quarter. Little: at most a quarter of the largest.",
-        ("figure", "sentence", "holds", "x", "y", "z"),
-        [_statement(j) for j in found],
-        (None, None, None, 4, 4, 4),
-    )
-    text = (moving, f"{held} of {len(found)} sentences hold on this pass. {straight}")
-    return Section(heading, text, (*figures, table, sentences))
-
-
-def _statement(judgement: Judgement) -> tuple[Cell, ...]:
-    numbers = (judgement.numbers.get(axis) for axis in "xyz")
-    cells = [float(v) if v is not None and np.isfinite(v) else None for v in numbers]
-    return judgement.statement.figure, judgement.statement.text, "yes" if judgement.holds else "no", *cells
+    return Section("Errors of the station and of the points", (moving, straight), (*figures, table))

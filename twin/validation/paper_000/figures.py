@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Method, Strip
-from analysis.orbit.sensitivity import sensitivity
+from analysis.orbit.sensitivity import Sensitivity, sensitivity
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement
@@ -130,6 +130,14 @@ class Answers:
     amount: Array
     change: Mapping[tuple[str, str, str], Array]
 
+    @classmethod
+    def of(cls, table: Sequence[Sensitivity]) -> Answers:
+        """From the rows for every thing that is moved along every axis."""
+        change = {
+            (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
+        }
+        return cls(table[0].amount, change)
+
     @property
     def rises(self) -> Rises:
         """At the end."""
@@ -159,11 +167,7 @@ def make_passes(
 def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: Method = "corrected") -> Answers:
     """All planes fitted anew for every move."""
     amount = np.linspace(0.0, REACH, steps + 1)
-    table = sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount)
-    change = {
-        (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
-    }
-    return Answers(amount, change)
+    return Answers.of(sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount))
 
 
 @one_blas_thread()

@@ -15,13 +15,13 @@ from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit_angle import LINES
 from twin.orbit.angle.angle_flight import Measurement
-from twin.orbit.angle.angle_numbers import PRINTED_DIFFERENCE_ARCSEC
 from twin.orbit.angle.angle_run import effect_rows, values_of
 from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import NOT_CHECKABLE, REFUTED, SIGMAS, Check, CheckResult, Explanation
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_000.passes import PAIRS, TEST, Passes, planes_of, repeated, setup_of
 
 
@@ -49,7 +49,8 @@ def differences_svg(same: NDArray[np.float64], own: NDArray[np.float64], printed
 
 
 Array = NDArray[np.float64]
-ALPHA, BETA = PRINTED_DIFFERENCE_ARCSEC["alpha"], PRINTED_DIFFERENCE_ARCSEC["beta"]
+PRINTED_ARCSEC = load_printed("000").numbers("table1.difference_arcsec")
+ALPHA, BETA = PRINTED_ARCSEC["alpha"], PRINTED_ARCSEC["beta"]
 POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))
 """Metres: control points of 2 m, matched to a third of a pixel of 5 m."""
 
@@ -187,7 +188,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 def _same(context: Context, data: Data, same: Differences) -> Iterator[CheckResult]:
     count = len(same.values)
-    for k, (name, printed) in enumerate(PRINTED_DIFFERENCE_ARCSEC.items()):
+    for k, (name, printed) in enumerate(PRINTED_ARCSEC.items()):
         identifier = f"000.table1.{name}"
         if identifier not in context.selected:
             continue
@@ -211,7 +212,7 @@ def _same(context: Context, data: Data, same: Differences) -> Iterator[CheckResu
 
 def _own(context: Context, data: Data, own: Differences) -> Iterator[CheckResult]:
     count = len(own.values)
-    for k, name in enumerate(PRINTED_DIFFERENCE_ARCSEC):
+    for k, name in enumerate(PRINTED_ARCSEC):
         identifier = f"000.table1.{name}_own"
         if identifier not in context.selected:
             continue

@@ -21,6 +21,7 @@ from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_job
 from twin.monitor.truth import line_points, trace_sight
 from twin.validation.checks.group import Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001.random_states import LINES, BudgetLine, ErrorBudget, Together
 
 FRAMES = 9
@@ -64,7 +65,7 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
 BUDGET = "monitor_pair"
 FEW_DRAWS = ("coordinate_thermal", "central_prism_thermal")
 """Lines of two or three random numbers a state, which need more states than those of a prism in every channel."""
-ROLL = 2.15 * ARCSEC
+ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
 """Table 5's error of d_gamma."""
 FROM_ALL_CAUSES = frozenset(
     f"001.{name}"

@@ -13,6 +13,7 @@ from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget, monitored_errors
 from twin.validation.paper_001.budget import FEW_DRAWS, BudgetImages
 from twin.validation.paper_001.random_states import BudgetLine
@@ -42,13 +43,13 @@ def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:
 
 _INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
 _LINES = {
-    "centroid": ("Energy centre of one image", 0.021),
-    "coordinate_thermal": ("Thermal distortion of the coordinate system (recorder's board)", 0.018),
-    "prism_180_thermal": ("Temperature gradient across the 180° prism", 0.130),
-    "prism_0_thermal": ("Temperature gradient across the 0° prism", 0.010),
-    "prism_180_rotation": ("Rotation of the 180° prism with residual angle errors", 0.020),
-    "prism_0_rotation": ("Rotation of the 0° prism with residual angle errors", 0.056),
-    "central_prism_thermal": ("Temperature of the central prism", 0.002),
+    "centroid": "Energy centre of one image",
+    "coordinate_thermal": "Thermal distortion of the coordinate system (recorder's board)",
+    "prism_180_thermal": "Temperature gradient across the 180° prism",
+    "prism_0_thermal": "Temperature gradient across the 0° prism",
+    "prism_180_rotation": "Rotation of the 180° prism with residual angle errors",
+    "prism_0_rotation": "Rotation of the 0° prism with residual angle errors",
+    "central_prism_thermal": "Temperature of the central prism",
 }
 _LARGEST = ("prism_180_thermal", "prism_0_rotation")
 """The two lines that make most of (12)."""
@@ -62,14 +63,15 @@ _INPUT_OF = {
     "central_prism_thermal": "gradient in the central prism",
 }
 """What a line's input is; those of rotations act through the prisms' residual angle errors, which are chosen too."""
-PRINTED = {name: value for name, (_, value) in _LINES.items()}
-"""Table 3, arcsec."""
+TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
+TABLE_4 = load_printed("001").number("table4.spot_arcsec")
 
 CHECKS = (
     *(
-        Check(f"001.table3.{name}", "Table 3", f"{text}, error of one spot", "arcsec", value, 0.2 * value, _INPUTS,
-              tells=0.5 * value, against="half as much or half as much again", basis="chosen")
-        for name, (text, value) in _LINES.items()
+        Check(f"001.table3.{name}", "Table 3", f"{text}, error of one spot", "arcsec", TABLE_3[name],
+              0.2 * TABLE_3[name], _INPUTS,
+              tells=0.5 * TABLE_3[name], against="half as much or half as much again", basis="chosen")
+        for name, text in _LINES.items()
     ),
     Check("001.table3.prism_180_thermal.halved", "Table 3, section 3.2.1 item 3",
           "The 180° prism's error is that of its glass path: with half the path across the gradient, half the error",
@@ -85,14 +87,14 @@ CHECKS = (
     Check("001.eq12.gravity", "section 3.2.1 item 5, section 3.2.2",
           "In orbit the bending of the optics by gravity can be left out of (12)", "arcsec", None, 0.0,
           "nothing is printed to compare with", expected=NOT_CHECKABLE),
-    Check("001.table4.printed_lines", "Table 4, from Table 3", "(12) of the printed lines of Table 3", "arcsec", 0.145,
-          0.0005, "half of the last printed digit",
+    Check("001.table4.printed_lines", "Table 4, from Table 3", "(12) of the printed lines of Table 3", "arcsec",
+          TABLE_4, 0.0005, "half of the last printed digit",
           tells=0.0013, against="(12) without the mean over the frames"),
     Check("001.table4.root_sum", "Table 4, eq. (12)", "(12) of the simulated lines, the centroid's over 9 frames",
-          "arcsec", 0.145, 0.029, _INPUTS,
+          "arcsec", TABLE_4, 0.029, _INPUTS,
           tells=0.07, against="half as much or half as much again", basis="chosen"),
-    Check("001.table4.together", "Table 4", "Error of one spot with all causes at once in the images", "arcsec", 0.145,
-          0.029, _INPUTS,
+    Check("001.table4.together", "Table 4", "Error of one spot with all causes at once in the images", "arcsec",
+          TABLE_4, 0.029, _INPUTS,
           tells=0.07, against="half as much or half as much again", basis="chosen"),
     *monitored_errors.CHECKS,
 )  # fmt: skip
@@ -181,8 +183,8 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         assert images.scatter is not None
         (single, s_sigma), (mean, m_sigma) = images.scatter
         should = budget.frame_mean(single)
-        rest = budget.root_sum({n: v for n, v in PRINTED.items() if n != "centroid"})
-        printed = budget.root_sum(PRINTED)
+        rest = budget.root_sum({n: v for n, v in TABLE_3.items() if n != "centroid"})
+        printed = budget.root_sum(TABLE_3)
         how = (
             f"{groups} groups of {budget.FRAMES} frames, energy centroid: {single / ARCSEC:.5f} arcsec (3σ) "
             f"in single frames, {mean / ARCSEC:.5f} in means. Of the printed lines the centroid's is then the smallest "
@@ -198,7 +200,7 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         )
     if "001.table4.printed_lines" in context.selected:
         how = "Arithmetic of the printed numbers alone: Table 4 follows from Table 3 by (12) with 9 frames."
-        yield context.check("001.table4.printed_lines").judge(budget.root_sum(PRINTED), None, how)
+        yield context.check("001.table4.printed_lines").judge(budget.root_sum(TABLE_3), None, how)
     if "001.table4.root_sum" in context.selected:
         total, sigma = budget.root_sum_of_squares(images.lines)
         how = f"(12) over the seven simulated lines, {budget.FRAMES} frames, {trials} states and more each."
@@ -215,9 +217,9 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
 def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     rows: list[list[Cell]] = []
     for name, line in lines.items():
-        text, printed = _LINES[name]
-        rows.append([text, f"{printed:g}", f"{line.three_sigma / ARCSEC:.4f}", f"{line.sigma / ARCSEC:.4f}",
-                     f"{line.value:.4g} {line.unit}", f"{line.allowed:.3g} {line.unit}"])  # fmt: skip
+        rows.append([_LINES[name], f"{TABLE_3[name]:g}", f"{line.three_sigma / ARCSEC:.4f}",
+                     f"{line.sigma / ARCSEC:.4f}", f"{line.value:.4g} {line.unit}",
+                     f"{line.allowed:.3g} {line.unit}"])  # fmt: skip
     context.add(
         Table(
             "table3",
@@ -230,7 +232,7 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     data = {n: {"three_sigma_arcsec": l.three_sigma / ARCSEC, "sigma_arcsec": l.sigma / ARCSEC, "input": l.value,
                 "unit": l.unit, "input_for_0.1_arcsec": l.allowed} for n, l in lines.items()}  # fmt: skip  # noqa: E741
     context.add(Data("budget", "The budget as data", "Inputs and results of every line.", data))
-    shown = {_LINES[n][0]: (_LINES[n][1], line.three_sigma / ARCSEC, line.sigma / ARCSEC) for n, line in lines.items()}
+    shown = {_LINES[n]: (TABLE_3[n], line.three_sigma / ARCSEC, line.sigma / ARCSEC) for n, line in lines.items()}
     caption = (
         "Printed and simulated error of one spot, 3σ, on a logarithmic scale; bars: three sigma of the simulation."
     )

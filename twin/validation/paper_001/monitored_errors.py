@@ -10,19 +10,21 @@ from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget
 from twin.validation.paper_001.budget import BudgetImages
 from twin.validation.paper_001.random_states import Together
 
-TABLE_4 = 0.145 * ARCSEC
+_PRINTED = load_printed("001")
+TABLE_4 = _PRINTED.number("table4.spot_arcsec") * ARCSEC
 _INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
 _DIGITS = "half of the last printed digit"
 _PARAMETERS = {
-    "d_beta": ("d_beta_rad", "Δβ, 3σ", 0.05, "arcsec", 0.005, _DIGITS),
-    "d_alpha": ("d_alpha_rad", "Δα, 3σ", 0.05, "arcsec", 0.005, _DIGITS),
-    "d_gamma": ("d_gamma_rad", "Δγ by (5), 3σ", 2.15, "arcsec", 0.03,
+    "d_beta": ("d_beta_rad", "Δβ, 3σ", _PRINTED.number("table5.d_beta_arcsec"), "arcsec", 0.005, _DIGITS),
+    "d_alpha": ("d_alpha_rad", "Δα, 3σ", _PRINTED.number("table5.d_alpha_arcsec"), "arcsec", 0.005, _DIGITS),
+    "d_gamma": ("d_gamma_rad", "Δγ by (5), 3σ", _PRINTED.number("table5.d_gamma_arcsec"), "arcsec", 0.03,
                 "f/L is not printed, the camera's is 0.6 % above the one that Table 5 implies; half of a digit"),
-    "d_f": ("d_f_m", "Δf by (7), 3σ", 0.04, "mm", 0.005, _DIGITS),
+    "d_f": ("d_f_m", "Δf by (7), 3σ", _PRINTED.number("table5.d_f_mm"), "mm", 0.005, _DIGITS),
 }  # fmt: skip
 _UNIT = {"arcsec": ARCSEC, "mm": 1e-3}
 _OF_GEOMETRY = ("d_gamma", "d_f")
@@ -42,8 +44,8 @@ CHECKS = (
         for name, (_, text, value, unit, tolerance, why) in _PARAMETERS.items()
     ),
     Check("001.table5.d_f.by_table1", "Table 5, section 3.2.3",
-          "Table 5 follows from Tables 1 and 4: Δf by Table 1's last column from the printed Table 4", "mm", 0.04,
-          0.005, _DIGITS, expected=CORRECTED,
+          "Table 5 follows from Tables 1 and 4: Δf by Table 1's last column from the printed Table 4", "mm",
+          _PRINTED.number("table5.d_f_mm"), 0.005, _DIGITS, expected=CORRECTED,
           tells=0.02, against="half of it"),
     Check("001.table5.x_and_y", "section 3.2.3, abstract",
           "The turns about X and Y are determined to better than 0.1″: the larger, 3σ", "arcsec", 0.1, 0.02, _INPUTS,

@@ -25,6 +25,7 @@ from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
 from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import principle_rows
 from twin.validation.paper_001 import principle_rows as printed
 from twin.validation.paper_001.principle_bench import PrincipleTable, Reader, run_principle_experiment
@@ -123,7 +124,8 @@ def _differences(axes: Axes, tables: Sequence[PrincipleTable], axis: str, last: 
 
 _SPREAD = "half of the printed value; the scatter between benches, in sigma, is larger"
 _SECOND = "second order in the turn: below 2e-6 at 720 arcsec; the rest is the noise-free centroid"
-_CLAIMED = {"d_beta": ("Δβ", "X", 0.55), "d_alpha": ("Δα", "Y", 0.64), "d_gamma": ("Δγ", "Z", 0.97)}
+_CLAIMED = load_printed("001").numbers("table2.claimed_arcsec")
+_AXES = {"d_beta": ("Δβ", "X"), "d_alpha": ("Δα", "Y"), "d_gamma": ("Δγ", "Z")}
 _TURNS = {
     "x": "About X mirror 2 turns by Δβ: read / true",
     "y": "About Y mirror 2 turns by Δα cos b about its own Y: read / (Δα cos b)",
@@ -131,14 +133,14 @@ _TURNS = {
 }
 
 CHECKS = (
-    Check("001.table2.x", "Table 2, X", "About X both mirrors turn by Δβ: mean difference", "arcsec", 0.460909, 0.230,
-          _SPREAD,
+    Check("001.table2.x", "Table 2, X", "About X both mirrors turn by Δβ: mean difference", "arcsec",
+          printed.MEAN_DIFFERENCE["X"], 0.230, _SPREAD,
           tells=50.0, against="a wrong relation: cos 30° in place of 1", basis="chosen"),
-    Check("001.table2.y", "Table 2, Y", "About Y mirror 2 reads Δα cos b: mean difference", "arcsec", 0.340353, 0.170,
-          _SPREAD,
+    Check("001.table2.y", "Table 2, Y", "About Y mirror 2 reads Δα cos b: mean difference", "arcsec",
+          printed.MEAN_DIFFERENCE["Y"], 0.170, _SPREAD,
           tells=50.0, against="a wrong relation: sine in place of cosine", basis="chosen"),
-    Check("001.table2.z", "Table 2, Z", "About Z mirror 2 reads Δγ sin b: mean difference", "arcsec", 0.177646, 0.089,
-          _SPREAD,
+    Check("001.table2.z", "Table 2, Z", "About Z mirror 2 reads Δγ sin b: mean difference", "arcsec",
+          printed.MEAN_DIFFERENCE["Z"], 0.089, _SPREAD,
           tells=50.0, against="a wrong relation: cosine in place of sine", basis="chosen"),
     *(
         Check(f"001.table2.relation.{axis}", "section 3.1.1", text, "1", 1.0, 1e-5, _SECOND,
@@ -161,10 +163,10 @@ CHECKS = (
           tells=0.5, against="half as much again", basis="chosen"),
     *(
         Check(f"001.table2.claimed.{name}", "section 3.1.3, conclusion",
-              f"The mean accuracy of {symbol} is {claimed}″: mean difference of the rows that are printed", "arcsec",
-              claimed, 0.005, "half of the last printed digit", expected=CORRECTED,
+              f"The mean accuracy of {_AXES[name][0]} is {claimed}″: mean difference of the rows that are printed",
+              "arcsec", claimed, 0.005, "half of the last printed digit", expected=CORRECTED,
               tells=0.05, against="another first digit")
-        for name, (symbol, _, claimed) in _CLAIMED.items()
+        for name, claimed in _CLAIMED.items()
     ),
 )  # fmt: skip
 
@@ -280,7 +282,7 @@ def _limits(context: Context, findings: tuple[PrincipleCheck, ...], count: int) 
 
 
 def _claimed(context: Context, name: str) -> CheckResult:
-    symbol, axis, claimed = _CLAIMED[name]
+    claimed, (symbol, axis) = _CLAIMED[name], _AXES[name]
     value = printed_mean_difference(axis)
     how = (
         f"Worked out from the printed rows; the claimed figure is {claimed / value:.2f} times it. The sentence before "

@@ -7,7 +7,7 @@ is printed as 2/sqrt(3) times mirror 2.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,38 +16,16 @@ from analysis.monitor.autocollimator import AXES, column_component, mean_differe
 from analysis.units import ARCSEC
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
-from optics.numerics.frozen_map import FrozenMap
 from scenes.models.principle_model import UNITS
 from scenes.specs.principle_experiment import PrincipleExperimentSpec, PrincipleSetup
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001.principle_bench import PrincipleTable, Reader, Series, run_principle_experiment, table_2
 
-ANGLES = (0.0, 72.0, 144.0, 216.0, 288.0, 360.0, 432.0, 504.0, 576.0, 648.0, 720.0)
-"""Turn of the table."""
-
-MIRROR_1: Mapping[str, tuple[float, ...]] = FrozenMap(
-    {
-        "X": (0.04, 70.98, 143.17, 215.27, 286.92, 358.72, 431.05, 503.28, 575.18, 647.18, 718.99),
-        "Y": (0.15, 72.00, 144.22, 215.54, 288.33, 360.41, 432.54, 504.51, 577.13, 648.86, 721.08),
-        "Z": (0.04, 62.31, 124.63, 187.00, 249.06, 311.89, 374.04, 436.31, 498.61, 560.97, 623.23),
-    }
-)
-MIRROR_2: Mapping[str, tuple[float, ...]] = FrozenMap(
-    {
-        "X": (0.03, 71.16, 143.39, 215.64, 287.29, 359.14, 431.70, 503.93, 575.89, 647.94, 719.72),
-        "Y": (
-            *(0.046188, 71.822373, 144.002704, 216.183035, 288.536571, 360.786183),
-            *(432.966514, 505.031374, 577.304081, 649.288113, 721.549272),
-        ),
-        "Z": (
-            *(0.046188, 71.949391, 143.910328, 215.929001, 287.589716, 360.139551),
-            *(431.904189, 503.807392, 575.745235, 647.752361, 719.644017),
-        ),
-    }
-)
-MEAN_DIFFERENCE: Mapping[str, float] = FrozenMap({"X": 0.460909, "Y": 0.340353, "Z": 0.177646})
-"""The table's last line."""
-
-
+_TABLE = load_printed("001")
+ANGLES = _TABLE.column("table2.turn_arcsec")
+MIRROR_1 = _TABLE.columns("table2.mirror_1_arcsec")
+MIRROR_2 = _TABLE.columns("table2.mirror_2_arcsec")
+MEAN_DIFFERENCE = _TABLE.numbers("table2.mean_difference_arcsec")
 PAPER = "001"
 DRAWS = 4000
 _RELATIONS = {

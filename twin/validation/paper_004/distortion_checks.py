@@ -10,19 +10,22 @@ from numpy.typing import NDArray
 from analysis.units import UM_PER_M as UM
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_distortion
-from twin.laboratory import printed_004
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import DistortionRun, measure, rms
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.validation.checks.check import REFUTED, UNDECIDED, Check, CheckResult, Explanation, mean_of, median_of
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_004 import orientation, sensitivity_checks
 from twin.validation.paper_004.figures_004 import points_svg, reduction_svg
-from twin.validation.paper_004.orientation import SpotTest, judge_equations
+from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS, SpotTest, judge_equations
 from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
 TEST = "distortion"
+SETS = load_printed("004").whole("distortion.sets")
+REDUCTION = load_printed("004").number("distortion.reduction")
+RAW, COMPENSATED = (np.array(load_printed("004").column(f"table2.{name}_um")) for name in ("raw", "compensated"))
 TESTS, FAST_TESTS = 60, 14
 """Simulated tests: another turntable, calibration, zero, axis, detector and noise in each."""
 
@@ -32,27 +35,26 @@ CHECKS = (
     *orientation.CHECKS,
     *sensitivity_checks.CHECKS,
     Check("004.table2.reduction", "Table 2, section 3.3", "By Table 2, compensated angles lower the RMS of the "
-          "distortion by 35 %: RMS over the points", "%", 100.0 * printed_004.REDUCTION, 1.0, _DIGIT,
+          "distortion by 35 %: RMS over the points", "%", 100.0 * REDUCTION, 1.0, _DIGIT,
           expected=REFUTED, tells=8.7, against="the reduction of the mean, 26.3 %"),
     Check("004.table2.mean", "Table 2, section 3.3", "The same: mean over the points", "%",
-          100.0 * printed_004.REDUCTION, 1.0, _DIGIT, expected=REFUTED,
+          100.0 * REDUCTION, 1.0, _DIGIT, expected=REFUTED,
           tells=8.7, against="the reduction that the columns give"),
     Check("004.table2.largest", "Table 2, section 3.3", "The same: largest value of any point", "%",
-          100.0 * printed_004.REDUCTION, 1.0, _DIGIT,
+          100.0 * REDUCTION, 1.0, _DIGIT,
           tells=8.7, against="the reduction of the mean"),
     Check("004.table2.bound", "Table 2, abstract", "The distortion is tested to better than 2.3 µm: largest value of "
-          "the compensated column", "µm", printed_004.DISTORTION_ACCURACY_UM, 0.0, "the bound itself", "at most",
+          "the compensated column", "µm", ACCURACY_UM, 0.0, "the bound itself", "at most",
           tells=1.2, against="the raw column's largest value"),
     Check("004.table2.accuracy", "abstract", "Accuracy of the distortion with compensated angles: largest RMS error "
-          "over the field of any test", "µm", printed_004.DISTORTION_ACCURACY_UM, 0.05,
+          "over the field of any test", "µm", ACCURACY_UM, 0.05,
           "half of the last printed digit", "at most",
           tells=2.3, against="twice the accuracy that the paper claims", basis="chosen"),
     Check("004.table2.compensation", "section 3.3", "Compensated angles lower the RMS of the distortion: median "
-          "reduction of its error", "%", 100.0 * printed_004.REDUCTION, 1.0, _DIGIT, expected=UNDECIDED,
+          "reduction of its error", "%", 100.0 * REDUCTION, 1.0, _DIGIT, expected=UNDECIDED,
           tells=11.0, against="the 24 % of Table 2 itself", basis="chosen"),
     Check("004.table2.points", "Table 2", "Compensation changes 19 of 55 points by 0.1 µm or more: share of the points",
-          "%", 100.0 * float(np.mean(np.array(printed_004.DISTORTION_RAW_UM) !=
-                                     np.array(printed_004.DISTORTION_COMPENSATED_UM))), 15.0,
+          "%", 100.0 * float(np.mean(RAW != COMPENSATED)), 15.0,
           "eight points of 55: how far a dividing error goes from table to table", expected=REFUTED,
           tells=50.0, against="a correction that changes nearly every point"),
 )  # fmt: skip
@@ -93,10 +95,6 @@ def measured_tests(context: Context) -> list[DistortionRun]:
     return runs
 
 
-def _printed() -> tuple[Array, Array]:
-    return np.array(printed_004.DISTORTION_RAW_UM), np.array(printed_004.DISTORTION_COMPENSATED_UM)
-
-
 def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
     """Reduction, percent."""
     return float(100.0 * (1.0 - compensated / raw))
@@ -104,7 +102,7 @@ def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
 
 def _table2(context: Context) -> Iterator[CheckResult]:
     """What the printed columns give."""
-    raw, own = _printed()
+    raw, own = RAW, COMPENSATED
     changed = raw != own
     top = [np.eye(len(raw))[np.argmax(values)] for values in (raw, own)]
     share = [np.full(len(raw), 1.0 / len(raw))] * 2
@@ -141,7 +139,7 @@ def _table2(context: Context) -> Iterator[CheckResult]:
 def _accuracy(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
     raw, own = _errors(runs).T
     how = (
-        f"{len(runs)} rendered tests, {printed_004.TEST_POINTS} points and {printed_004.SETS} sets each, against "
+        f"{len(runs)} rendered tests, {POINTS} points and {SETS} sets each, against "
         f"exact chief rays: median {np.median(own):.2f} µm, largest {np.max(own):.2f} µm; with angles as read "
         f"{np.median(raw):.2f} and {np.max(raw):.2f} µm. The fit has the constant term that (1) lacks."
     )
@@ -210,7 +208,7 @@ def _errors(runs: Sequence[DistortionRun]) -> Array:
 
 
 def _show(context: Context, runs: Sequence[DistortionRun]) -> None:
-    raw, own = _printed()
+    raw, own = RAW, COMPENSATED
     changes = {"paper 004, Table 2": (raw[None], own[None])}
     kinds: dict[str, Callable[[DistortionRun], tuple[Array, Array]]] = {
         "error of the distortion (needs the truth)": lambda r: (r.error(r.raw), r.error(r.compensated)),
@@ -224,7 +222,7 @@ def _show(context: Context, runs: Sequence[DistortionRun]) -> None:
         Table(
             "table2",
             "Table 2 and the simulation",
-            f"Over the {printed_004.TEST_POINTS} points, µm: raw and compensated angles; median of {len(runs)} "
+            f"Over the {POINTS} points, µm: raw and compensated angles; median of {len(runs)} "
             "simulated tests, reductions too.",
             ("quantity", "RMS, raw", "RMS, comp.", "lower, %", "mean, raw", "mean, comp.", "lower, %",
              "largest, raw", "largest, comp.", "lower, %"),
@@ -237,7 +235,7 @@ def _show(context: Context, runs: Sequence[DistortionRun]) -> None:
             "What compensation brings, table by table",
             "A point per simulated turntable and test: RMS error of the distortion. The square is the RMS of the "
             "paper's Table 2, which holds the distortion of its camera as well.",
-            reduction_svg(_errors(runs), (rms(raw), rms(own))),
+            reduction_svg(_errors(runs), (rms(raw), rms(own)), REDUCTION),
         )
     )
     tests = [SpotTest(r) for r in runs]

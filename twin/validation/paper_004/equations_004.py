@@ -20,10 +20,10 @@ from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from scenes.models.camera_assembly import ROOT, build_camera_under_test
 from scenes.specs.lab_setup import DistortionSetup, resolve_distortion
-from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM, TEST_POINTS
 from twin.targets.target_path import TargetPath
 from twin.validation.checks.check import Check, CheckResult
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS
 
 Array = NDArray[np.float64]
 TEST = "distortion"
@@ -41,7 +41,7 @@ CHECKS = (
           "least-squares solution", "µm", None, 1e-6, _ROUNDING,
           tells=1.0, against="half of the accuracy that the paper claims"),
     Check("004.eq3.ignored", "section 3.1, eq. (3)", "A principal point one pixel from the middle of the line can be "
-          "ignored: largest change of D by (3)", "µm", DISTORTION_ACCURACY_UM, 0.05,
+          "ignored: largest change of D by (3)", "µm", ACCURACY_UM, 0.05,
           "half of the last printed digit", "at most",
           tells=2.3, against="twice the accuracy that the paper claims"),
     Check("004.turntable.range", "section 3.2", "The test turns the camera by no more than 5°: angle between the "
@@ -104,12 +104,12 @@ def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pi
     second = distortion(*moved, principal_distance(*moved))
     change = float(np.max(np.abs(second - first)))
     edge = np.tan(turn[-1])
-    most = MM * pitch * 1e-6 * DISTORTION_ACCURACY_UM / change
+    most = MM * pitch * 1e-6 * ACCURACY_UM / change
     how = (
         f"{len(turn)} exact chief rays of gf7, L and W counted from a point {UM * shift:g} µm beside the middle of the "
         f"line: D changes by {1e3 * UM * change:.1f} nm at most. Without distortion it would be p tan² W, "
         f"{1e3 * UM * pitch * edge**2:.1f} nm; a radial distortion whose centre is off adds the rest. To make "
-        f"{DISTORTION_ACCURACY_UM:g} µm p would have to be {most:.1f} mm."
+        f"{ACCURACY_UM:g} µm p would have to be {most:.1f} mm."
     )
     return context.check("004.eq3.ignored").judge(UM * change, None, how)
 
@@ -117,7 +117,7 @@ def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pi
 def _solutions(context: Context, places: Callable[[Array], Array], edge: float) -> Iterator[CheckResult]:
     """(2), (3), (4) against a singular value decomposition of (1)."""
     # not even about the middle, so that no sum vanishes and an error in any of them shows
-    turn = edge * np.linspace(-1.0, 0.6, TEST_POINTS)
+    turn = edge * np.linspace(-1.0, 0.6, POINTS)
     where, t = places(turn), np.tan(turn)
     f, p = (float(v) for v in principal_distance_and_point(where, turn))
     alone = float(principal_distance(where, turn))

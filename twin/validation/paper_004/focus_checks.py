@@ -22,15 +22,18 @@ from scenes.specs.lab_setup import resolve_focus
 from twin.laboratory.focus_alignment import Alignment, State, align, line_turn, mount_of
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import NYQUIST
-from twin.laboratory.printed_004 import CONFOCAL_UM, LINE_LEVEL_ARCMIN, MTF_NYQUIST
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.targets.edge_images import TRACK
 from twin.validation.checks.check import NOT_CHECKABLE, Check, CheckResult, mean_of
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_004.figures_004 import alignment_svg
 
 Array = NDArray[np.float64]
+MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
+CONFOCAL_UM = load_printed("004").number("alignment.confocal_um")
+LINE_LEVEL_ARCMIN = load_printed("004").number("alignment.line_level_arcmin")
 PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
 ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "slide along x", "slide along y", "lift")
 """Tilts and lift by shims, the others by hand."""

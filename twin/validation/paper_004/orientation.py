@@ -24,12 +24,14 @@ from analysis.units import ARCSEC
 from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
 from twin.laboratory.distortion_run import DistortionRun, rms
-from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM
 from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.checks.group import Context
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
+ACCURACY_UM = load_printed("004").number("distortion.accuracy_um")
+POINTS = load_printed("004").whole("distortion.points")
 UNEVEN = slice(0, 44)
 """Points from one end of the line to six tenths of the other half: there f and p of (2) hang on each other, and the
 camera's radial distortion makes a p of 54 mm, which no noise hides.
@@ -43,10 +45,10 @@ _SQUARES = "other errors, near 1 µm, add in square, and 0.3 µm for how the zer
 
 CHECKS = (
     Check("004.eq1.constant", "eqs. (1), (2)", "D by (1) with f and p of (2), W counted from where the operator set "
-          "the zero: RMS error of all tests", "µm", DISTORTION_ACCURACY_UM, 0.5, _SQUARES, "at most", CORRECTED,
+          "the zero: RMS error of all tests", "µm", ACCURACY_UM, 0.5, _SQUARES, "at most", CORRECTED,
           tells=2.3, against="twice the accuracy that the paper claims"),
     Check("004.eq1.zero", "eqs. (1), (2)", "D by (1) with f and p of (2), W counted from the zero that a constant term "
-          "finds: largest RMS error of any test", "µm", DISTORTION_ACCURACY_UM, 0.05,
+          "finds: largest RMS error of any test", "µm", ACCURACY_UM, 0.05,
           "half of the last printed digit", "at most",
           tells=2.3, against="twice the accuracy that the paper claims", basis="chosen"),
     Check("004.eq2.f", "eqs. (2), (3)", "(2), and (3) with p = 0, give the principal distance: mean over the tests "
@@ -204,10 +206,10 @@ def _eq1(context: Context, tests: Sequence[SpotTest]) -> Iterator[CheckResult]:
     left = rms(np.array([t.shifted(1, 2)[1] for t in tests]))
     alone = [t.place - principal_distance(t.place, t.turn) * np.tan(t.turn) - t.camera.rest for t in tests]
     zeros = np.array([t.zero for t in tests]) / ARCSEC
-    need = DISTORTION_ACCURACY_UM / (UM * left) * rms(zeros)
+    need = ACCURACY_UM / (UM * left) * rms(zeros)
     how = (
         f"{rendered(tests)}. The zero of W is wrong by {rms(zeros):.2f}″ RMS, as an operator leaves it. (3) instead "
-        f"of (2) leaves {UM * rms(np.array(alone)):.1f} µm. To keep {DISTORTION_ACCURACY_UM:g} µm by (1) and (2) the "
+        f"of (2) leaves {UM * rms(np.array(alone)):.1f} µm. To keep {ACCURACY_UM:g} µm by (1) and (2) the "
         f"zero has to be right to {need:.2f}″; the paper does not say how it is set."
     )
     reason = Explanation(

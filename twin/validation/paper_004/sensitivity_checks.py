@@ -11,12 +11,11 @@ from analysis.units import ARCSEC
 from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
 from twin.laboratory.distortion_run import DistortionRun, rms
-from twin.laboratory.printed_004 import DISTORTION_ACCURACY_UM, FIT_RMS_ARCSEC, TEST_POINTS
 from twin.validation.checks.check import REFUTED, Check, CheckResult, Explanation
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import Context
-from twin.validation.paper_004.orientation import SpotTest, rendered
-from twin.validation.paper_004.turntable_checks import dividing
+from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS, SpotTest, rendered
+from twin.validation.paper_004.turntable_checks import FIT_RMS_ARCSEC, dividing
 
 Array = NDArray[np.float64]
 FEW = 5
@@ -41,7 +40,7 @@ CHECKS = (
           tells=0.2, against="twice the bound", basis="chosen"),
     Check("004.sensitivity.requirement", "section 3.3", "A dividing error known to 0.2 arcsec RMS satisfies the "
           "distortion test: error of D with angles that err so much from point to point", "µm",
-          DISTORTION_ACCURACY_UM, 0.05, "half of the last printed digit", "at most", REFUTED,
+          ACCURACY_UM, 0.05, "half of the last printed digit", "at most", REFUTED,
           tells=2.3, against="twice the accuracy that the paper claims"),
 )  # fmt: skip
 
@@ -72,15 +71,15 @@ def judge_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterat
     for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
         top, bottom = rms(over[:, column]), rms(under[:, column])
         unit, scale = ("µm", UM) if column else ("mm", MM)
-        how = f"{count} tests of {TEST_POINTS} points; {len(half)} of them lie in the inner half: {scale * top:.3g} "
+        how = f"{count} tests of {POINTS} points; {len(half)} of them lie in the inner half: {scale * top:.3g} "
         how += f"against {scale * bottom:.3g} {unit} RMS."
         yield context.check(f"004.sensitivity.{name}").judge(top / bottom, _ratio(over, under, column), how, 1.0)
     few = np.array([[t.errors(t.turn, slice(k, None, FEW))[0] for k in range(FEW)] for t in tests])
     every = np.array([t.errors(t.turn, whole)[0] for t in tests])
     gain = rms(few) / rms(every)
     how = (
-        f"{count} tests, angles compensated: RMS error of f {MM * rms(every):.3f} mm with {TEST_POINTS} points, "
-        f"{MM * rms(few):.3f} mm with {TEST_POINTS // FEW}. Independent errors would gain {FEW**0.5:.2f}; what the "
+        f"{count} tests, angles compensated: RMS error of f {MM * rms(every):.3f} mm with {POINTS} points, "
+        f"{MM * rms(few):.3f} mm with {POINTS // FEW}. Independent errors would gain {FEW**0.5:.2f}; what the "
         "compensation leaves is common to neighbouring points and gains nothing."
     )
     yield context.check("004.sensitivity.points").judge(gain, None, how, 1.0)
@@ -103,7 +102,7 @@ def judge_angles(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         for angle in (lambda t: t.turn, lambda t: t.run.raw.fit.angle)
     )
     how = (
-        f"{len(tests)} tests, angles of {TEST_POINTS} points against the true ones: median {np.median(own):.3f}″; "
+        f"{len(tests)} tests, angles of {POINTS} points against the true ones: median {np.median(own):.3f}″; "
         f"angles as read {np.median(raw):.3f}″, largest {np.max(raw):.3f}″. What all points share is the zero, see "
         "004.eq1.constant."
     )
@@ -123,7 +122,7 @@ def _requirement(context: Context, tests: Sequence[SpotTest]) -> CheckResult:
     )
     text = (
         f"{FIT_RMS_ARCSEC:g}″ times f is more than twice the accuracy that is claimed, which needs "
-        f"{FIT_RMS_ARCSEC * DISTORTION_ACCURACY_UM / (UM * expected):.2f}″; the fits reach less (004.turntable.fit)."
+        f"{FIT_RMS_ARCSEC * ACCURACY_UM / (UM * expected):.2f}″; the fits reach less (004.turntable.fit)."
     )
     reason = Explanation(UM * expected, REFUTED, text)
     sigma = UM * expected / np.sqrt(2.0 * points * len(tests))

@@ -19,7 +19,6 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_turntable
 from scenes.specs.turntable_test import TurntableTestSpec
 from twin.laboratory.distortion_run import rms
-from twin.laboratory.printed_004 import CHAUVENET_RMS_ARCSEC, FIT_RMS_ARCSEC, REPEAT_RMS_ARCSEC, REPEATS
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.laboratory.turntable_run import run_turntable
@@ -27,9 +26,14 @@ from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, REFUTED, Check, CheckResult, Explanation, median_of
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.printed import load_printed
 
 Array = NDArray[np.float64]
 TEST = "turntable"
+REPEATS = load_printed("004").whole("turntable.repeats")
+REPEAT_RMS_ARCSEC = load_printed("004").number("turntable.repeat_rms_arcsec")
+CHAUVENET_RMS_ARCSEC = load_printed("004").number("turntable.chauvenet_rms_arcsec")
+FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
 """Turntables that are calibrated; quick."""
 FURTHER = 1.6
