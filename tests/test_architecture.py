@@ -269,6 +269,38 @@ def test_a_cycle_would_be_found() -> None:
         TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()
 
 
+def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and content of every text that a program can show: docstrings are none."""
+    silent = {
+        node.value
+        for body in (getattr(n, "body", []) for n in ast.walk(tree))
+        for node in (body if isinstance(body, list) else [])
+        if isinstance(node, ast.Expr)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in silent:
+            yield node.lineno, node.value
+
+
+OF_PAPERS = re.compile(r"\bpapers?\b|\bTable \d|\bFig\. \d", re.I)
+"""A command's help cites where its method is from, in a text that ends with it; results never speak of papers."""
+
+
+@pytest.mark.parametrize("room", ["analysis", "twin/laboratory", "twin/orbit"])
+def test_general_commands_know_no_paper(room: str) -> None:
+    """What papers print, and whether it holds, is said by the validation; docstrings cite them."""
+    files = sorted((ROOT / room).rglob("*.py"))
+    assert len(files) > 10
+    told = [
+        f"{path.relative_to(ROOT)}:{line}: {text[:60]!r}"
+        for path in files
+        if path.name != "__main__.py"
+        for line, text in texts(ast.parse(path.read_text("utf-8")))
+        if OF_PAPERS.search(text)
+    ]
+    assert not told, "\n".join(told)
+
+
 def test_folders_are_small_enough_to_look_through() -> None:
     count = Counter(path.parent.as_posix() for path in modules().values())
     assert {folder: number for folder, number in count.items() if number > MOST_FILES} == {}

@@ -180,7 +180,7 @@ def point_report(
             f" {1e6 * tolerance:.3g} um. {same}"
         )
     else:
-        text = f"{size}: not observable over {field}; {effect}; take p = 0 (paper 004, eq. 3). {same}"
+        text = f"{size}: not observable over {field}; {effect}; take p = 0 (eq. 3). {same}"
     return PointReport(value, sigma, fitted, observable, significant, edge, typical, text)
 
 

@@ -274,7 +274,7 @@ class OrbitCalibrationSpec(Spec):
         strip: tie points for an adjustment of every pass; None for none.
         launch: how much of a change is no surprise.
         limits: for the verdict.
-        repeats: campaigns over the same fields with everything drawn anew, for how often the paper's finding holds.
+        repeats: campaigns over the same fields with everything drawn anew, for what differs from one to the next.
         seed: of every random number.
     """
 

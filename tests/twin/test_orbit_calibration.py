@@ -207,13 +207,13 @@ def test_schemes(full) -> None:
     assert np.corrcoef(found, expected)[0, 1] > 0.9
 
 
-def test_the_papers_finding(full) -> None:
-    finding = full.finding
-    assert len(finding.plan) == 4
-    assert finding.plan[-1] < finding.plan[0]
-    assert finding.plan_spread[-1] < finding.plan_spread[0]
-    assert finding.height_change < 0.2
-    assert finding.holds
+def test_plan_improves_and_evens_out_with_more_fields_and_heights_stay(full) -> None:
+    means = full.scheme_means
+    assert len(means.plan) == 4
+    assert means.plan[-1] < means.plan[0]
+    assert means.plan_spread[-1] < means.plan_spread[0]
+    # three times the scatter of an RMS over 100 points, 7 %
+    assert means.height_change < 0.2
 
 
 # Effects on the light
@@ -436,7 +436,6 @@ def test_campaigns_are_flights_over_the_same_fields(full) -> None:
     schemes = schemes_tested(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
     # the campaigns count the noise of readings as independent: other weights, of little effect
     assert repeats.plan[1] == pytest.approx(np.array([values_of(e, "plan_rms") for e in schemes.values()]), abs=0.1)
-    assert repeats.share("holds") in (0.0, 0.5, 1.0)
     assert repeats.met(1e3, 1e3) == pytest.approx(1.0)
     assert repeats.met(1e-3, 1e3) == pytest.approx(0.0)
 
@@ -475,7 +474,7 @@ def test_command(full, tmp_path: Path) -> None:
     assert data["verdict"]["schemes"]["4"] is True
     assert "nadir x" in data["null_vectors"][0]["change"]
     tables = {"schemes", "plan", "height", "interior", "biases", "fields", "correlations", "third-differences"}
-    tables |= {"campaigns", "sentences", "repeatability", "bias-fits", "light", "light-pixels", "datum"}
+    tables |= {"campaigns", "repeatability", "bias-fits", "light", "light-pixels", "datum"}
     figures = {"schemes-of-fields", "bias-latitude", "correlation-matrix", "residuals", "check-points"}
     expected = {"manifest.json", "config.yaml", "calibration.json", "report.html"}
     expected |= {f"artefacts/{name}.csv" for name in tables} | {f"artefacts/{name}.svg" for name in figures}

@@ -22,7 +22,7 @@ from twin.orbit.calibration.repeatability import Repeatability, repeatability
 from twin.orbit.calibration.scheme_numbers import (
     CampaignNumbers,
     ErrorNumbers,
-    FindingNumbers,
+    MeanNumbers,
     MonitoringNumbers,
     StripNumbers,
     VerdictNumbers,
@@ -224,13 +224,11 @@ class RepeatabilityNumbers:
     scatter: float
     sigma: float
     p_value: float | None
-    paper: float
-    within_paper: bool
 
     @classmethod
     def of(cls, one: Repeatability) -> Self:
         """Of one parameter."""
-        return cls(one.name, unit(one.name), one.scatter, one.sigma, one.p_value, one.paper, one.holds)
+        return cls(one.name, unit(one.name), one.scatter, one.sigma, one.p_value)
 
 
 @dataclass(frozen=True)
@@ -327,7 +325,7 @@ class CalibrationNumbers:
     schemes: Mapping[str, Mapping[str, ErrorNumbers]]
     scheme_fields: Mapping[str, Sequence[str] | str]
     before: Mapping[str, ErrorNumbers]
-    finding: FindingNumbers | None
+    finding: MeanNumbers | None
     bias_latitude: Mapping[str, LatitudeNumbers]
     repeatability: Sequence[RepeatabilityNumbers]
     light: Sequence[LightNumbers]
@@ -342,7 +340,7 @@ class CalibrationNumbers:
     @classmethod
     def of(cls, run: CalibrationRun) -> Self:
         """Of a run."""
-        found, campaign, spec, way = run.together, run.campaign, run.campaign.spec, run.paper_way
+        found, campaign, spec, way = run.together, run.campaign, run.campaign.spec, run.stepwise
         limits = spec.limits
         return cls(
             seed=run.seed,
@@ -362,7 +360,7 @@ class CalibrationNumbers:
                 for k, scheme in enumerate(run.schemes)
             },
             before=ErrorNumbers.by_field(run.before),
-            finding=None if run.finding is None else FindingNumbers.of(run.finding),
+            finding=None if run.scheme_means is None else MeanNumbers.of(run.scheme_means),
             bias_latitude={f.axis: LatitudeNumbers.of(f) for f in run.latitude},
             repeatability=[RepeatabilityNumbers.of(r) for r in repeatability(run)],
             light=[LightNumbers.of(row) for row in run.light],

@@ -29,7 +29,7 @@ def calibration_report(run: CalibrationRun) -> Report:
     verdict = f"schemes {', '.join(good)}" if good else "no scheme"
     lead = (
         f"Before calibration {plan:.0f} m in plan and {height:.0f} m in height, mean of the fields' RMS. "
-        + said(run.finding),
+        + said(run.scheme_means),
         f"{limits.plan:g} m in plan and {limits.height:g} m in height, assumed for 1:50 000, are met in every field by "
         f"{verdict}.",
         *(() if run.monitoring is None else (bought(run.monitoring),)),

@@ -24,7 +24,7 @@ from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
 from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise, datum_rows, light_rows, surprises
 from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
-from twin.orbit.calibration.schemes import Finding, Repeats, repeated, schemes_tested, tested_before
+from twin.orbit.calibration.schemes import Repeats, SchemeMeans, repeated, schemes_tested, tested_before
 from twin.orbit.calibration.screening import screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
 from twin.run.procedure import Advance, BenchError, silent
@@ -64,10 +64,10 @@ class CalibrationRun:
             the drift of the biases during the passes.
         truth: (P,) true values of its unknowns.
         fields: name -> that field by itself.
-        paper_way: the first scheme's first field by the paper's stepwise solution.
+        stepwise: the first scheme's first field by the stepwise solution, bias and interior in turn.
         before: field -> errors with the laboratory's camera.
         schemes: scheme, "1" on -> field -> errors; the last lets each field use its own parameters.
-        finding: of the paper, judged; None for a single scheme of averaged parameters.
+        scheme_means: over the fields; None for a single scheme of averaged parameters.
         latitude: the biases against latitude, roll, pitch, yaw; empty for too few fields.
         light: what effects on the light do where they are left in.
         datum: what a wrong datum does.
@@ -83,10 +83,10 @@ class CalibrationRun:
     together: Adjustment
     truth: np.ndarray
     fields: Mapping[str, FieldResult]
-    paper_way: Stepwise
+    stepwise: Stepwise
     before: Mapping[str, CheckErrors]
     schemes: Mapping[str, Mapping[str, CheckErrors]]
-    finding: Finding | None
+    scheme_means: SchemeMeans | None
     latitude: tuple[LatitudeFit, ...]
     light: tuple[LightRow, ...]
     datum: tuple[DatumRow, ...]
@@ -132,7 +132,7 @@ def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
-    paper_way = stepwise([control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=STEPWISE_TOLERANCE)
+    in_turn = stepwise([control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=STEPWISE_TOLERANCE)
     alone = {name: result.adjustment for name, result in fields.items()}
     schemes = schemes_tested(campaign, alone)
     advance("calibration", parts - 3, parts)
@@ -147,10 +147,10 @@ def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun
         together,
         true_values(campaign, together.names),
         FrozenMap(fields),
-        paper_way,
+        in_turn,
         tested_before(campaign),
         schemes,
-        Finding.of(schemes),
+        SchemeMeans.of(schemes),
         latitude,
         light,
         datum,

@@ -24,7 +24,7 @@ from twin.orbit.calibration.field_sections import (
 )
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.scheme_numbers import meets
-from twin.orbit.calibration.schemes import RMS, STATEMENTS, Finding, Repeats, values_of
+from twin.orbit.calibration.schemes import RMS, Repeats, SchemeMeans, values_of
 from twin.orbit.calibration.strip import Strips
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table
 from twin.run.report import Section
@@ -232,7 +232,7 @@ def _schemes(run: CalibrationRun) -> Section:
     spec = run.campaign.spec
     limits = spec.limits
     tables = []
-    for name, number, what in zip(("plan", "height"), (6, 7), RMS, strict=True):
+    for name, what in zip(("plan", "height"), RMS, strict=True):
         columns = [values_of(run.before, what), *(values_of(e, what) for e in run.schemes.values())]
         rows: list[tuple[Cell, ...]] = [(field, *(float(c[k]) for c in columns)) for k, field in enumerate(run.before)]
         rows.append(("mean", *(float(c.mean()) for c in columns)))
@@ -241,8 +241,7 @@ def _schemes(run: CalibrationRun) -> Section:
             Table(
                 name,
                 f"RMS in {name} at check points without ground control, metres",
-                f"Fields and schemes as in Table {number} of the paper, whose numbers are not in the text that is "
-                "available.",
+                "Mean and standard deviation of the fields below.",
                 ("field", "laboratory", *(f"scheme {k}" for k in run.schemes)),
                 rows,
                 (None, *(2,) * len(columns)),
@@ -253,13 +252,13 @@ def _schemes(run: CalibrationRun) -> Section:
         f"and each scheme uses the mean of the parameters of its fields: {'; '.join(scheme_names(run))}. Check points "
         "are intersected from all three lines with these parameters and the measured orbit and attitude, without "
         "ground control.",
-        said(run.finding),
+        said(run.scheme_means),
         "What averaging changes are the biases of attitude, which differ from field to field and move all three lines "
         "alike: they act in plan. Heights depend on the difference between the outer lines, which the interior "
         "orientation holds and which hardly differs between fields; noise of the image and of the attitude makes the "
         "rest.",
-        f"Maps at 1:50 000: {limits.plan:g} m in plan and {limits.height:g} m in height, assumed in the file, for the "
-        f"paper prints none. Every field meets them by {_good(run)}; the laboratory's camera "
+        f"Maps at 1:50 000: {limits.plan:g} m in plan and {limits.height:g} m in height, assumed in the file. Every "
+        f"field meets them by {_good(run)}; the laboratory's camera "
         f"{'meets them, too' if meets(run.before, limits.plan, limits.height) else 'does not meet them'}.",
     )
     figures = (
@@ -281,28 +280,17 @@ def _good(run: CalibrationRun) -> str:
     return f"scheme{'s' * (len(good) > 1)} {', '.join(good)}" if good else "no scheme"
 
 
-def said(finding: Finding | None) -> str:
-    """Whether the paper's finding holds, with the numbers."""
-    if finding is None:
+def said(means: SchemeMeans | None) -> str:
+    """What averaging over more fields changes."""
+    if means is None:
         return "With one scheme of averaged parameters there is nothing to compare."
-    plan, spread, height = finding.plan, finding.plan_spread, finding.height
-    first = (
+    plan, spread, height = means.plan, means.plan_spread, means.height
+    return (
         f"The mean RMS in plan goes from {plan[0]:.2f} m with the first scheme to {plan[-1]:.2f} m with the last of "
         f"averaged parameters, its spread over the fields from {spread[0]:.2f} m to {spread[-1]:.2f} m; in height it "
         f"goes from {height[0]:.2f} m to {height[-1]:.2f} m and changes by "
-        f"{100.0 * finding.height_change:.1f}% at most."
+        f"{100.0 * means.height_change:.1f}% at most."
     )
-    if finding.holds:
-        return (
-            f"{first} The paper's finding holds: plan improves and evens out with more fields, height hardly changes."
-        )
-    parts = (
-        ("plan does not improve", finding.plan_improves),
-        ("plan does not even out", finding.plan_evens_out),
-        ("height changes by a fifth or more", finding.height_stays),
-    )
-    failed = ", ".join(text for text, good in parts if not good)
-    return f"{first} The paper's finding does not hold with these errors: {failed}."
 
 
 def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
@@ -334,29 +322,12 @@ def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
         rows,
         (None, 2, 2, 2, 2, 2, 2, None),
     )
-    judged: list[tuple[Cell, ...]] = []
-    for key, sentence in (*STATEMENTS.items(), ("holds", "all three")) if repeats.findings else ():
-        share = repeats.share(key)
-        # Wilson's interval of one sigma, which is not empty at 0 and 1
-        middle = (share + 0.5 / count) / (1.0 + 1.0 / count)
-        half = np.sqrt(share * (1.0 - share) / count + 0.25 / count**2) / (1.0 + 1.0 / count)
-        here = "yes" if getattr(run.finding, key) else "no"
-        judged.append((sentence, here, share, float(middle - half), float(middle + half)))
-    sentences = Table(
-        "sentences",
-        "The paper's sentences",
-        "First averaged scheme against the last. Share of the campaigns in which a sentence holds, with the interval "
-        "of one sigma that so many campaigns leave.",
-        ("sentence", "this campaign", "share", "from", "to"),
-        judged,
-        (None, None, 2, 2, 2),
-    )
     text = (
         "Biases, orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude stay. One "
         "campaign of seven fields may come out otherwise by the chance of its biases alone: when the one field of the "
         "first scheme happens to lie near the mean of all, averaging cannot improve on it.",
     )
-    return Section("Other campaigns", text, (sentences, table) if judged else (table,))
+    return Section("Other campaigns", text, (table,))
 
 
 def _parameters(run: CalibrationRun) -> Section:
@@ -420,7 +391,7 @@ def _parameters(run: CalibrationRun) -> Section:
 
 
 def _rank(run: CalibrationRun) -> Section:
-    found, way = run.together, run.paper_way
+    found, way = run.together, run.stepwise
     size = np.abs(np.triu(found.correlation, 1))
     size[~np.isfinite(size)] = 0.0
     order = np.argsort(size, axis=None)[::-1][:10]
@@ -432,7 +403,7 @@ def _rank(run: CalibrationRun) -> Section:
     text += [f"Weak, but solved for: {c}." for c in found.weak]
     state = "converges" if way.converged else "does not converge"
     text.append(
-        f"The paper's stepwise solution, bias and interior in turn, {state} for {run.campaign.spec.schemes[0][0]} in "
+        f"The stepwise solution, bias and interior in turn, {state} for {run.campaign.spec.schemes[0][0]} in "
         f"{way.rounds} rounds to steps of {STEPWISE_TOLERANCE:g} sigma; a round leaves {way.rate:.4f} of the slowest "
         "error. The simultaneous adjustment of all "
         f"fields takes {found.iterations} steps."
@@ -462,7 +433,7 @@ def _data(run: CalibrationRun) -> Section:
         rows.append((name, *map(float, orbit), *map(float, attitude)))
     table = Table(
         "third-differences",
-        "RMS of third differences, as Table 2 of the paper",
+        "RMS of third differences",
         "Measured positions in the Earth-fixed frame, metres; measured attitude against the orbital frame, arcseconds. "
         "White noise of one sigma gives the square root of 20. Biases and drifts do not show.",
         ("field", "x", "y", "z", "roll", "pitch", "yaw"),

@@ -1,4 +1,4 @@
-"""How well the parameters repeat from field to field, each calibrated by itself, against what paper 003 says."""
+"""How well the parameters repeat from field to field, each calibrated by itself."""
 
 from __future__ import annotations
 
@@ -8,16 +8,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.orbit.three_line_model import BIAS
-from analysis.units import ARCSEC
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.influences import INNER
-
-PAPER_INTERIOR = 1e-5
-"""Metres: "stable to 0.01 mm"."""
-PAPER_BIAS = ARCSEC
-"""Radians: the 1 arcsec class."""
-_CLASS = 3.0
-"""A scatter of the class of 1 arcsec lies below this many arcseconds."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +21,12 @@ class Repeatability:
         scatter: standard deviation over the fields.
         sigma: that the adjustments claim, root mean square; 0 where held.
         p_value: chance of such a scatter or a larger one if the parameter is the same in all fields; None where held.
-        paper: what the paper says.
-        holds: the scatter is within the paper's figure (interior), or of its class (bias).
     """
 
     name: str
     scatter: float
     sigma: float
     p_value: float | None
-    paper: float
-    holds: bool
 
 
 def repeatability(run: CalibrationRun) -> tuple[Repeatability, ...]:
@@ -57,7 +45,5 @@ def repeatability(run: CalibrationRun) -> tuple[Repeatability, ...]:
             weight = sigma**-2.0
             mean = float(np.sum(weight * value) / np.sum(weight))
             chance = float(chi2.sf(np.sum(weight * (value - mean) ** 2), len(value) - 1))
-        paper = PAPER_BIAS if name in BIAS else PAPER_INTERIOR
-        holds = scatter <= (_CLASS * paper if name in BIAS else paper)
-        found.append(Repeatability(name, scatter, claimed, chance, paper, holds))
+        found.append(Repeatability(name, scatter, claimed, chance))
     return tuple(found)

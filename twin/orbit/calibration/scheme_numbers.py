@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from analysis.orbit.forward_intersection import CheckErrors
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
-from twin.orbit.calibration.schemes import STATEMENTS, Finding, Repeats
+from twin.orbit.calibration.schemes import Repeats, SchemeMeans
 from twin.orbit.calibration.strip import Strips
 
 Array = NDArray[np.float64]
@@ -42,31 +42,18 @@ class ErrorNumbers:
 
 
 @dataclass(frozen=True)
-class FindingNumbers:
-    """Errors over the fields by scheme, and what they say."""
+class MeanNumbers:
+    """Errors over the fields by scheme."""
 
     plan_mean_m: Array
     plan_spread_m: Array
     height_mean_m: Array
     height_spread_m: Array
-    plan_improves: bool
-    plan_evens_out: bool
-    height_stays: bool
-    holds: bool
 
     @classmethod
-    def of(cls, finding: Finding) -> Self:
+    def of(cls, means: SchemeMeans) -> Self:
         """Of the schemes."""
-        return cls(
-            finding.plan,
-            finding.plan_spread,
-            finding.height,
-            finding.height_spread,
-            finding.plan_improves,
-            finding.plan_evens_out,
-            finding.height_stays,
-            finding.holds,
-        )
+        return cls(means.plan, means.plan_spread, means.height, means.height_spread)
 
 
 @dataclass(frozen=True)
@@ -82,10 +69,9 @@ class RepeatedScheme:
 
 @dataclass(frozen=True)
 class CampaignNumbers:
-    """Campaigns repeated with everything drawn anew; share: of those for which a statement holds."""
+    """Campaigns repeated with everything drawn anew."""
 
     count: int
-    share: Mapping[str, float] | None
     schemes: Mapping[str, RepeatedScheme]
 
     @classmethod
@@ -93,7 +79,6 @@ class CampaignNumbers:
         """Of the repeats, with the limits in metres."""
         return cls(
             count=len(repeats.plan),
-            share={key: repeats.share(key) for key in (*STATEMENTS, "holds")} if repeats.findings else None,
             schemes={
                 scheme: RepeatedScheme(
                     repeats.plan[:, k].mean(axis=1),
@@ -218,7 +203,7 @@ class VerdictNumbers:
             scale="1:50000",
             plan_limit_m=limits.plan,
             height_limit_m=limits.height,
-            source="of the file; the paper prints none",
+            source="of the file",
             before=meets(run.before, limits.plan, limits.height),
             schemes={k: meets(errors, limits.plan, limits.height) for k, errors in run.schemes.items()},
         )

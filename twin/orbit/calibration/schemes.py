@@ -1,5 +1,5 @@
-"""Schemes of averaged parameters, tested on all fields by forward intersection without ground control, and what paper
-003 says of them: on one campaign, and on campaigns repeated with everything drawn anew.
+"""Schemes of averaged parameters (paper 003, section 4.4), tested on all fields by forward intersection without ground
+control: on one campaign, and on campaigns repeated with everything drawn anew.
 """
 
 from __future__ import annotations
@@ -22,17 +22,10 @@ from twin.run.procedure import Advance
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup
 
-STATEMENTS = {
-    "plan_improves": "plan improves with more fields",
-    "plan_evens_out": "plan evens out with more fields",
-    "height_stays": "height hardly changes",
-}
-"""Of the paper, by the attribute of `Finding` that judges it."""
-
 
 @dataclass(frozen=True, eq=False)
-class Finding:
-    """The paper's finding, from the schemes of averaged parameters, fewest fields against most fields.
+class SchemeMeans:
+    """Errors of the schemes of averaged parameters over the fields, fewest fields first.
 
     Attributes:
         plan: mean over the fields of the RMS in plan, metres, each scheme.
@@ -46,7 +39,7 @@ class Finding:
     height_spread: np.ndarray
 
     @classmethod
-    def of(cls, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> Finding | None:
+    def of(cls, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> SchemeMeans | None:
         """None for a single scheme of averaged parameters.
 
         schemes: all of them; the last, each field its own, is not averaged and does not count.
@@ -57,29 +50,9 @@ class Finding:
         return cls(plan.mean(axis=1), plan.std(axis=1), height.mean(axis=1), height.std(axis=1))
 
     @property
-    def plan_improves(self) -> bool:
-        """The mean falls from the first scheme to the last."""
-        return bool(self.plan[-1] < self.plan[0])
-
-    @property
-    def plan_evens_out(self) -> bool:
-        """The spread over the fields falls from the first scheme to the last."""
-        return bool(self.plan_spread[-1] < self.plan_spread[0])
-
-    @property
     def height_change(self) -> float:
         """Largest change of the mean height error between schemes, relative to the first."""
         return float(np.ptp(self.height) / self.height[0])
-
-    @property
-    def height_stays(self) -> bool:
-        """It changes by less than a fifth, three times the scatter of an RMS over 100 points (7%)."""
-        return self.height_change < 0.2
-
-    @property
-    def holds(self) -> bool:
-        """All three parts."""
-        return self.plan_improves and self.plan_evens_out and self.height_stays
 
 
 _LEAST_SCHEMES = 3
@@ -95,17 +68,11 @@ class Repeats:
     Attributes:
         schemes: names, the last lets each field use its own parameters.
         plan, height: (N, schemes, fields) RMS at check points, metres.
-        findings: of each campaign; empty for a single scheme of averaged parameters.
     """
 
     schemes: tuple[str, ...]
     plan: np.ndarray
     height: np.ndarray
-    findings: tuple[Finding, ...]
-
-    def share(self, statement: str) -> float:
-        """Of the campaigns in which a statement of `STATEMENTS`, or ``holds``, is true."""
-        return float(np.mean([getattr(one, statement) for one in self.findings]))
 
     def met(self, plan: float, height: float) -> np.ndarray:
         """(schemes,) share of the campaigns in which every field is within limits, metres."""
@@ -156,7 +123,7 @@ def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Adv
         # what a correction leaves, 0.004 px, is no part of the scatter; flying without effects takes half of the time
         none = test.effects.model_copy(update=dict.fromkeys(EFFECTS, False))
         setup = setup.model_copy(update={"test": test.model_copy(update={"effects": none})})
-    plan, height, findings = [], [], []
+    plan, height = [], []
     names: tuple[str, ...] = ()
     for k, stream in enumerate(seed.spawn(count)):
         campaign = fly_fields(setup, stream).independent
@@ -164,10 +131,8 @@ def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Adv
         names = tuple(schemes)
         plan.append([values_of(e, "plan_rms") for e in schemes.values()])
         height.append([values_of(e, "height_rms") for e in schemes.values()])
-        if (finding := Finding.of(schemes)) is not None:
-            findings.append(finding)
         advance("campaigns", k + 1, count)
-    return Repeats(names, np.array(plan), np.array(height), tuple(findings)) if count else None
+    return Repeats(names, np.array(plan), np.array(height)) if count else None
 
 
 def averaged(
