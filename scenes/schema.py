@@ -15,6 +15,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
+from scenes.specs.autocollimator_test import AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.distortion_test import DistortionTestSpec
@@ -26,7 +27,6 @@ from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
-from scenes.specs.principle_experiment import PrincipleExperimentSpec
 from scenes.specs.study import StudySpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.turntable_test import TurntableTestSpec
@@ -40,7 +40,7 @@ MODELS: dict[str, type[Spec]] = {
     "camera_design": CameraDesignSpec,
     "detector": DetectorSpec,
     "error_budget": ErrorBudgetSpec,
-    "principle_experiment": PrincipleExperimentSpec,
+    "principle_experiment": AutocollimatorTestSpec,
     "focus_test": FocusTestSpec,
     "distortion_test": DistortionTestSpec,
     "turntable_test": TurntableTestSpec,

@@ -45,8 +45,8 @@ class ErrorBudgetSpec(Spec):
     Attributes:
         description: for people.
         instrument: which, by name or path.
-        photons_per_frame: light of one spot in one frame; weak, as what the paper states for a single image implies.
-        frames: averaged in one measurement, as in eq. (12).
+        photons_per_frame: light of one spot in one frame; weak, as noise of the centroid is a line.
+        frames: averaged in one measurement.
         trials: number of random states for each line.
         all_together: number of random states with all causes at once.
         angle_errors: prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.

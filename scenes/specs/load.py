@@ -8,6 +8,7 @@ scenes/library/payloads, scenes/lab (experiments on the ground) and scenes/orbit
 from pathlib import Path
 from typing import TypeVar
 
+from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.distortion_test import DistortionTestSpec
@@ -19,7 +20,6 @@ from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_scene import LineImageSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
-from scenes.specs.principle_experiment import PrincipleExperimentSpec, PrincipleSetup
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
@@ -111,14 +111,14 @@ def load_detector(name_or_path: str | Path, relative_to: str | Path | None = Non
     return _load(DetectorSpec, DETECTORS, name_or_path, relative_to)
 
 
-def load_principle_experiment(
+def load_autocollimator_test(
     name_or_path: str | Path = "principle_experiment", relative_to: str | Path | None = None
-) -> PrincipleSetup:
-    """Read a principle experiment and the data sheet of its area CCDs; arguments and errors as `load_instrument`."""
-    spec = _load(PrincipleExperimentSpec, LAB, name_or_path, relative_to)
+) -> AutocollimatorSetup:
+    """Read a test with two autocollimators and the data sheet of their CCDs; arguments, errors as `load_instrument`."""
+    spec = _load(AutocollimatorTestSpec, LAB, name_or_path, relative_to)
     reference = spec.autocollimator.area_ccd.detector
     detector = _find(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
-    return PrincipleSetup(spec, load_detector(detector))
+    return AutocollimatorSetup(spec, load_detector(detector))
 
 
 def load_turntable_test(

@@ -14,7 +14,7 @@ from analysis.monitor.autocollimator import (
     reading_of_normal,
     relation_factor,
 )
-from twin.validation.paper_001 import principle_rows as printed
+from twin.validation.paper_001 import table2 as printed
 
 ARCSEC = math.pi / 648000
 TWO_OVER_ROOT_3 = 2.0 / math.sqrt(3.0)

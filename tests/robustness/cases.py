@@ -17,7 +17,7 @@ from unittest.mock import patch
 import typer
 from rich.console import Console
 
-from scenes.specs.load import SCENES, load_error_budget, load_principle_experiment
+from scenes.specs.load import SCENES, load_autocollimator_test, load_error_budget
 from twin.design import app as design
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
@@ -72,7 +72,7 @@ bench = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @bench.command()
 def principle(file: Path, out: Annotated[Path | None, typer.Option()] = None) -> None:
     with explained(Console(stderr=True)):
-        load_principle_experiment(file)
+        load_autocollimator_test(file)
     raise Reached
 
 

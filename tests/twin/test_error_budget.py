@@ -12,10 +12,10 @@ from scenes.specs.job import JobSpec
 from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
+from twin.monitor.simulated_budget import LINES, BudgetLine, ErrorBudget, _shifts
 from twin.validate import app
 from twin.validation.paper_001.budget import propagated, root_sum_of_squares
-from twin.validation.paper_001.error_budget import CHECKS
-from twin.validation.paper_001.random_states import LINES, BudgetLine, ErrorBudget, _shifts
+from twin.validation.paper_001.budget_checks import CHECKS
 
 TRIALS = 40
 PRINTED = {c.id.rpartition(".")[2]: c.printed for c in CHECKS if c.id.startswith("001.table3") and c.printed}

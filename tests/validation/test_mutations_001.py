@@ -21,21 +21,20 @@ import pytest
 
 from analysis.monitor import autocollimator, intersection_angle, monitoring, recovery
 from analysis.units import ARCSEC
-from scenes.specs.load import load_principle_experiment
+from scenes.specs.load import load_autocollimator_test
+from twin.laboratory import autocollimator_bench
+from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
 from twin.validation.checks.check import REPRODUCED, UNDECIDED
 from twin.validation.checks.group import Context
 from twin.validation.paper_001 import (
     budget,
-    error_budget,
+    budget_checks,
     formulas,
     formulas_images,
     joint,
     monitored_errors,
-    principle,
-    principle_bench,
-    principle_rows,
+    table2,
 )
-from twin.validation.paper_001.principle_bench import Reader, run_principle_experiment
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -69,23 +68,23 @@ def groups(backend):
     """Name -> (group, module, what ``measured`` found): everything that is rendered, once."""
     experiments = {}
     out = {}
-    for module in (formulas, joint, error_budget):
+    for module in (formulas, joint, budget_checks):
         group = module.GROUP
         checks = {check.id: check for check in group.checks}
         chosen = set(checks)
-        if module is error_budget:
+        if module is budget_checks:
             # another instrument, and no formula is in it
             chosen -= {c for c in chosen if c.endswith("halved")}
         context = Context(backend, SEED, frozenset(chosen), checks, fast=True, experiments=experiments)
-        if module is error_budget:
+        if module is budget_checks:
             context.count = lambda full, fast: {60: 20, 80: 60}[fast]  # sigmas twice as large do for factors of two
         out[module.__name__.rpartition(".")[2]] = (module, module.measured(context), frozenset(chosen))
-    setup = load_principle_experiment()
+    setup = load_autocollimator_test()
     reader = Reader(setup, backend)
-    ideal = run_principle_experiment(setup, backend, seed=SEED, ideal=True, reader=reader)
-    real = tuple(run_principle_experiment(setup, backend, seed=SEED + n, reader=reader) for n in range(12))
-    ids = frozenset(principle.GROUP.ids)
-    out["principle"] = (principle, principle.Measured(setup, reader, ideal, real), ids)
+    ideal = run_autocollimator_test(setup, backend, seed=SEED, ideal=True, reader=reader)
+    real = tuple(run_autocollimator_test(setup, backend, seed=SEED + n, reader=reader) for n in range(12))
+    ids = frozenset(table2.GROUP.ids)
+    out["table2"] = (table2, table2.Measured(setup, reader, ideal, real), ids)
     return out
 
 
@@ -96,7 +95,7 @@ def turned(groups, backend, monkeypatch):
     def run(name):
         module, images, ids = groups[name]
         monkeypatch.setattr(module, "measured", lambda context: images)
-        monkeypatch.setattr(principle, "_show", lambda context, found: None)  # draws with one more trace
+        monkeypatch.setattr(table2, "_show", lambda context, found: None)  # draws with one more trace
         checks = run_checks([Selection(module.GROUP, ids)], backend, SEED, fast=True)
         assert not [r.how for r in checks.results if r.verdict == "failed"]
         return {result.id for result, _ in checks.unexpected}
@@ -167,7 +166,7 @@ def relation(change: Callable[[str, int, float, float], float]):
         def broken(axis, unit, between):
             return change(axis, unit, between, sound(axis, unit, between))
 
-        for module in (autocollimator, principle_bench, principle_rows):
+        for module in (autocollimator, autocollimator_bench, table2):
             patch.setattr(module, "relation_factor", broken)
 
     return apply
@@ -219,9 +218,9 @@ def by_factors() -> list[Mutation]:
         for what, change in (("twice", doubled), ("half", halved)):
             identifier = f"001.table5.{name}"
             turns = f"{identifier}.propagated"
-            out.append(Mutation(identifier, what, "error_budget", turns, factors("paper_single", row, change)))
+            out.append(Mutation(identifier, what, "budget_checks", turns, factors("paper_single", row, change)))
     turns = "001.table5.d_f.by_table1"
-    out.append(Mutation("001.table5.d_f", "(7)'s factor", "error_budget", turns, factors("paper_joint", D_F, doubled)))
+    out.append(Mutation("001.table5.d_f", "(7)'s factor", "budget_checks", turns, factors("paper_joint", D_F, doubled)))
     return out
 
 
@@ -277,30 +276,30 @@ MUTATIONS = (
              formula(recovery.intersection_angle, "exact", lambda sound: lambda f, b, lf, lb: sound(b, f, lf, lb))),
     Mutation("001.fig4", "twice", "joint", "001.fig4.angle",
              formula(intersection_angle, "exact", lambda sound: lambda f, b, lf, lb: twice_the(sound(f, b, lf, lb)))),
-    Mutation("001.eq12", "frames not averaged", "error_budget", "001.eq12.frames 001.table4.printed_lines",
+    Mutation("001.eq12", "frames not averaged", "budget_checks", "001.eq12.frames 001.table4.printed_lines",
              formula(budget, "frame_mean", lambda sound: lambda error, frames=9: error)),
-    Mutation("001.eq12", "divided by 9", "error_budget", "001.eq12.frames 001.table4.printed_lines",
+    Mutation("001.eq12", "divided by 9", "budget_checks", "001.eq12.frames 001.table4.printed_lines",
              formula(budget, "frame_mean", lambda sound: lambda error, frames=9: error / frames)),
-    Mutation("001.eq12", "plain sum", "error_budget",
+    Mutation("001.eq12", "plain sum", "budget_checks",
              "001.eq12 001.table4.printed_lines 001.table4.root_sum",
              formula(budget, "root_sum", lambda sound: plain_sum)),
-    Mutation("001.eq12", "twice", "error_budget", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
+    Mutation("001.eq12", "twice", "budget_checks", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
              formula(budget, "root_sum", scaled(2))),
-    Mutation("001.table4", "a quarter", "error_budget", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
+    Mutation("001.table4", "a quarter", "budget_checks", "001.eq12 001.table4.printed_lines 001.table4.root_sum",
              formula(budget, "root_sum", scaled(0.25))),
-    Mutation("001.table5.d_gamma", "spots taken as one", "error_budget",
+    Mutation("001.table5.d_gamma", "spots taken as one", "budget_checks",
              "001.table5.d_beta.propagated 001.table5.d_alpha.propagated 001.table5.d_gamma.propagated "
              "001.table5.d_f.propagated 001.table5.d_f.by_table1",
              formula(monitored_errors, "TABLE_4", lambda sound: sound * np.sqrt(2))),
-    Mutation("001.table2", "sine for cosine about Y", "principle", f"001.table2.y 001.table2.relation.y {LIMITS}",
+    Mutation("001.table2", "sine for cosine about Y", "table2", f"001.table2.y 001.table2.relation.y {LIMITS}",
              relation(lambda axis, unit, b, sound: np.sin(b) if (axis, unit) == ("Y", 2) else sound)),
-    Mutation("001.table2", "cosine for sine about Z", "principle",
+    Mutation("001.table2", "cosine for sine about Z", "table2",
              f"001.table2.z 001.table2.relation.z {LIMITS}",
              relation(lambda axis, unit, b, sound: np.cos(b) if (axis, unit) == ("Z", 2) else sound)),
-    Mutation("001.table2", "cosine about X", "principle", f"001.table2.x 001.table2.relation.x {LIMITS}",
+    Mutation("001.table2", "cosine about X", "table2", f"001.table2.x 001.table2.relation.x {LIMITS}",
              relation(lambda axis, unit, b, sound: np.cos(b) if (axis, unit) == ("X", 2) else sound)),
     *(
-        Mutation("001.table2", f"{name} about {axis}", "principle",
+        Mutation("001.table2", f"{name} about {axis}", "table2",
                  f"001.table2.{axis.lower()} 001.table2.relation.{axis.lower()} {LIMITS}",
                  relation(lambda a, unit, b, sound, axis=axis, by=by: by * sound if (a, unit) == (axis, 2) else sound))
         for axis in "XYZ"
@@ -312,7 +311,7 @@ MUTATIONS = (
 # --- the tests --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["formulas", "joint", "error_budget", "principle"])
+@pytest.mark.parametrize("name", ["formulas", "joint", "budget_checks", "table2"])
 def test_unbroken_every_verdict_is_the_expected_one(name, turned):
     assert turned(name) == set()
 
@@ -327,16 +326,16 @@ def test_worse_benches_do_not_keep_table_2(groups, backend, monkeypatch):
     """With 2.5 times the declared errors the mean difference is 0.9 arcsec, and six benches know it to 0.2 arcsec: no
     agreement with 0.5.
     """
-    _, found, _ = groups["principle"]
+    _, found, _ = groups["table2"]
     errors = found.setup.spec.errors
     worse = errors.model_copy(update={name: 2.5 * value for name, value in errors})
     setup = replace(found.setup, spec=found.setup.spec.model_copy(update={"errors": worse}))
-    real = tuple(run_principle_experiment(setup, backend, seed=SEED + n, reader=found.reader) for n in range(6))
-    images = principle.Measured(setup, found.reader, found.ideal, real)
-    monkeypatch.setattr(principle, "measured", lambda context: images)
-    monkeypatch.setattr(principle, "_show", lambda context, found: None)
+    real = tuple(run_autocollimator_test(setup, backend, seed=SEED + n, reader=found.reader) for n in range(6))
+    images = table2.Measured(setup, found.reader, found.ideal, real)
+    monkeypatch.setattr(table2, "measured", lambda context: images)
+    monkeypatch.setattr(table2, "_show", lambda context, found: None)
     ids = frozenset(LIMITS.split())
-    results = {r.id: r for r in run_checks([Selection(principle.GROUP, ids)], backend, SEED, fast=True).results}
+    results = {r.id: r for r in run_checks([Selection(table2.GROUP, ids)], backend, SEED, fast=True).results}
     within = results["001.table2.mean_error"]
     assert 0.5 < within.measured < within.printed + within.power  # agrees, but for its noise
     assert within.verdict == UNDECIDED
@@ -351,7 +350,7 @@ def test_every_formula_is_broken():
     assert broken == numbered | tables | {"001.table2", "001.table4", "001.fig4"}
     rows = {
         match.group()
-        for module in (formulas, joint, error_budget)
+        for module in (formulas, joint, budget_checks)
         for check in module.CHECKS
         for name in check.names
         if (match := re.match(r"001\.eq\d+", name))

@@ -1,1 +1,1 @@
-"""Laboratory tests of a camera, simulated: focal-plane alignment, distortion, turntable (paper 004)."""
+"""Laboratory tests, simulated: focal-plane alignment, distortion, turntable (paper 004); two autocollimators (001)."""

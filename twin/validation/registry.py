@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from scenes.yaml.errors import nearest
 from twin.validation.checks.group import CheckGroup, matches
 from twin.validation.paper_000 import groups as paper_000
-from twin.validation.paper_001 import error_budget, formulas, joint, principle, ranges
+from twin.validation.paper_001 import budget_checks, formulas, joint, ranges, table2
 from twin.validation.paper_003 import fields, model
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks, unprinted
 
@@ -18,8 +18,8 @@ GROUPS: tuple[CheckGroup, ...] = (
     formulas.GROUP,
     ranges.GROUP,
     joint.GROUP,
-    principle.GROUP,
-    error_budget.GROUP,
+    table2.GROUP,
+    budget_checks.GROUP,
     model.GROUP,
     fields.GROUP,
     focus_checks.GROUP,

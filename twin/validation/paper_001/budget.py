@@ -19,10 +19,10 @@ from scenes.specs.channel import BASE
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_job
+from twin.monitor.simulated_budget import LINES, BudgetLine, ErrorBudget, Together
 from twin.monitor.truth import line_points, trace_sight
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import load_printed
-from twin.validation.paper_001.random_states import LINES, BudgetLine, ErrorBudget, Together
 
 FRAMES = 9
 """Averaged in one measurement, (12)."""

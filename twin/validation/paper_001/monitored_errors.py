@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from analysis.units import ARCSEC
+from twin.monitor.simulated_budget import Together
 from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
 from twin.validation.checks.chosen import Chosen, Supposed
@@ -13,7 +14,6 @@ from twin.validation.checks.group import Context
 from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget
 from twin.validation.paper_001.budget import BudgetImages
-from twin.validation.paper_001.random_states import Together
 
 _PRINTED = load_printed("001")
 TABLE_4 = _PRINTED.number("table4.spot_arcsec") * ARCSEC

@@ -1,8 +1,7 @@
-"""Paper 001's error budget by its mechanisms: random states of each cause, rendered, measured, and turned into angles.
+"""A monitor's error budget by its mechanisms: random states of each cause, rendered, measured, and turned into angles.
 
-Table 3's lines are errors of one spot's position, as an angle: displacement / principal distance (that this is the
-meaning follows from Table 5, whose values are (12) times the factors of Table 1). Every line is 3 sigma here: three
-times the rms over random states, all spots and both axes.
+A line of the budget is the error of one spot's position by one cause, as an angle: displacement / principal distance.
+Every line is 3 sigma: three times the rms over random states, all spots and both axes.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ LINES = (
     "prism_0_rotation",
     "central_prism_thermal",
 )
-"""Table 3's seven lines, in the paper's order."""
+"""The causes: noise of the centroid, then what moves or warms; in the order of paper 001, Table 3."""
 
 ALLOWED = 0.1 * ARCSEC
 """Error of one line that the inverse view asks for, 3 sigma, radians."""
@@ -48,7 +47,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One line of Table 3 as simulated.
+    """One line as simulated.
 
     Attributes:
         name: one of LINES.
@@ -106,7 +105,7 @@ class ErrorBudget:
         return self.experiment.path.pitch / float(np.mean(distances))
 
     def line(self, name: str, progress: Progress = lambda fraction, text: None) -> BudgetLine:
-        """Simulate one line of Table 3.
+        """Simulate one line.
 
         Raises:
             ValueError: no such line.
@@ -178,7 +177,9 @@ class ErrorBudget:
                     turns[body] = Motion(rotate=triple(getattr(steady, f"{prism}_rotation")), pivot="centre")
 
     def grown_focal_planes(self) -> tuple[float, float]:
-        """True change of d_f when every focal plane is warmer by the input, 3 sigma, and what (7) reads, metres."""
+        """True change of d_f when every focal plane is warmer by the input, 3 sigma, and what paper 001, eq. (7)
+        reads, metres.
+        """
         experiment, change = self.experiment, Temperature(self.spec.steadiness.focal_plane_temperature)
         names = list(experiment.instrument.cameras)
         state = experiment.thermal.state({f"{BASE}/{camera}/focal_plane": change for camera in names})
@@ -227,7 +228,7 @@ class ErrorBudget:
         return out
 
     def _centroid_line(self) -> BudgetLine:
-        """Scatter of the paper's energy centroid in single frames, and the light at which it is 0.1 arcsec.
+        """Scatter of the energy centroid in single frames, and the light at which it is 0.1 arcsec.
 
         Between shot noise and read noise the scatter follows no power of the light: the allowed light is searched for.
         """

@@ -1,4 +1,4 @@
-"""The principle experiment's file, and the bench that is built from it."""
+"""The file of the test with two autocollimators, and the bench that is built from it."""
 
 import math
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
-from scenes.models.principle_model import (
+from scenes.models.autocollimator_model import (
     UNITS,
     autocollimator_body,
     axis_body,
@@ -18,22 +18,22 @@ from scenes.models.principle_model import (
     paraxial_focus,
     pinhole_body,
 )
-from scenes.specs.load import LAB, SCENES, library_names, load_principle_experiment
-from scenes.specs.principle_experiment import PrincipleExperimentSpec
+from scenes.specs.autocollimator_test import AutocollimatorTestSpec
+from scenes.specs.load import LAB, SCENES, library_names, load_autocollimator_test
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
-from twin.validation.paper_001.principle_images import AutocollimatorPath
+from twin.laboratory.autocollimator_images import AutocollimatorPath
 
 FILE = SCENES / LAB / "principle_experiment.yaml"
-SPEC = load_principle_experiment().spec
+SPEC = load_autocollimator_test().spec
 ANGLES = [math.radians(15), math.radians(30)]
 
 
 def test_the_file() -> None:
     assert "principle_experiment" in library_names(LAB)
-    setup = load_principle_experiment()
+    setup = load_autocollimator_test()
     assert setup.detector.name == setup.spec.autocollimator.area_ccd.detector == "autocollimator_ccd"
     programme = setup.spec.programme
     np.testing.assert_allclose(np.degrees([programme.small, programme.table, programme.large]), [0.01, 0.02, 0.03])
@@ -46,13 +46,13 @@ def test_the_file() -> None:
 
 
 def test_a_full_well_is_just_below_saturation() -> None:
-    detector = load_principle_experiment().detector
+    detector = load_autocollimator_test().detector
     full = detector.full_well_e * detector.system_gain_dn_per_e + detector.offset_dn
     assert 0.9 * 2**detector.bit_depth < full < 2**detector.bit_depth - 1
 
 
 def test_the_specification_reads_back() -> None:
-    again: Spec = validate(PrincipleExperimentSpec, parse_yaml(dump_yaml(SPEC.plain())))
+    again: Spec = validate(AutocollimatorTestSpec, parse_yaml(dump_yaml(SPEC.plain())))
     assert again == SPEC
     assert hash(again) == hash(SPEC)
 
@@ -162,10 +162,10 @@ def broken(tmp_path: Path, old: str, new: str) -> tuple[Path, int]:
 def test_mistakes(old: str, new: str, key: str | None, words: list[str], tmp_path: Path) -> None:
     path, line = broken(tmp_path, old, new)
     if key is None:  # a right file, so that the test's way of breaking it does not break it by itself
-        assert load_principle_experiment(path).spec != SPEC
+        assert load_autocollimator_test(path).spec != SPEC
         return
     with pytest.raises(InputError) as caught:
-        load_principle_experiment(path)
+        load_autocollimator_test(path)
     message = str(caught.value)
     assert message.startswith(f"{path}:{line}: {key}: ")
     for word in words:
@@ -175,7 +175,7 @@ def test_mistakes(old: str, new: str, key: str | None, words: list[str], tmp_pat
 def test_a_misspelt_key_is_told(tmp_path: Path) -> None:
     path, line = broken(tmp_path, "narrow: 15 deg", "narow: 15 deg")
     with pytest.raises(InputError) as caught:
-        load_principle_experiment(path)
+        load_autocollimator_test(path)
     unknown = next(issue for issue in caught.value.issues if issue.key == ("programme", "narow"))
     assert (unknown.line, unknown.suggestion) == (line, "narrow")
 
@@ -183,9 +183,9 @@ def test_a_misspelt_key_is_told(tmp_path: Path) -> None:
 def test_a_missing_key_is_told(tmp_path: Path) -> None:
     path, _ = broken(tmp_path, "  axis_tilt: 10 arcsec", "  # gone")
     with pytest.raises(InputError, match="'axis_tilt' is missing"):
-        load_principle_experiment(path)
+        load_autocollimator_test(path)
 
 
 def test_an_unknown_name() -> None:
     with pytest.raises(InputError, match="did you mean 'principle_experiment'"):
-        load_principle_experiment("principle_experimnt")
+        load_autocollimator_test("principle_experimnt")

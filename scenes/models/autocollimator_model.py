@@ -1,9 +1,7 @@
-"""From the principle experiment's YAML to the optical assembly: autocollimators, turntable, mirrors (paper 001, 3.1).
+"""From the YAML of a test with two autocollimators to the optical assembly: autocollimators, turntable, mirrors.
 
-Frames, all right-handed. System frame 1-XYZ of the paper: X up, Y horizontal, Z = X x Y along the view of
-autocollimator 1, from its lens to its mirror; the origin is where the turntable's three axes cross. (The paper calls Z
-"the turntable's axis". With X up and Y horizontal that can only be the one of its three axes that points along
-autocollimator 1's view.)
+Frames, all right-handed. System frame 1-XYZ (paper 001, section 3.1): X up, Y horizontal, Z = X x Y along the
+view of autocollimator 1, from its lens to its mirror; the origin is where the turntable's three axes cross.
 Frame 2-XYZ is frame 1 turned about X by b = 2 theta, so that
 
     Y1 = Y2 cos b - Z2 sin b,    Z1 = Y2 sin b + Z2 cos b.
@@ -28,7 +26,7 @@ from optics.materials.glass import glass
 from optics.raytrace.assembly import Assembly, Element, Interaction
 
 if TYPE_CHECKING:
-    from scenes.specs.principle_experiment import LensSpec, PrincipleExperimentSpec
+    from scenes.specs.autocollimator_test import AutocollimatorTestSpec, LensSpec
 
 BENCH = "bench"
 AXES = ("X", "Y", "Z")
@@ -85,14 +83,14 @@ class Bench:
         focal_length: of the autocollimators, paraxial, metres.
     """
 
-    spec: PrincipleExperimentSpec
+    spec: AutocollimatorTestSpec
     half_angle: float
     assembly: Assembly
     focal_length: float
 
     @property
     def between(self) -> float:
-        """Twice theta, the paper's b: the angle between the mirrors' normals, radians."""
+        """b, twice theta: the angle between the mirrors' normals, radians."""
         return 2.0 * self.half_angle
 
     @property
@@ -114,7 +112,7 @@ def paraxial_focus(lens: LensSpec, wavelength: float) -> tuple[float, float]:
     return -1.0 / leaving, -height / leaving
 
 
-def build_bench(spec: PrincipleExperimentSpec, half_angle: float) -> Bench:
+def build_bench(spec: AutocollimatorTestSpec, half_angle: float) -> Bench:
     """Build the bench with the mirrors square to their autocollimators.
 
     Args:
@@ -155,7 +153,7 @@ def build_bench(spec: PrincipleExperimentSpec, half_angle: float) -> Bench:
     return Bench(spec, half_angle, assembly, paraxial_focus(lens, collimator.wavelength)[0])
 
 
-def _autocollimator_bodies(spec: PrincipleExperimentSpec, unit: int, pose: Pose) -> list[Body]:
+def _autocollimator_bodies(spec: AutocollimatorTestSpec, unit: int, pose: Pose) -> list[Body]:
     """An autocollimator, its origin at the front vertex of the lens. Scaling it changes its focal length; the interior
     of the focal plane keeps its size.
     """

@@ -1,5 +1,5 @@
-"""The principle experiment of paper 001 (section 3.1): two digital autocollimators, two plane mirrors at an angle on a
-three-axis turntable, as a file in scenes/lab gives it.
+"""The test with two autocollimators, the principle experiment of paper 001 (section 3.1): both look at plane mirrors at
+an angle on a three-axis turntable. As a file in scenes/lab gives it.
 """
 
 import math
@@ -110,7 +110,7 @@ class MirrorsSpec(Spec):
 
 
 class StandSpec(Spec):
-    """One series of Table 2: about which half angle theta the mirrors stand for each axis, radians."""
+    """At which half angle theta the mirrors stand in the main series about each axis, radians."""
 
     X: HalfAngle
     Y: HalfAngle
@@ -122,9 +122,9 @@ class ProgrammeSpec(Spec):
 
     Attributes:
         steps: how many steps follow the first reading at zero.
-        small, table, large: the three step sizes, radians; `table` is the one of the printed Table 2.
+        small, table, large: the three step sizes, radians; `table` is the one of the main series.
         narrow, wide: the two half angles theta between the mirrors, radians.
-        stands: half angle of each axis in the printed Table 2, radians.
+        stands: half angle of each axis in the main series, radians.
     """
 
     steps: Annotated[Whole, Field(ge=1, le=100)]
@@ -156,8 +156,8 @@ class BenchErrorsSpec(Spec):
     mirror_mount: AngleSigma
 
 
-class PrincipleExperimentSpec(Spec):
-    """The principle experiment.
+class AutocollimatorTestSpec(Spec):
+    """The test with two autocollimators.
 
     Attributes:
         name: as the file is called.
@@ -176,7 +176,7 @@ class PrincipleExperimentSpec(Spec):
     errors: BenchErrorsSpec
 
     @model_validator(mode="after")
-    def _mirrors_fit(self) -> "PrincipleExperimentSpec":
+    def _mirrors_fit(self) -> "AutocollimatorTestSpec":
         least = min(self.programme.narrow, *self._stand_angles())
         # neighbouring rims touch where the mirrors' planes meet: at radius tan(theta) from either middle
         from_middle = self.mirrors.radius * math.tan(least)
@@ -202,13 +202,13 @@ class PrincipleExperimentSpec(Spec):
 
 
 @dataclass(frozen=True)
-class PrincipleSetup:
-    """A principle experiment with what its file refers to.
+class AutocollimatorSetup:
+    """A test with two autocollimators, with what its file refers to.
 
     Attributes:
-        spec: the experiment.
+        spec: the test.
         detector: data sheet of the area CCDs.
     """
 
-    spec: PrincipleExperimentSpec
+    spec: AutocollimatorTestSpec
     detector: DetectorSpec

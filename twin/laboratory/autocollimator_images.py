@@ -1,4 +1,4 @@
-"""Images of the principle experiment's autocollimators: pinhole, lens, mirror, lens, a window of the area CCD.
+"""Images of autocollimators that look at mirrors: pinhole, lens, mirror, lens, a window of the area CCD.
 
 As in ``twin.monitor.monitor_path``, rays from the pinhole are aimed at quadrature nodes of the smallest aperture, which
 is the mirror, traced back to the CCD, and summed as plane waves on the CCD's own pixels. Only the window that is read
@@ -26,7 +26,7 @@ from optics.raytrace.trace import BeamMissedError, Traced, make_rays, require_so
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pixel_response import PixelResponse
 from optics.waves.wavefront import eikonal
-from scenes.models.principle_model import UNITS, Bench, autocollimator_body, outgoing, pinhole_body, round_trip
+from scenes.models.autocollimator_model import UNITS, Bench, autocollimator_body, outgoing, pinhole_body, round_trip
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 AIM_TOLERANCE = 1e-9

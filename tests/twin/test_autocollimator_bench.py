@@ -1,11 +1,10 @@
-"""The rendered principle experiment: ideal relations from images against the exact trace, the scatter against the
-sigmas that are stated, the errors of the bench, and the table.
+"""The rendered bench with two autocollimators: ideal relations from images against the exact trace, the scatter against
+the sigmas that are stated, the errors of the bench, and the table.
 
 Chi-square tests have a false-alarm rate of 1e-4 each, two-sided; seeds are fixed, so that they pass or fail for good.
 """
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,25 +14,25 @@ from analysis.monitor.autocollimator import exact_reading, mirror_rotation, rela
 from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
 from optics.raytrace.trace import BeamMissedError
-from scenes.models.principle_model import UNITS, autocollimator_body, axis_body, mirror_body
-from scenes.specs.load import load_principle_experiment
-from scenes.specs.principle_experiment import BenchErrorsSpec, PrincipleSetup
-from twin.validation.paper_001 import principle_rows as printed
-from twin.validation.paper_001.principle import write_principle_figure
-from twin.validation.paper_001.principle_bench import (
-    PrincipleTable,
+from scenes.models.autocollimator_model import UNITS, autocollimator_body, axis_body, mirror_body
+from scenes.specs.autocollimator_test import AutocollimatorSetup, BenchErrorsSpec
+from scenes.specs.load import load_autocollimator_test
+from twin.laboratory.autocollimator_bench import (
     Reader,
+    ReadingTable,
     Series,
-    run_principle_experiment,
+    declared_spread,
+    run_autocollimator_test,
+    series_per_axis,
     states_of,
-    table_2,
     whole_programme,
 )
-from twin.validation.paper_001.principle_images import window_pattern
-from twin.validation.paper_001.principle_rows import declared_spread, principle_checks, printed_mean_difference
+from twin.laboratory.autocollimator_images import window_pattern
+from twin.validation.paper_001 import table2
+from twin.validation.paper_001.table2_figure import bench_png
 
 ARCSEC = math.pi / 648000
-SETUP = load_principle_experiment()
+SETUP = load_autocollimator_test()
 FALSE_ALARM = 1e-4
 
 
@@ -43,16 +42,16 @@ def reader(backend: Backend) -> Reader:
 
 
 @pytest.fixture(scope="module")
-def benches(reader: Reader, backend: Backend) -> list[PrincipleTable]:
+def benches(reader: Reader, backend: Backend) -> list[ReadingTable]:
     """Table 2 on five benches with all errors."""
-    return [run_principle_experiment(SETUP, backend, seed=seed, reader=reader) for seed in range(100, 105)]
+    return [run_autocollimator_test(SETUP, backend, seed=seed, reader=reader) for seed in range(100, 105)]
 
 
-def with_errors(**sigmas: float) -> PrincipleSetup:
+def with_errors(**sigmas: float) -> AutocollimatorSetup:
     """The experiment with these errors of the bench and no others."""
     zero = dict.fromkeys(BenchErrorsSpec.model_fields, 0.0)
     errors = BenchErrorsSpec.model_construct(**{**zero, **sigmas})
-    return PrincipleSetup(SETUP.spec.model_copy(update={"errors": errors}), SETUP.detector)
+    return AutocollimatorSetup(SETUP.spec.model_copy(update={"errors": errors}), SETUP.detector)
 
 
 def scatter_agrees(squares: float, freedom: int) -> bool:
@@ -62,7 +61,7 @@ def scatter_agrees(squares: float, freedom: int) -> bool:
 
 def test_ideal_images_satisfy_the_relations(reader: Reader, backend: Backend) -> None:
     series = whole_programme(SETUP.spec)
-    table = run_principle_experiment(SETUP, backend, series, ideal=True, reader=reader)
+    table = run_autocollimator_test(SETUP, backend, series, ideal=True, reader=reader)
     assert len(table.results) == 18
     for result in table.results:
         # exact to all orders, on both axes of both mirrors
@@ -88,7 +87,7 @@ def test_ideal_images_satisfy_the_relations(reader: Reader, backend: Backend) ->
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
 def test_spots_lie_where_the_exact_trace_sends_them(axis: str, reader: Reader) -> None:
     # no calibration in between: centroids of images against the mean of the traced rays, and eq. (1) on both
-    series = next(s for s in table_2(SETUP.spec) if s.axis == axis)
+    series = next(s for s in series_per_axis(SETUP.spec) if s.axis == axis)
     path = reader.path(series.half_angle)
     states = states_of(SETUP.spec, series, None)[::5]
     windows = path.windows(states)
@@ -121,7 +120,7 @@ def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None
     residual = np.array(places) - np.mean(places, axis=0)
     assert scatter_agrees(float(np.sum(residual**2 / np.mean(sigmas, axis=0))), 4 * (count - 1))
     # and the whole reading, fixed pattern and zero included
-    result = run_principle_experiment(
+    result = run_autocollimator_test(
         setup, backend, [Series("X", math.radians(15), math.radians(0.003), 100)], 4, reader=reader
     )["X"]
     off = result.from_exact[..., 1:, :]
@@ -136,7 +135,7 @@ def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None
 def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) -> None:
     series = Series("X", math.radians(15), math.radians(0.002), 100)
     setup = with_errors(reading=0.5 * ARCSEC, turntable_step=0.8 * ARCSEC)
-    result = run_principle_experiment(setup, backend, [series], 11, reader=reader)["X"]
+    result = run_autocollimator_test(setup, backend, [series], 11, reader=reader)["X"]
     off = result.from_exact[:, 1:, 0]
     noise = np.mean(result.sigma**2) / 2
     # the table's position is common to both mirrors, the unrest is not
@@ -152,12 +151,12 @@ def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) 
 
 
 def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend) -> None:
-    series = table_2(SETUP.spec)[0]
+    series = series_per_axis(SETUP.spec)[0]
     angle = series.angles[-1]
 
     def last(**sigmas: float) -> tuple[np.ndarray, dict[str, Motion]]:
         setup = with_errors(**sigmas)
-        result = run_principle_experiment(setup, backend, [series], 2, reader=reader)["X"]
+        result = run_autocollimator_test(setup, backend, [series], 2, reader=reader)["X"]
         return result.readings[:, -1], dict(states_of(setup.spec, series, 2)[-1])
 
     limit = 6 * 0.015 * ARCSEC  # six sigma of the images
@@ -184,7 +183,7 @@ def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend
 
 def test_errors_are_drawn_as_large_as_declared() -> None:
     e = SETUP.spec.errors
-    series = table_2(SETUP.spec)[0]
+    series = series_per_axis(SETUP.spec)[0]
     drawn: dict[str, list[float]] = {name: [] for name in BenchErrorsSpec.model_fields}
     for seed in range(300):
         zero, *_, last = states_of(SETUP.spec, series, seed)
@@ -203,7 +202,7 @@ def test_errors_are_drawn_as_large_as_declared() -> None:
 
 def test_seeds(reader: Reader, backend: Backend) -> None:
     first, again, other = (
-        run_principle_experiment(SETUP, backend, table_2(SETUP.spec)[:n], seed, reader=reader)
+        run_autocollimator_test(SETUP, backend, series_per_axis(SETUP.spec)[:n], seed, reader=reader)
         for n, seed in ((1, 1), (3, 1), (1, 2))
     )
     # a series does not depend on those run with it
@@ -221,30 +220,31 @@ def test_a_pixel_keeps_its_pattern_in_every_window(reader: Reader) -> None:
 
 def test_too_large_a_turn_is_told(reader: Reader, backend: Backend) -> None:
     with pytest.raises(BeamMissedError, match="does not fit on the area CCD"):
-        run_principle_experiment(
+        run_autocollimator_test(
             SETUP, backend, [Series("X", math.radians(15), math.radians(0.04), 10)], reader=reader, ideal=True
         )
 
 
-def test_the_checks(backend: Backend) -> None:
-    said: list[str] = []
-    checks = {c.id: c for c in principle_checks(SETUP, backend, benches=1, progress=said.append)}
-    assert list(checks) == ["001.table2.x", "001.table2.y", "001.table2.z", "001.table2.z_columns"]
-    assert said
-    for axis in "XYZ":
-        check = checks[f"001.table2.{axis.lower()}"]
-        assert check.printed == printed.MEAN_DIFFERENCE[axis] == pytest.approx(printed_mean_difference(axis), abs=6e-7)
-        assert 0.05 < check.measured < 1.5
-        assert 0.05 < check.sigma < 0.4
-        assert check.unit == "arcsec"
-    same = checks["001.table2.z_columns"]
-    assert same.printed < 5e-7
-    assert same.measured == pytest.approx(720, abs=4)
+def test_mean_differences(reader: Reader, benches: list[ReadingTable], backend: Backend) -> None:
+    ideal = run_autocollimator_test(SETUP, backend, ideal=True, reader=reader)
+    found = table2.mean_differences(SETUP.spec, ideal, benches[:1])
+    assert list(found) == ["X", "Y", "Z"]
+    for axis, one in found.items():
+        assert table2.MEAN_DIFFERENCE[axis] == pytest.approx(table2.printed_mean_difference(axis), abs=6e-7)
+        assert 0.05 < one.value < 1.5
+        assert 0.05 < one.sigma < 0.4
 
 
-def test_declared_spread_is_that_of_rendered_benches(benches: list[PrincipleTable]) -> None:
+def test_the_printed_columns_about_z_are_one() -> None:
+    (row,) = (check for check in table2.CHECKS if check.id == "001.table2.z_columns")
+    one, two = (np.array(mirror["Z"]) for mirror in (table2.MIRROR_1, table2.MIRROR_2))
+    assert row.printed == pytest.approx(np.max(np.abs(2 / math.sqrt(3) * one - two)), abs=5e-10)
+    assert row.printed < 5e-7  # half of the last printed digit
+
+
+def test_declared_spread_is_that_of_rendered_benches(benches: list[ReadingTable]) -> None:
     # mean differences against the distribution without images: their mean within 4 sigma, none absurd
-    for series in table_2(SETUP.spec):
+    for series in series_per_axis(SETUP.spec):
         spread = declared_spread(SETUP.spec, series, 0.011 * ARCSEC / math.sqrt(2))
         found = np.array([table[series.axis].mean_difference for table in benches])
         assert abs(found.mean() - spread.mean()) < 4 * spread.std() / math.sqrt(len(found))
@@ -262,26 +262,20 @@ def test_declared_spread_is_that_of_rendered_benches(benches: list[PrincipleTabl
 )
 def test_declared_spread_of_single_errors(error: str, sigma: float, x: float, z: float) -> None:
     spec = with_errors(**{error: sigma}).spec
-    for series, wanted in zip(table_2(spec)[::2], (x, z), strict=True):
+    for series, wanted in zip(series_per_axis(spec)[::2], (x, z), strict=True):
         mean = declared_spread(spec, series, 0.0).mean() / ARCSEC
         assert mean == pytest.approx(math.sqrt(2 / math.pi) * wanted, rel=0.05, abs=1e-3)
 
 
-def test_the_table_as_the_paper_prints_it(reader: Reader, benches: list[PrincipleTable], tmp_path: Path) -> None:
+def test_columns_follow_the_table_and_the_picture_is_drawn(reader: Reader, benches: list[ReadingTable]) -> None:
     table = benches[0]
-    plain = table.to_dict()
-    assert [s["axis"] for s in plain["series"]] == ["X", "Y", "Z"]
-    assert [s["mirror_2_scale"] for s in plain["series"]] == pytest.approx([1, 2 / math.sqrt(3), 2 / math.sqrt(3)])
-    for series in plain["series"]:
-        angles = [row["angle_arcsec"] for row in series["rows"]]
-        assert angles == pytest.approx(printed.ANGLES)
-        for row in series["rows"]:
-            assert row["scaled_mirror_2_arcsec"] == pytest.approx(row["angle_arcsec"], abs=3)
-            wanted = 0.0 if series["axis"] == "Z" else row["angle_arcsec"]
-            assert row["mirror_1_arcsec"] == pytest.approx(wanted, abs=3)
-    assert len(table.text().splitlines()) == 13
+    assert [r.series.axis for r in table.results] == ["X", "Y", "Z"]
+    assert [r.scale for r in table.results] == pytest.approx([1, 2 / math.sqrt(3), 2 / math.sqrt(3)])
+    for result in table.results:
+        assert result.series.angles / ARCSEC == pytest.approx(table2.ANGLES)
+        first, second = (column / ARCSEC for column in result.columns)
+        assert second == pytest.approx(table2.ANGLES, abs=3)
+        assert first == pytest.approx(np.zeros(11) if result.series.axis == "Z" else table2.ANGLES, abs=3)
     with pytest.raises(KeyError):
         table["W"]
-    place = tmp_path / "principle.png"
-    write_principle_figure(reader, benches, place)
-    assert place.read_bytes().startswith(b"\x89PNG")
+    assert bench_png(reader, benches).startswith(b"\x89PNG")

@@ -8,6 +8,7 @@ from math import hypot, log, sqrt
 from matplotlib.ticker import FuncFormatter
 
 from analysis.units import ARCSEC
+from twin.monitor.simulated_budget import BudgetLine
 from twin.run.artefact import Cell, Data, SvgFigure, Table
 from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult
@@ -16,7 +17,6 @@ from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget, monitored_errors
 from twin.validation.paper_001.budget import FEW_DRAWS, BudgetImages
-from twin.validation.paper_001.random_states import BudgetLine
 
 
 def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:

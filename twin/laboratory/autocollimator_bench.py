@@ -1,16 +1,15 @@
-"""Paper 001's principle experiment (section 3.1) on its bench, and Table 2 from its images.
+"""Two autocollimators that look at two mirrors on a turntable: the bench with its errors, and its readings from images.
 
 The bench's errors are motions of bodies. They are drawn from the seed and applied to the scene alone: the analysis
 reads the frames with the calibration of the ideal autocollimator and the angles that the turntable and the mirrors
-*should* have. Each series begins with a reading at zero that is taken off all others, as the paper's did (its first row
-reads 0.03 to 0.15 arcsec, so that it is a second reading at zero).
+*should* have. Each series begins with a reading at zero that is taken off all others, and its first row is a
+second reading at zero, which shows the unrest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -29,10 +28,10 @@ from analysis.units import ARCSEC
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import Backend
-from scenes.models.principle_model import UNITS, autocollimator_body, axis_body, build_bench, ccd_body, mirror_body
-from scenes.specs.principle_experiment import PrincipleExperimentSpec, PrincipleSetup
+from scenes.models.autocollimator_model import UNITS, autocollimator_body, axis_body, build_bench, ccd_body, mirror_body
+from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
+from twin.laboratory.autocollimator_images import AutocollimatorPath, SpotWindows, window_pattern
 from twin.sensors.area_detector import EmvaDetector
-from twin.validation.paper_001.principle_images import AutocollimatorPath, SpotWindows, window_pattern
 
 
 @dataclass(frozen=True)
@@ -79,13 +78,15 @@ class SeriesResult:
 
     @property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mirror 1 and scaled mirror 2 as in Table 2, (rows,) each, radians."""
+        """Mirror 1 and scaled mirror 2, (rows,) each, radians."""
         component = column_component(self.series.axis)
         return self.readings[0, :, component], self.scale * self.readings[1, :, component]
 
     @property
     def mean_difference(self) -> float:
-        """Last line of Table 2, radians: X and Y mirror 1 - scaled mirror 2, Z the turntable - scaled mirror 2."""
+        """Mean size, radians, of mirror 1 - scaled mirror 2; about Z, where mirror 1 shows nothing, of the turntable -
+        scaled mirror 2.
+        """
         first, second = self.columns
         return mean_difference(self.series.angles if self.series.axis == "Z" else first, second)
 
@@ -97,7 +98,7 @@ class SeriesResult:
 
 
 @dataclass(frozen=True, eq=False)
-class PrincipleTable:
+class ReadingTable:
     """All series of one run of the experiment, and the seed that its errors and noise come from."""
 
     results: tuple[SeriesResult, ...]
@@ -110,54 +111,25 @@ class PrincipleTable:
                 return result
         raise KeyError(axis)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data: every number in the unit that its key ends in."""
-        out = []
-        for result in self.results:
-            first, second = result.columns
-            out.append(
-                {
-                    "axis": result.series.axis,
-                    "theta_deg": float(np.degrees(result.series.half_angle)),
-                    "step_arcsec": result.series.step / ARCSEC,
-                    "mirror_2_scale": result.scale,
-                    "rows": [
-                        {"angle_arcsec": a, "mirror_1_arcsec": m1, "scaled_mirror_2_arcsec": m2}
-                        for a, m1, m2 in (np.stack([result.series.angles, first, second], -1) / ARCSEC).tolist()
-                    ],
-                    "image_sigma_arcsec": float(np.max(result.sigma) / ARCSEC),
-                    "mean_difference_arcsec": result.mean_difference / ARCSEC,
-                }
-            )
-        return {"seed": self.seed, "series": out}
-
-    def text(self) -> str:
-        """The table as the paper prints it, arcsec; all series need the same number of steps."""
-        heads = [f"{r.series.axis}: mirror 1 {r.scale:9.6f}*mirror 2" for r in self.results]
-        lines = [f"{'angle':>9} " + " ".join(f"{head:>29}" for head in heads)]
-        for i in range(len(self.results[0].series.angles)):
-            cells = ["{:>12.4f} {:>16.4f}".format(*(c[i] / ARCSEC for c in r.columns)) for r in self.results]
-            lines.append(f"{self.results[0].series.angles[i] / ARCSEC:9.1f} " + " ".join(cells))
-        cells = [f"{r.mean_difference / ARCSEC:29.6f}" for r in self.results]
-        return "\n".join([*lines, f"{'mean |d|':>9} " + " ".join(cells)])
-
 
 AIRY_RADII = 4.0
 """Radius of the centroid's window in radii of the first dark ring."""
 CALIBRATION_POINTS = 9
 """Turns about each axis at which an autocollimator is calibrated."""
+DRAWS = 4000
+"""Benches without images from which a spread is taken."""
 _BENCH, _PATTERN, _READINGS, _FRAMES = range(4)
 """Numbers of the seed's random streams."""
 
 
-def table_2(spec: PrincipleExperimentSpec) -> tuple[Series, ...]:
-    """The three series that the paper prints."""
+def series_per_axis(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:
+    """The main series: one about each axis."""
     p = spec.programme
     return tuple(Series(axis, getattr(p.stands, axis), p.table, p.steps) for axis in AXES)
 
 
-def whole_programme(spec: PrincipleExperimentSpec) -> tuple[Series, ...]:
-    """All series that the paper reports to have measured: three axes, two half angles, three steps."""
+def whole_programme(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:
+    """All series of the programme: three axes, two half angles, three steps."""
     p = spec.programme
     return tuple(
         Series(axis, half_angle, step, p.steps)
@@ -167,21 +139,21 @@ def whole_programme(spec: PrincipleExperimentSpec) -> tuple[Series, ...]:
     )
 
 
-def run_principle_experiment(
-    setup: PrincipleSetup,
+def run_autocollimator_test(
+    setup: AutocollimatorSetup,
     backend: Backend,
     series: Sequence[Series] | None = None,
     seed: int = 0,
     ideal: bool = False,
     reader: Reader | None = None,
     progress: Callable[[str], None] | None = None,
-) -> PrincipleTable:
+) -> ReadingTable:
     """Render and read the experiment.
 
     Args:
         setup: the experiment with its detector.
         backend: where to trace.
-        series: what to turn; by default Table 2. Those of one half angle are traced together.
+        series: what to turn; by default one series about each axis. Those of one half angle are traced together.
         seed: of the bench's errors and the detectors' noise.
         ideal: no errors of the bench, and images without noise or rounding.
         reader: of an earlier run of the same setup, to save the calibration.
@@ -190,7 +162,7 @@ def run_principle_experiment(
     Raises:
         BeamMissedError: a turn takes a spot off its area CCD.
     """
-    wanted = tuple(table_2(setup.spec) if series is None else series)
+    wanted = tuple(series_per_axis(setup.spec) if series is None else series)
     say = progress or (lambda text: None)
     if reader is None:
         say("calibrate the autocollimators")
@@ -207,10 +179,10 @@ def run_principle_experiment(
             first = part.stop
             own = SpotWindows(windows.photons[:, part], windows.corner[:, part])
             done[s] = reader.read(s, own, None if ideal else seed)
-    return PrincipleTable(tuple(done[s] for s in wanted), seed)
+    return ReadingTable(tuple(done[s] for s in wanted), seed)
 
 
-def states_of(spec: PrincipleExperimentSpec, series: Series, seed: int | None) -> list[State]:
+def states_of(spec: AutocollimatorTestSpec, series: Series, seed: int | None) -> list[State]:
     """The reading at zero and all rows of a series as states of the bench, with errors drawn from the seed.
 
     Errors of the bench are the same in all series of a seed, except how the mirrors are mounted: they are set anew for
@@ -245,6 +217,43 @@ def states_of(spec: PrincipleExperimentSpec, series: Series, seed: int | None) -
     return out
 
 
+def declared_spread(
+    spec: AutocollimatorTestSpec, series: Series, image_sigma: float, draws: int = DRAWS, seed: int = 0
+) -> np.ndarray:
+    """Mean differences of a series, (draws,), radians, under the errors that the scene declares, without images.
+
+    Args:
+        spec: the experiment.
+        series: one of its series.
+        image_sigma: standard deviation of one reading by the noise of the images, radians.
+        draws: number of benches.
+        seed: of the draws.
+    """
+    e, rng = spec.errors, np.random.default_rng(seed)
+    between = 2.0 * series.half_angle
+    angles = np.broadcast_to(series.angles, (draws, series.steps + 1)).copy()
+    angles[:, 1:] += e.turntable_step * rng.standard_normal((draws, series.steps))
+    k = AXES.index(series.axis)
+    axis = np.where(np.arange(3) == k, 1.0, e.axis_tilt * rng.standard_normal((draws, 3)))
+    turn = rotation_matrix(angles[..., None] * (axis / np.linalg.norm(axis, axis=1, keepdims=True))[:, None])
+    columns = []
+    for unit in UNITS:
+        frame = rotation_matrix(np.array([between if unit == 2 else 0.0, 0.0, 0.0]))
+        mount = rotation_matrix(e.mirror_mount * rng.standard_normal((draws, 3)) * [1.0, 1.0, 0.0])
+        start = mount @ np.array([0.0, 0.0, -1.0])
+        normal = np.einsum("xi,drxy,yj,dj->dri", frame, turn, frame, start, optimize=True)
+        reading = reading_of_normal(normal) - reading_of_normal(start)[:, None]
+        roll = rotation_matrix(e.ccd_rotation * rng.standard_normal((draws, 1)) * [0.0, 0.0, 1.0])[:, :2, :2]
+        reading = np.einsum("dij,drj->dri", roll, reading)[..., column_component(series.axis)]
+        reading *= 1.0 + e.focal_length * rng.standard_normal((draws, 1))
+        # the reading at zero is common to all rows; image_sigma already holds its share
+        unrest = e.reading * rng.standard_normal((draws, series.steps + 2))
+        reading += unrest[:, 1:] - unrest[:, :1] + image_sigma * rng.standard_normal(reading.shape)
+        columns.append(reading)
+    first = series.angles if series.axis == "Z" else columns[0]
+    return np.asarray(np.mean(np.abs(first - columns[1] / relation_factor(series.axis, 2, between)), axis=1))
+
+
 def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
@@ -260,7 +269,7 @@ class Reader:
         map: the calibration, from the place of a spot to the turn of the mirror.
     """
 
-    def __init__(self, setup: PrincipleSetup, backend: Backend) -> None:
+    def __init__(self, setup: AutocollimatorSetup, backend: Backend) -> None:
         self.spec = setup.spec
         self.backend = backend
         self.exposure: float = setup.spec.autocollimator.area_ccd.exposure
