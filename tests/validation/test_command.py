@@ -51,7 +51,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check(identifier: str = "001.table3.a", printed: float | None = 1.0, tolerance: float = 0.1, **more) -> Check:
-    told = {"tells": 0.5, "against": "half"} | more
+    told = {"separation": 0.5, "alternative": "half"} | more
     return Check(identifier, "Table 3", f"Statement of {identifier}", "arcsec", printed, tolerance, "a reason", **told)
 
 
@@ -59,7 +59,7 @@ def answers(context: Context):
     """A group that finds every check to hold, and adds one artefact of each kind."""
     for k, identifier in enumerate(sorted(context.selected)):
         context.progress(k / len(context.selected), f"do {identifier}")
-        yield context.check(identifier).judge(1.02, 0.01, "Thought about it.")
+        yield context.check(identifier).evaluate(1.02, 0.01, "Thought about it.")
     context.add(SvgFigure("drawing", "A drawing", "Of nothing.", "<svg viewBox='0 0 1 1'><g id='mark'/></svg>"))
     context.add(PngFigure("picture", "A picture", "Of less.", PNG))
     context.add(Table("numbers", "Some numbers", "Three.", ("name [arcsec]", "value"), [("a<b", 0.5), ("c", None)]))
@@ -70,7 +70,7 @@ def answers(context: Context):
 
 def breaks(context: Context):
     """A group that answers the first of its checks and then fails."""
-    yield context.check(min(context.selected)).judge(1.0, None, "Easy.")
+    yield context.check(min(context.selected)).evaluate(1.0, None, "Easy.")
     raise ValueError("no light\non the detector")
 
 
@@ -218,7 +218,7 @@ CAMERA = Explanation(3.0, REFUTED, "The camera is another one.")
     ],
 )
 def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
-    result = check().judge(measured, sigma, "Measured.", explanations=[FAULT, CAMERA])
+    result = check().evaluate(measured, sigma, "Measured.", explanations=[FAULT, CAMERA])
     assert result.verdict == verdict
     assert (result.measured, result.sigma, result.printed) == (measured, sigma, 1.0)
     assert ("factor 2 is missing" in result.how) == (verdict == CORRECTED)
@@ -233,18 +233,18 @@ def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
 )
 def test_claims_of_a_limit(comparison, low, high):
     claim = check(comparison=comparison)
-    assert claim.judge(0.5, None, "").verdict == low
-    assert claim.judge(1.5, None, "").verdict == high
-    assert claim.judge(1.05, None, "").verdict == claim.judge(0.95, None, "").verdict == CONFIRMED
+    assert claim.evaluate(0.5, None, "").verdict == low
+    assert claim.evaluate(1.5, None, "").verdict == high
+    assert claim.evaluate(1.05, None, "").verdict == claim.evaluate(0.95, None, "").verdict == CONFIRMED
 
 
 def test_a_number_that_is_not_printed_needs_one_that_is_implied():
     silent = check(printed=None)
     with pytest.raises(ValueError, match="implied"):
-        silent.judge(1.0, None, "")
-    result = silent.judge(1.0, None, "", implied=1.05)
+        silent.evaluate(1.0, None, "")
+    result = silent.evaluate(1.0, None, "", implied=1.05)
     assert (result.printed, result.verdict) == (None, CONFIRMED)
-    assert silent.judge(1.0, None, "", implied=1.2).verdict == REFUTED
+    assert silent.evaluate(1.0, None, "", implied=1.2).verdict == REFUTED
 
 
 def test_what_the_text_does_not_print_is_not_checked():
@@ -262,8 +262,8 @@ def test_another_verdict_than_the_expected_one_fails_the_command(fake, tmp_path)
     """A finding of earlier work that is no longer found is as much of a surprise as a claim that no longer holds."""
 
     def run_both(context: Context):
-        yield context.check("001.eq5").judge(1.0, None, "Right as printed.")
-        yield context.check("001.eq7").judge(2.0, None, "Twice.", explanations=[FAULT])
+        yield context.check("001.eq5").evaluate(1.0, None, "Right as printed.")
+        yield context.check("001.eq7").evaluate(2.0, None, "Twice.", explanations=[FAULT])
 
     known = (check("001.eq5", expected=CORRECTED), check("001.eq7", expected=CORRECTED))
     fake(CheckGroup("001.formulas", "Formulas", 1.0, known, run_both))
@@ -278,7 +278,7 @@ def test_another_verdict_than_the_expected_one_fails_the_command(fake, tmp_path)
 
 def test_a_fast_run_makes_fewer_trials(fake):
     def trials(context: Context):
-        yield context.check("001.table4").judge(context.count(full=100, fast=7), None, "Counted.")
+        yield context.check("001.table4").evaluate(context.count(full=100, fast=7), None, "Counted.")
 
     (one,) = group("001.table4", "").checks
     fake(CheckGroup("001.table4", "", 600.0, (one,), trials, fast_seconds=5.0))
@@ -296,22 +296,22 @@ def test_a_fast_run_makes_fewer_trials(fake):
 )
 def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, corrected):
     """0.1 + 3 sigma against the 0.5 to half of it."""
-    result = check().judge(1.0, sigma, "")
+    result = check().evaluate(1.0, sigma, "")
     assert result.verdict == verdict
     assert result.power == pytest.approx(0.1 + 3 * sigma)
     assert ("half is 0.5 away" in result.how) == (verdict == UNDECIDED)
-    assert check().judge(2.0, sigma, "", explanations=[FAULT]).verdict == corrected
+    assert check().evaluate(2.0, sigma, "", explanations=[FAULT]).verdict == corrected
     # what does not agree is found, however weak the row
-    assert check().judge(3.0, sigma, "", explanations=[CAMERA]).verdict == REFUTED
+    assert check().evaluate(3.0, sigma, "", explanations=[CAMERA]).verdict == REFUTED
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"tells": None}, "what the row tells"),
-        ({"tells": 0.0}, "what the row tells"),
-        ({"against": ""}, "what the row tells"),
-        ({"tells": 0.09}, "can never tell"),
+        ({"separation": None}, "what the row tells"),
+        ({"separation": 0.0}, "what the row tells"),
+        ({"alternative": ""}, "what the row tells"),
+        ({"separation": 0.09}, "can never tell"),
         ({"basis": "theory"}, "a theory is named"),
         ({"theory": "optics"}, "a theory is named"),
         ({"basis": "theory", "theory": "optics"}, "nothing is printed"),
@@ -321,21 +321,21 @@ def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, correct
 def test_a_row_says_beforehand_what_it_tells(more, words):
     with pytest.raises(ValueError, match=words):
         check(**more)
-    assert check(expected=NOT_CHECKABLE, tells=None, against="").tells is None
+    assert check(expected=NOT_CHECKABLE, separation=None, alternative="").separation is None
 
 
 def test_the_verdict_of_agreement_is_that_of_the_rows_basis():
     reproduced, theory = check(basis="chosen"), check(printed=None, basis="theory", theory="optics")
     light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
-    result = reproduced.judge(1.0, None, "", inputs=[light])
+    result = reproduced.evaluate(1.0, None, "", inputs=[light])
     assert (check().expected, reproduced.expected, theory.expected) == (CONFIRMED, REPRODUCED, CONSISTENT)
     assert result.verdict == REPRODUCED
-    assert theory.judge(1.0, None, "", 1.0).verdict == CONSISTENT
-    assert reproduced.judge(2.0, None, "", inputs=[light]).verdict == REFUTED
+    assert theory.evaluate(1.0, None, "", 1.0).verdict == CONSISTENT
+    assert reproduced.evaluate(2.0, None, "", inputs=[light]).verdict == REFUTED
     with pytest.raises(ValueError, match="inputs"):
-        reproduced.judge(1.0, None, "")
+        reproduced.evaluate(1.0, None, "")
     with pytest.raises(ValueError, match="inputs"):
-        check().judge(1.0, None, "", inputs=[light])
+        check().evaluate(1.0, None, "", inputs=[light])
 
 
 @pytest.mark.parametrize(
@@ -353,14 +353,14 @@ def test_how_far_a_chosen_input_can_move_before_the_row_fails(comparison, power,
     """Tolerance 0.1 and 3 sigma of 0.1 / 3 about a printed 1, all of it measured at an input of 5 mK."""
     row = check(basis="chosen", comparison=comparison)
     chosen = Chosen.power("heat", 5.0, "mK", 1.0, power)
-    (found,) = row.judge(1.0, 0.1 / 3, "", inputs=[chosen]).inputs
+    (found,) = row.evaluate(1.0, 0.1 / 3, "", inputs=[chosen]).inputs
     for end, expected in ((found.low, low), (found.high, high)):
         assert end == (None if expected is None else pytest.approx(5.0 * expected, rel=1e-5))
     # there it does fail
     for end, step in ((found.low, 0.99), (found.high, 1.01)):
         if end is not None:
-            assert row.judge(chosen.response(step * end / 5.0), 0.1 / 3, "", inputs=[chosen]).verdict == REFUTED
-    (lost,) = row.judge(1.0 - 9.0 * (comparison == "at least") + 9.0 * (comparison != "at least"), None, "",
+            assert row.evaluate(chosen.response(step * end / 5.0), 0.1 / 3, "", inputs=[chosen]).verdict == REFUTED
+    (lost,) = row.evaluate(1.0 - 9.0 * (comparison == "at least") + 9.0 * (comparison != "at least"), None, "",
                         inputs=[chosen]).inputs  # fmt: skip
     assert (lost.low, lost.high, lost.agrees) == (None, None, False)
 
@@ -379,7 +379,7 @@ def test_the_limits_of_an_input_for_a_reader():
 
 def test_a_row_of_two_equations_fails_with_either():
     row = check(also=("001.eq6",), expected=CORRECTED)
-    right, wrong = (row.judge(v, None, "", explanations=[FAULT]) for v in (2.0, 1.0))
+    right, wrong = (row.evaluate(v, None, "", explanations=[FAULT]) for v in (2.0, 1.0))
     assert row.worse(right, right) is right
     assert row.worse(right, wrong) is row.worse(wrong, right) is wrong
 
@@ -396,7 +396,7 @@ def test_a_row_is_found_by_all_its_ids(fake, tmp_path):
 
 
 def test_what_neither_agrees_nor_is_explained_can_be_told():
-    result = check().judge(3.0, None, "", otherwise="Text and table contradict each other.")
+    result = check().evaluate(3.0, None, "", otherwise="Text and table contradict each other.")
     assert (result.verdict, result.how.splitlines()[0]) == (REFUTED, "Text and table contradict each other.")
 
 
@@ -412,7 +412,7 @@ def test_what_neither_agrees_nor_is_explained_can_be_told():
     ],
 )
 def test_results_that_say_nothing_are_refused(change):
-    good = check().judge(1.0, 0.01, "").to_dict()
+    good = check().evaluate(1.0, 0.01, "").to_dict()
     with pytest.raises(ValueError, match=r"001\.table3\.a"):
         CheckResult(**{**good, **change})
 
@@ -420,7 +420,7 @@ def test_results_that_say_nothing_are_refused(change):
 @pytest.mark.parametrize("measured", [math.nan, math.inf])
 def test_no_verdict_on_what_is_no_number(measured):
     with pytest.raises(ValueError, match="no comparison"):
-        check().judge(measured, None, "")
+        check().evaluate(measured, None, "")
 
 
 # --- what is written --------------------------------------------------------------------------------------------------
@@ -435,7 +435,7 @@ FILES = {
 
 
 def test_the_run_folder_is_complete(fake, tmp_path):
-    fake(GOOD, group("001.table4", "", run=lambda context: [context.check("001.table4").judge(1.0, None, "")]))
+    fake(GOOD, group("001.table4", "", run=lambda context: [context.check("001.table4").evaluate(1.0, None, "")]))
     result = run("--out", tmp_path / "new/run", "--json", "--seed", 7)
     assert result.exit_code == 0
     assert files(tmp_path) == {f"new/run/{name}" for name in FILES}
@@ -487,10 +487,10 @@ def test_the_report_shows_everything_and_needs_nothing_from_outside(fake, tmp_pa
 
 def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
     def one(context: Context):
-        yield context.check("001.eq5").judge(2.0, 0.001, "Twice | as much.", explanations=[FAULT])
+        yield context.check("001.eq5").evaluate(2.0, 0.001, "Twice | as much.", explanations=[FAULT])
         yield context.check("001.eq8").not_checkable("No number is printed.")
         light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
-        yield context.check("001.eq9").judge(1.0, 0.02, "Dim.", 1.0, inputs=[light])
+        yield context.check("001.eq9").evaluate(1.0, 0.02, "Dim.", 1.0, inputs=[light])
 
     silent = check("001.eq8", printed=None, expected=NOT_CHECKABLE)
     chosen = check("001.eq9", printed=None, basis="chosen")
@@ -584,8 +584,8 @@ def test_a_failing_group_does_not_stop_the_others(fake, tmp_path):
     ("results", "why"),
     [
         ([], "no result"),
-        ([check("001.eq9").judge(1.0, None, "")], "does not hold"),
-        ([check("001.table3.a").judge(1.0, None, "")] * 2, "twice"),
+        ([check("001.eq9").evaluate(1.0, None, "")], "does not hold"),
+        ([check("001.table3.a").evaluate(1.0, None, "")] * 2, "twice"),
     ],
 )
 def test_a_group_that_answers_wrongly_has_failed(results, why, backend):
@@ -626,7 +626,7 @@ def sleep(context):
     time.sleep(60)
     yield
 
-check = Check("001.slow", "", "", "1", 1.0, 0.1, "", tells=1.0, against="none")
+check = Check("001.slow", "", "", "1", 1.0, 0.1, "", separation=1.0, alternative="none")
 registry.GROUPS = (CheckGroup("001.slow", "", 1.0, (check,), sleep),)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)

@@ -1,1 +1,1 @@
-"""What a check of a paper is, and how it is judged."""
+"""What a check of a paper is, and how it is evaluated, and how printed numbers are read."""

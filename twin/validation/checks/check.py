@@ -177,7 +177,9 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Check:
-    """What is to be checked, known before anything is computed, so that no tolerance can follow its result.
+    """A check of a paper: what it states and prints, a tolerance with its reason, the alternative that it has to be
+    told from, and what agreement rests on. All of it is known before anything is computed, so that no tolerance can
+    follow a result; `evaluate` compares what was measured, with the inputs that were chosen for it, and gives the row.
 
     Attributes:
         id: dotted, beginning with the paper's number, for instance ``001.table3.centroid``.
@@ -186,14 +188,14 @@ class Check:
         unit: of printed, measured and tolerance; "1" for a ratio.
         printed: the paper's number; None where it prints none.
         tolerance: how far apart printed and measured may be and still agree, without the noise.
-        because: why that tolerance.
+        reason: why that tolerance.
         comparison: ``equal``, or what the paper claims of the measured value: ``at most`` or ``at least`` the printed.
         expected: the verdict that is known from earlier work; any other one is reported and fails the command. By
             default that of agreement.
-        tells: how far away the nearest other statement is that the row is to tell from this one, in its unit; with a
-            tolerance plus noise above that it confirms nothing. None only where nothing can be compared.
-        against: that other statement, a phrase that goes on "told from".
-        basis: what agreement rests on, see AGREED; the inputs of ``chosen`` are given to judge().
+        separation: how far away the nearest other statement is that the row is to tell from this one, in its unit; with
+            a tolerance plus noise above that it confirms nothing. None only where nothing can be compared.
+        alternative: that other statement, a phrase that goes on "told from".
+        basis: what agreement rests on, see AGREED; the inputs of ``chosen`` are given to `evaluate`.
         theory: for the basis ``theory``: which one, a phrase.
         also: further ids of the same row, where one comparison is of two equations.
     """
@@ -204,11 +206,11 @@ class Check:
     unit: str
     printed: float | None
     tolerance: float
-    because: str
+    reason: str
     comparison: Comparison = "equal"
     expected: Verdict = OF_AGREEMENT
-    tells: float | None = None
-    against: str = ""
+    separation: float | None = None
+    alternative: str = ""
     basis: Basis = "printed"
     theory: str = ""
     also: tuple[str, ...] = ()
@@ -227,10 +229,11 @@ class Check:
             raise ValueError(f"{self.id}: {self.expected!r} is no verdict to expect")
         if self.expected == NOT_CHECKABLE:
             return
-        if self.tells is None or not (math.isfinite(self.tells) and self.tells > 0) or not self.against:
-            raise ValueError(f"{self.id}: say what the row tells from what: `tells` > 0 and `against`")
-        if self.tolerance > self.tells:
-            raise ValueError(f"{self.id}: a tolerance of {self.tolerance:g} can never tell {self.tells:g}")
+        apart = self.separation
+        if apart is None or not (math.isfinite(apart) and apart > 0) or not self.alternative:
+            raise ValueError(f"{self.id}: say what the row tells from what: `separation` > 0 and `alternative`")
+        if self.tolerance > apart:
+            raise ValueError(f"{self.id}: a tolerance of {self.tolerance:g} can never tell {apart:g}")
         if (self.basis == "theory") != bool(self.theory) or (self.theory and self.printed is not None):
             raise ValueError(f"{self.id}: a theory is named where the row rests on it and nothing is printed")
 
@@ -249,7 +252,7 @@ class Check:
         """The paper's number."""
         return self.id.partition(".")[0]
 
-    def judge(
+    def evaluate(
         self,
         measured: float,
         sigma: float | None,
@@ -262,8 +265,8 @@ class Check:
         """The result, with the verdict that the numbers give.
 
         It agrees if ``measured`` is the claimed value within ``tolerance`` + 3 ``sigma``; else the first explanation
-        whose value it is within the same limit gives verdict and reason; else it is refuted. A limit above ``tells``
-        makes of either agreement ``undecided``.
+        whose value it is within the same limit gives verdict and reason; else it is refuted. A limit above
+        ``separation`` makes of either agreement ``undecided``.
 
         Args:
             measured: the simulation's number.
@@ -280,10 +283,10 @@ class Check:
         measured, noise = float(measured), SIGMAS * float(sigma or 0.0)
         goal = self.printed if self.printed is not None else implied
         if goal is None:
-            raise ValueError(f"{self.id}: the paper prints no number, so judge() needs `implied`")
+            raise ValueError(f"{self.id}: the paper prints no number, so `evaluate` needs `implied`")
         if not (math.isfinite(measured) and math.isfinite(noise) and math.isfinite(goal)):
             raise ValueError(f"{self.id}: {measured!r} with sigma {sigma!r} against {goal!r} is no comparison")
-        if self.tells is None or (self.basis == "chosen") != bool(inputs):
+        if self.separation is None or (self.basis == "chosen") != bool(inputs):
             raise ValueError(f"{self.id}: it must say what it tells, and its inputs just where they are chosen")
         goal, allowed = float(goal), self.tolerance + noise
         verdict, reason = self._verdict(measured, goal, allowed, explanations, otherwise)
@@ -293,8 +296,8 @@ class Check:
         name = "printed" if self.printed is not None else f"implied ({goal:.6g})"
         sign = {"equal": "±", "at most": "up to +", "at least": "down to -"}[self.comparison]
         limit = f"Measured minus {name}: {measured - goal:+.3g}; allowed {sign}{allowed:.3g}, that is "
-        limit += f"{self.tolerance:.3g} ({self.because})" + (" + 3 sigma." if noise else ".")
-        limit += f" To be told from {self.against}, {self.tells:.3g} away."
+        limit += f"{self.tolerance:.3g} ({self.reason})" + (" + 3 sigma." if noise else ".")
+        limit += f" To be told from {self.alternative}, {self.separation:.3g} away."
         text = "\n".join(part for part in (how, chosen, reason, limit) if part)
         found = self._result(measured, sigma, verdict, text)
         return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
@@ -319,17 +322,17 @@ class Check:
     def _verdict(
         self, measured: float, goal: float, allowed: float, explanations: Sequence[Explanation], otherwise: str
     ) -> tuple[Verdict, str]:
-        assert self.tells is not None
+        assert self.separation is not None
         weak = (
-            f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.against} is "
-            f"{self.tells:.3g} away and would have passed as well."
+            f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.alternative} is "
+            f"{self.separation:.3g} away and would have passed as well."
         )
         if self._outside(measured, goal) <= allowed:
-            return (self.agreed, "") if allowed <= self.tells else (UNDECIDED, f"It agrees, but {weak}")
+            return (self.agreed, "") if allowed <= self.separation else (UNDECIDED, f"It agrees, but {weak}")
         for reason in explanations:
             if abs(measured - reason.value) <= allowed:
                 text = f"{reason.text} That gives {reason.value:.6g}."
-                if reason.verdict == CORRECTED and allowed > self.tells:
+                if reason.verdict == CORRECTED and allowed > self.separation:
                     return UNDECIDED, f"{text} But {weak}"
                 return reason.verdict, text
         tried = ", ".join(f"{e.value:.6g}" for e in explanations)
@@ -349,10 +352,10 @@ class Check:
             sigma=sigma,
             unit=self.unit,
             tolerance=self.tolerance,
-            because=self.because,
+            because=self.reason,
             power=None,
-            tells=self.tells,
-            against=self.against,
+            tells=self.separation,
+            against=self.alternative,
             theory=self.theory,
             inputs=(),
             verdict=verdict,

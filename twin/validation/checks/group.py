@@ -54,7 +54,7 @@ class Context:
         return fast if self.fast else full
 
     def check(self, identifier: str) -> Check:
-        """One of the group's checks, to be judged.
+        """One of the group's checks, to be evaluated.
 
         Raises:
             KeyError: the group has none of that id.

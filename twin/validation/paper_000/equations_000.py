@@ -78,40 +78,41 @@ _ROUNDING = "rounding of coordinates of 6.4e6 m, 1e-9 m over 500 km, and a hundr
 CHECKS = (
     Check("000.eq1", "eq. (1)", "A line's plane goes through the station, a2 = z0 − a0 x0 − a1 y0: RMS distance of the "
           "true ground points from the plane of noisy ones", "m", None, 0.75, "half of a point's own error of 1.5 m",
-          tells=1000.0, against="a wrong sign or factor in (1), which puts the plane kilometres away"),
+          separation=1000.0, alternative="a wrong sign or factor in (1), which puts the plane kilometres away"),
     Check("000.eq2", "eqs. (2), (5)", "The plane that makes S least, and that (5) gives without the minus signs on its "
           "right side, is the line's plane: its pitch minus the true one, the line farthest off", "arcsec", None, 0.05,
-          _TENTH, tells=0.44, against="a difference as large as the smaller one of Table 1", also=("000.eq5.sign",)),
+          _TENTH,
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1", also=("000.eq5.sign",)),
     Check("000.eq3", "eq. (3)", "Both derivatives of S vanish at the plane: at (5)'s solution, over those 1 arcsec "
           "beside it", "1", None, 1e-3, "0.001 arcsec is a hundredth of what the points' noise leaves",
-          tells=1.0, against="slopes that are 1 arcsec off"),
+          separation=1.0, alternative="slopes that are 1 arcsec off"),
     Check("000.eq4", "eq. (4)", "The printed sums are the derivatives of S: over numerical ones of (2), the ratio "
           "farthest from 1", "1", 1.0, 1e-6, "rounding of differences of S, 1e-16 over a step of 1e-3, squared terms",
-          tells=0.5, against="sums with a factor 2 too many or too few"),
+          separation=0.5, alternative="sums with a factor 2 too many or too few"),
     Check("000.eq5", "eq. (5)", "(5) as printed gives the forward line's plane: angle from the true plane", "deg", None,
           0.001, "ten times the noise of a normal, 2 arcsec about the line of sight", expected=CORRECTED,
-          tells=40.0, against="a plane with its slopes negated"),
+          separation=40.0, alternative="a plane with its slopes negated"),
     Check("000.eq5.angles", "eqs. (5)-(7)", "The angles by (5) as printed are those by (5) with the right sign: "
           "largest difference", "arcsec", None, 1e-6, _ROUNDING,
-          tells=0.44, against="a difference as large as the smaller one of Table 1", basis="theory",
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1", basis="theory",
           theory="a half turn about the z axis, as two wrong signs make it, keeps all angles between planes"),
     Check("000.eq5.vertical", "section 1.3", "z = a0 x + a1 y + a2 can describe any line's plane: slope found over the "
           "true one, in a frame where the nadir plane is an arc second from vertical", "1", 1.0, 0.03,
           "2/n of n = 60 points, the order that the law for many points leaves out", expected=CORRECTED,
-          tells=0.5, against="half of the slope"),
+          separation=0.5, alternative="half of the slope"),
     Check("000.eq6", "eq. (6)", "α by (5) and (6) minus the camera's true dihedral angle", "arcsec", None, 0.05,
           _TENTH,
-          tells=0.44, against="a difference as large as the smaller one of Table 1"),
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.eq6.arccos", "eqs. (6), (7)", "The arccos keeps its digits: largest difference from an exact evaluation",
           "arcsec", None, 1e-6, "a millionth of the arc second in which the paper counts",
-          tells=0.03, against="single precision", basis="theory",
+          separation=0.03, alternative="single precision", basis="theory",
           theory="rounding of float64 in the cosine, over the sine of the angle"),
     Check("000.eq6.parallel", "section 1.2", "The angle between the planes is the angle between the looks, also when "
           "an array is 10 arcmin off parallel: their difference", "arcsec", None, 0.05, _TENTH, expected=CORRECTED,
-          tells=1.8, against="an angle between looks that differs by twist² / (2 tan α)"),
+          separation=1.8, alternative="an angle between looks that differs by twist² / (2 tan α)"),
     Check("000.eq7", "eq. (7)", "β by (5) and (7) minus the camera's true dihedral angle", "arcsec", None, 0.05,
           _TENTH,
-          tells=0.44, against="a difference as large as the smaller one of Table 1"),
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
 )  # fmt: skip
 
 
@@ -210,7 +211,7 @@ def _through_station(context: Context, planes: Planes) -> CheckResult:
         f"measured station itself lies in the planes to {max(station):.0e} m; the true ground points lie beside them "
         "by what station and slopes are wrong."
     )
-    return context.check("000.eq1").judge(value, sigma, how, 0.0)
+    return context.check("000.eq1").evaluate(value, sigma, how, 0.0)
 
 
 def _least(context: Context, planes: Planes) -> CheckResult:
@@ -226,7 +227,7 @@ def _least(context: Context, planes: Planes) -> CheckResult:
         f"them. Mean errors: {_by_line(errors[0])}; by (5) with the right sign {_by_line(errors[1])}. Coordinates are "
         "Earth-fixed."
     )
-    return check.worse(*(check.judge(*worst(e), how, 0.0) for e in errors))
+    return check.worse(*(check.evaluate(*worst(e), how, 0.0) for e in errors))
 
 
 def _vanishing(context: Context, planes: Planes) -> CheckResult:
@@ -242,7 +243,7 @@ def _vanishing(context: Context, planes: Planes) -> CheckResult:
         f"{planes.said}; derivatives of S by central differences, which are exact for a square form, at (5)'s solution "
         "with the right sign and at slopes that are greater by 1 arcsec of their size. The largest ratio counts."
     )
-    return context.check("000.eq3").judge(found, None, how, 0.0)
+    return context.check("000.eq3").evaluate(found, None, how, 0.0)
 
 
 def _derivatives(context: Context, planes: Planes) -> CheckResult:
@@ -254,7 +255,7 @@ def _derivatives(context: Context, planes: Planes) -> CheckResult:
             ratios += list(derivatives(s, points, station) / numerical_derivatives(s, points, station))
     value = max(ratios, key=lambda r: abs(r - 1.0))
     how = f"At three pairs of slopes far from the least S, on one measurement of each line: {len(ratios)} ratios."
-    return context.check("000.eq4").judge(value, None, how)
+    return context.check("000.eq4").evaluate(value, None, how)
 
 
 def _printed_plane(context: Context, planes: Planes) -> CheckResult:
@@ -277,7 +278,7 @@ def _printed_plane(context: Context, planes: Planes) -> CheckResult:
         "The minus signs on the right side of (5) do not follow from (4) and negate both slopes: every plane is turned "
         "by half a turn about the z axis. Without them (5) gives the plane, see 000.eq2.",
     )
-    return context.check("000.eq5").judge(value, sigma, how, 0.0, [reason])
+    return context.check("000.eq5").evaluate(value, sigma, how, 0.0, [reason])
 
 
 def _printed_angles(context: Context, planes: Planes) -> CheckResult:
@@ -287,7 +288,7 @@ def _printed_angles(context: Context, planes: Planes) -> CheckResult:
         f"{planes.said}. The half turn about z that the wrong sign makes is the same for all planes, so that the "
         "angles between them stay: the error of print could not show in the paper's Table 1."
     )
-    return context.check("000.eq5.angles").judge(difference, None, how, 0.0)
+    return context.check("000.eq5.angles").evaluate(difference, None, how, 0.0)
 
 
 def _vertical(context: Context, planes: Planes) -> CheckResult:
@@ -317,7 +318,7 @@ def _vertical(context: Context, planes: Planes) -> CheckResult:
         "The form has no vertical planes, and the paper does not say which frame to take. Near the vertical x − x0 of "
         "the points is as small as its errors, which (5) takes for exact: the slope shrinks by x²/(x² + σ²).",
     )
-    return context.check("000.eq5.vertical").judge(value, sigma, how, None, [reason])
+    return context.check("000.eq5.vertical").evaluate(value, sigma, how, None, [reason])
 
 
 def _alpha(context: Context, planes: Planes) -> CheckResult:
@@ -337,7 +338,7 @@ def _angle(context: Context, planes: Planes, which: int, identifier: str) -> Che
         f"The looks of the lines' centres make that angle {(look - truth) / ARCSEC:+.4f}″. Light time, "
         "aberration and refraction are taken out of the points; left in, see 000.light."
     )
-    return context.check(identifier).judge(*mean_of(off), how, 0.0)
+    return context.check(identifier).evaluate(*mean_of(off), how, 0.0)
 
 
 def _arccos(context: Context, planes: Planes) -> CheckResult:
@@ -348,7 +349,7 @@ def _arccos(context: Context, planes: Planes) -> CheckResult:
         f"{planes.said}; against atan2 of cross and scalar product in extended precision. The error grows as 1/sin of "
         f"the angle: of the nearly parallel planes of the outlook, arccos tells no angle below {least / ARCSEC:.4f}″."
     )
-    return context.check("000.eq6.arccos").judge(found, None, how, 0.0)
+    return context.check("000.eq6.arccos").evaluate(found, None, how, 0.0)
 
 
 def _exact(a: PlaneFit, b: PlaneFit) -> float:
@@ -378,7 +379,7 @@ def _parallel(context: Context, planes: Planes) -> CheckResult:
         "Right for parallel arrays, which the paper supposes. Else cos(angle of planes) = cos(twist) cos(angle of "
         "looks), larger by twist² / (2 tan α).",
     )
-    return context.check("000.eq6.parallel").judge(value, sigma, how, 0.0, [reason])
+    return context.check("000.eq6.parallel").evaluate(value, sigma, how, 0.0, [reason])
 
 
 def _normal(slopes: Array) -> Array:

@@ -109,12 +109,12 @@ CHECKS = (
     *(sentence.check() for sentence in SENTENCES),
     Check("000.fig3.ordinate", "Fig. 3, section 2.3.1", "The sentences speak of the angles, though the figures show "
           "resection minus planes: share of the signs that come out so", "1", None, 0.0, "signs counted", "at least",
-          tells=1 / 6, against="one sentence of six that comes out the other way", basis="chosen"),
+          separation=1 / 6, alternative="one sentence of six that comes out the other way", basis="chosen"),
     Check("000.fig3.values", "Figs. 3, 4, 5", "Sizes of the changes", "arcsec", None, 0.0, "nothing to compare",
           expected=NOT_CHECKABLE),
     Check("000.fig4.single", "section 2.3.2", "Single control points do not change the result much: change of α by one "
           "forward point over that by all, the point that does most", "1", None, 0.1, "a tenth is not much", "at most",
-          tells=0.33, against="a third, the share of one point of three", basis="chosen"),
+          separation=0.33, alternative="a third, the share of one point of three", basis="chosen"),
 )  # fmt: skip
 
 
@@ -188,7 +188,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     places = _places(context)
     for sentence in SENTENCES:
         if f"000.{sentence.name}" in context.selected:
-            yield _judged(context, sentence, passes, found, other, places)
+            yield _row(context, sentence, passes, found, other, places)
     if "000.fig3.ordinate" in context.selected:
         yield _ordinate(context, found, places)
     if "000.fig4.single" in context.selected:
@@ -197,7 +197,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     _show(context, found[0], places)
 
 
-def _judged(
+def _row(
     context: Context,
     sentence: Sentence,
     passes: Passes,
@@ -216,7 +216,7 @@ def _judged(
         f"{sentence.measure(other.rises, other.growth):.3g}."
     )
     value, sigma = (float(values[0]), None) if sentence.kind == "grows" else mean_of(values)
-    return context.check(f"000.{sentence.name}").judge(
+    return context.check(f"000.{sentence.name}").evaluate(
         value, sigma, how, sentence.implied, list(_reasons(sentence, passes, other)),
         [place] if sentence.basis == "chosen" else [],
     )  # fmt: skip
@@ -262,7 +262,7 @@ def _ordinate(context: Context, found: list[Answers], places: Mapping[tuple[floa
         f"where the resection stays, the share is {other:.2f}: the figures' curves fall where the text says that the "
         "angle rises."
     )
-    return context.check("000.fig3.ordinate").judge(float(share), None, how, 1.0, inputs=[_place(None, places)])
+    return context.check("000.fig3.ordinate").evaluate(float(share), None, how, 1.0, inputs=[_place(None, places)])
 
 
 def _single(context: Context, passes: Passes) -> CheckResult:
@@ -289,7 +289,7 @@ def _single(context: Context, passes: Passes) -> CheckResult:
         "1/n, and the paper does not print n."
     )
     count = Chosen.power("points on a line", float(len(each)), "1", value, -1.0)
-    return context.check("000.fig4.single").judge(value, None, how, 0.0, inputs=[count])
+    return context.check("000.fig4.single").evaluate(value, None, how, 0.0, inputs=[count])
 
 
 def _places(context: Context) -> dict[tuple[float, float], Answers]:

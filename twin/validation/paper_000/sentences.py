@@ -84,7 +84,7 @@ class Sentence:
         unit, tolerance, because, comparison, tells, against = compared[self.kind]
         return Check(
             f"000.{self.name}", self.where, self.text, unit, None, tolerance, because, comparison, self.expected,
-            tells=tells, against=against, basis=self.basis,
+            separation=tells, alternative=against, basis=self.basis,
         )  # fmt: skip
 
     @property

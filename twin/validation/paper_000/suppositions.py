@@ -28,24 +28,24 @@ CHECKS = (
     Check("000.light.aberration", "section 1.2", "Ground points lie in the plane of the line that sees them, whatever "
           "its velocity: α from true points minus the camera's, aberration alone", "arcsec", None, 0.03, _FIRST_ORDER,
           expected=CORRECTED,
-          tells=0.4, against="points that aberration has moved"),
+          separation=0.4, alternative="points that aberration has moved"),
     Check("000.light.refraction", "section 1.2", "Ground points lie in the plane of the line that sees them, also "
           "through air: α from true points minus the camera's, refraction alone", "arcsec", None, 0.03, _FIRST_ORDER,
           expected=CORRECTED,
-          tells=0.4, against="points that air has moved"),
+          separation=0.4, alternative="points that air has moved"),
     Check("000.light.beta", "section 2.1", "The procedure needs no correction for the light: β from true points minus "
           "the camera's, all effects together", "arcsec", None, 0.05, "the two effects' 0.03 arcsec in "
           "quadrature, rounded up",
           expected=CORRECTED,
-          tells=0.9, against="points that both have moved"),
+          separation=0.9, alternative="points that both have moved"),
     Check("000.traced", "eqs. (5), (6)", "Change of the angle of gf7_pair as the planes show it, minus the change by "
           "exact trace of the instrument", "arcsec", None, 0.05,
           "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec",
-          tells=0.44, against="a difference as large as the smaller one of Table 1"),
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.centres", "section 1.2", "The lines may be taken to have one projection centre: the same of gf7_pair, "
           "whose centres lie 2.8 m apart", "arcsec", None, 0.05,
           "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec", expected=CORRECTED,
-          tells=1.0, against="what centres so far apart make"),
+          separation=1.0, alternative="what centres so far apart make"),
 )  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
         if identifier in context.selected:
             measured = float(rows[what].bias[which] / ARCSEC)
             reason = Explanation(value, CORRECTED, text)
-            yield context.check(identifier).judge(measured, None, said(what), 0.0, [reason])
+            yield context.check(identifier).evaluate(measured, None, said(what), 0.0, [reason])
 
 
 def _refraction(passes: Passes, angle: str, line: str) -> float:
@@ -149,10 +149,10 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
             f"{trace / ARCSEC:.3f}″ and the planes by {trace / ARCSEC + value:.3f}″ ± {sigma:.3f}″. Points are moved "
             "to a common projection centre by what the laboratory knows."
         )
-        yield context.check("000.traced").judge(value, sigma, how, 0.0)
+        yield context.check("000.traced").evaluate(value, sigma, how, 0.0)
     if "000.centres" in context.selected:
         apart = {line: _seen(passes, line) for line in (first, second)}
-        yield context.check("000.centres").judge(
+        yield context.check("000.centres").evaluate(
             *off(list(passes.measured)),
             f"{many}; the planes go through one station, as the paper has it.",
             0.0,

@@ -72,30 +72,30 @@ CHECKS = (
           "arcsec in α: standard deviation of their "
           "difference", "arcsec", ALPHA, 0.005, _DIGIT,
           expected=REFUTED,
-          tells=0.4, against="what the two methods differ by on the same data"),
+          separation=0.4, alternative="what the two methods differ by on the same data"),
     Check("000.table1.beta", "Table 1", "Resection and planes of the same points and station differ by 1.53 "
           "arcsec in β: standard deviation of their "
           "difference", "arcsec", BETA, 0.005, _DIGIT,
           expected=REFUTED,
-          tells=1.5, against="what the two methods differ by on the same data"),
+          separation=1.5, alternative="what the two methods differ by on the same data"),
     Check("000.table1.alpha_own", "Table 1", "0.44 arcsec in α are within reach when each method has points of its own "
           "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", ALPHA, 0.1, _LIMIT,
           "at least",
-          tells=0.4, against="the reach of methods that share their points, 0.03 arcsec", basis="chosen"),
+          separation=0.4, alternative="the reach of methods that share their points, 0.03 arcsec", basis="chosen"),
     Check("000.table1.beta_own", "Table 1", "1.53 arcsec in β are within reach when each method has points of its own "
           "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", BETA, 0.1, _LIMIT,
           "at least",
-          tells=0.7, against="the reach without the light's effects", basis="chosen"),
+          separation=0.7, alternative="the reach without the light's effects", basis="chosen"),
     Check("000.table1.pair", "Table 1", "0.44 and 1.53 arcsec of one sign are within reach together: distance of the "
           "pair from such differences, in standard deviations of two dimensions", "1", None, 0.2,
           "a twentieth of the limit, which 99.7 % of pairs keep", "at most", expected=REFUTED,
-          tells=0.85, against="a pair as rare as one in 10 000"),
+          separation=0.85, alternative="a pair as rare as one in 10 000"),
     Check("000.accuracy", "abstract, section 2.2", "The result is good to the order of 1 arcsec: larger RMS error of α "
           "and β, light corrected", "arcsec", 1.0, 0.1, "a tenth of the order that is printed", "at most",
-          tells=2.1, against="the next order of magnitude, which begins at √10", basis="chosen"),
+          separation=2.1, alternative="the next order of magnitude, which begins at √10", basis="chosen"),
     Check("000.accuracy.light", "abstract, section 2.2", "The result is good to the order of 1 arcsec: larger "
           "RMS error of α and β, light left as it is", "arcsec", 1.0, 0.5, "the order of 1 arcsec", "at most",
-          tells=2.1, against="the next order of magnitude, which begins at √10", basis="chosen"),
+          separation=2.1, alternative="the next order of magnitude, which begins at √10", basis="chosen"),
 )  # fmt: skip
 
 
@@ -207,7 +207,7 @@ def _same(context: Context, data: Data, same: Differences) -> Iterator[CheckResu
             "their variances. The printed one must come from data or models that differ, see the rows _own.",
         )
         noise = sigma / np.sqrt(2.0 * (count - 1))
-        yield context.check(identifier).judge(sigma, noise, how, None, [reason])
+        yield context.check(identifier).evaluate(sigma, noise, how, None, [reason])
 
 
 def _own(context: Context, data: Data, own: Differences) -> Iterator[CheckResult]:
@@ -225,7 +225,7 @@ def _own(context: Context, data: Data, own: Differences) -> Iterator[CheckResult
             "whether the two methods share them, is not printed."
         )
         reach = partial(_reach, abs(bias), SIGMAS * spread)
-        yield context.check(identifier).judge(reach(1.0), noise, how, inputs=_points(reach))
+        yield context.check(identifier).evaluate(reach(1.0), noise, how, inputs=_points(reach))
 
 
 def _reach(bias: float, spread: float, factor: float) -> float:
@@ -268,7 +268,7 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
         "Planes are wrong by σ/√n over their range, and an error of the common nadir plane moves α and β oppositely, "
         "so that differences of one sign are unlikely: either signs are not printed, or there is a further cause.",
     )
-    return context.check("000.table1.pair").judge(together, None, how, LIMIT, [reason])
+    return context.check("000.table1.pair").evaluate(together, None, how, LIMIT, [reason])
 
 
 def _pitch_variance(passes: Passes, line: str) -> float:
@@ -303,7 +303,7 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
         bias, spread = float(mean[worst]), float(np.std(off[:, worst]))
         noise = spread / float(np.sqrt(len(off)))
         inputs = _points(partial(_rms, bias, spread))
-        yield context.check(identifier).judge(float(rms[worst]), noise, how, inputs=inputs)
+        yield context.check(identifier).evaluate(float(rms[worst]), noise, how, inputs=inputs)
 
 
 GROUP = CheckGroup("000.table1", "Planes against resection, Table 1", 20.0, CHECKS, run, 4.0)

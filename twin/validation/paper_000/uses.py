@@ -21,25 +21,25 @@ CHECKS = (
     Check("000.height.alpha", "section 0", "1 arcsec of α makes more than 5 m of height", "m", 5.0, 0.0,
           "the bound itself",
           "at least",
-          tells=1.0, against="no more than 4 m"),
+          separation=1.0, alternative="no more than 4 m"),
     Check("000.height.beta", "section 0", "1 arcsec of β makes more than 5 m of height", "m", 5.0, 0.0,
           "the bound itself",
           "at least",
-          tells=1.0, against="no more than 4 m"),
+          separation=1.0, alternative="no more than 4 m"),
     Check("000.height.size", "section 0", "Height of 1 arcsec of α over slant range times 1 arcsec over the "
           "sine of the rays' angle on the ground", "1", None, 0.01, "first order in the curvature of ground and orbit",
-          tells=0.068, against="flat ground", basis="theory",
+          separation=0.068, alternative="flat ground", basis="theory",
           theory="intersection of two rays on a sphere, range times angle over the sine of theirs"),
     Check("000.outlook.high_resolution", "section 3", "Off-axis angle of the high-resolution line by planes: "
           "angle along the track minus the true one", "arcsec", None, 0.05, _TENTH,
-          tells=0.44, against="a difference as large as the smaller one of Table 1"),
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.outlook.multispectral", "section 3", "Off-axis angle of the multispectral line by planes: angle "
           "along the track minus the true one", "arcsec", None, 0.05, _TENTH,
-          tells=0.44, against="a difference as large as the smaller one of Table 1"),
+          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.outlook.unsigned", "section 3, eq. (6)", "(6) gives the off-axis angle of the multispectral line: its "
           "value minus the angle between the looks", "arcsec", None, 1.0, "half of the noise of one measurement",
           expected=CORRECTED,
-          tells=9.0, against="the twist of the arrays in place of the looks"),
+          separation=9.0, alternative="the twist of the arrays in place of the looks"),
 )  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
                 "sensor, that line is turned by 1 arcsec in pitch, and the two rays are intersected again. Over flat "
                 f"ground H / (sin α cos α) makes {flat:.2f} m; the curved Earth lets the rays meet at a larger angle."
             )
-            yield context.check(f"000.height.{name}").judge(float(heights[name] or 0.0), None, how)
+            yield context.check(f"000.height.{name}").evaluate(float(heights[name] or 0.0), None, how)
     if "000.height.size" in context.selected:
         # on a sphere the nadir ray stands upright and the other one at alpha plus the angle at the Earth's centre
         radius = float(np.linalg.norm(flight.middle_point))
@@ -88,7 +88,7 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
             f"Triangle of station, point and centre of a spherical Earth: slant range {slant / 1e3:.1f} km, angle of "
             f"the rays {np.degrees(zenith):.2f}°. By the intersection: {heights['alpha']:.3f} m."
         )
-        yield context.check("000.height.size").judge(ratio, None, how, 1.0)
+        yield context.check("000.height.size").evaluate(ratio, None, how, 1.0)
 
 
 def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
@@ -104,7 +104,7 @@ def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
                 f"{many}; true angle along the track {np.degrees(true):.5f}° from the nadir line, one measurement "
                 f"scatters by {np.std(off, ddof=1):.3f}″. The lines of sight are found in the fitted planes."
             )
-            yield context.check(f"000.outlook.{name}").judge(*mean_of(off), how, 0.0)
+            yield context.check(f"000.outlook.{name}").evaluate(*mean_of(off), how, 0.0)
     if "000.outlook.unsigned" in context.selected:
         found = []
         for m in passes.measured:
@@ -122,7 +122,7 @@ def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
             "Planes of nearly parallel looks differ by the twist of their arrays as much as by the looks. The turn "
             "about the arrays' direction, which has a sign, is the off-axis angle, see the rows above.",
         )
-        yield context.check("000.outlook.unsigned").judge(*mean_of(off), how, 0.0, [reason])
+        yield context.check("000.outlook.unsigned").evaluate(*mean_of(off), how, 0.0, [reason])
 
 
 GROUP = CheckGroup("000.uses", "One arc second in heights; off-axis angles of other cameras", 12.0, CHECKS, run, 2.5)

@@ -70,32 +70,32 @@ CHECKS = (
     *(
         Check(f"001.table3.{name}", "Table 3", f"{text}, error of one spot", "arcsec", TABLE_3[name],
               0.2 * TABLE_3[name], _INPUTS,
-              tells=0.5 * TABLE_3[name], against="half as much or half as much again", basis="chosen")
+              separation=0.5 * TABLE_3[name], alternative="half as much or half as much again", basis="chosen")
         for name, text in _LINES.items()
     ),
     Check("001.table3.prism_180_thermal.halved", "Table 3, section 3.2.1 item 3",
           "The 180° prism's error is that of its glass path: with half the path across the gradient, half the error",
           "1", None, 0.02, "the short legs in the roof stay as they are",
-          tells=0.5, against="an error that does not follow the path"),
+          separation=0.5, alternative="an error that does not follow the path"),
     Check("001.eq12", "eq. (12)", "The causes add as the root of a sum of squares: all at once / (12)", "1", 1.0, 0.15,
           "half of what a full correlation of the two largest lines would add",
-          tells=0.6, against="a plain sum of the lines", basis="chosen"),
+          separation=0.6, alternative="a plain sum of the lines", basis="chosen"),
     Check("001.eq12.frames", "eq. (12), section 3.2.2",
           "The mean of 9 frames has a third of the centroid's random error: scatter of means / (single / 3)", "1", 1.0,
           0.12, "7 or 12 frames instead of 9 would give 13 %",
-          tells=0.5, against="the mean of four frames in place of nine"),
+          separation=0.5, alternative="the mean of four frames in place of nine"),
     Check("001.eq12.gravity", "section 3.2.1 item 5, section 3.2.2",
           "In orbit the bending of the optics by gravity can be left out of (12)", "arcsec", None, 0.0,
           "nothing is printed to compare with", expected=NOT_CHECKABLE),
     Check("001.table4.printed_lines", "Table 4, from Table 3", "(12) of the printed lines of Table 3", "arcsec",
           TABLE_4, 0.0005, "half of the last printed digit",
-          tells=0.0013, against="(12) without the mean over the frames"),
+          separation=0.0013, alternative="(12) without the mean over the frames"),
     Check("001.table4.root_sum", "Table 4, eq. (12)", "(12) of the simulated lines, the centroid's over 9 frames",
           "arcsec", TABLE_4, 0.029, _INPUTS,
-          tells=0.07, against="half as much or half as much again", basis="chosen"),
+          separation=0.07, alternative="half as much or half as much again", basis="chosen"),
     Check("001.table4.together", "Table 4", "Error of one spot with all causes at once in the images", "arcsec",
           TABLE_4, 0.029, _INPUTS,
-          tells=0.07, against="half as much or half as much again", basis="chosen"),
+          separation=0.07, alternative="half as much or half as much again", basis="chosen"),
     *monitored_errors.CHECKS,
 )  # fmt: skip
 
@@ -113,7 +113,7 @@ def run(context: Context) -> Iterator[CheckResult]:
             "the path across the gradient is halved, the ways in and out of the prism stay. Same gradients, rms of "
             "all spots."
         )
-        yield context.check("001.table3.prism_180_thermal.halved").judge(ratio, None, how, 0.5)
+        yield context.check("001.table3.prism_180_thermal.halved").evaluate(ratio, None, how, 0.5)
     yield from _totals(context, images)
     yield from monitored_errors.results(context, images)
     if images.lines:
@@ -144,7 +144,7 @@ def _line(context: Context, images: BudgetImages, line: BudgetLine) -> CheckResu
     # proportional to the input, but for the centroid's light, whose power the budget's own search tells
     power = log(0.1 * ARCSEC / line.three_sigma) / log(line.allowed / line.value)
     chosen = Chosen.power(_INPUT_OF[line.name], line.value, line.unit, line.three_sigma / ARCSEC, power)
-    return check.judge(line.three_sigma / ARCSEC, line.sigma / ARCSEC, how, inputs=[chosen])
+    return check.evaluate(line.three_sigma / ARCSEC, line.sigma / ARCSEC, how, inputs=[chosen])
 
 
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
@@ -178,7 +178,7 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
             "are drawn independently, as (12) takes them; the images show that they then add. A drift of temperature "
             f"that all glass shares would break it: the plain sum of the lines is {plain / ARCSEC:.3f} arcsec."
         )
-        yield context.check("001.eq12").judge(measured, noise, how, inputs=[drawn])
+        yield context.check("001.eq12").evaluate(measured, noise, how, inputs=[drawn])
     if "001.eq12.frames" in context.selected:
         assert images.scatter is not None
         (single, s_sigma), (mean, m_sigma) = images.scatter
@@ -191,7 +191,7 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
             f"but one: without it Table 4 were {rest:.4f} for {printed:.4f} arcsec, so that more frames gain nothing."
         )
         ratio = mean / should
-        yield context.check("001.eq12.frames").judge(ratio, ratio * hypot(s_sigma / single, m_sigma / mean), how)
+        yield context.check("001.eq12.frames").evaluate(ratio, ratio * hypot(s_sigma / single, m_sigma / mean), how)
     if "001.eq12.gravity" in context.selected:
         yield context.check("001.eq12.gravity").not_checkable(
             "Weightlessness is no approximation in orbit, so that leaving the term out follows from the statement "
@@ -200,18 +200,18 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         )
     if "001.table4.printed_lines" in context.selected:
         how = "Arithmetic of the printed numbers alone: Table 4 follows from Table 3 by (12) with 9 frames."
-        yield context.check("001.table4.printed_lines").judge(budget.root_sum(TABLE_3), None, how)
+        yield context.check("001.table4.printed_lines").evaluate(budget.root_sum(TABLE_3), None, how)
     if "001.table4.root_sum" in context.selected:
         total, sigma = budget.root_sum_of_squares(images.lines)
         how = f"(12) over the seven simulated lines, {budget.FRAMES} frames, {trials} states and more each."
         inputs = [_in_sum(images, name, total / ARCSEC) for name in _LARGEST]
-        yield context.check("001.table4.root_sum").judge(total / ARCSEC, sigma / ARCSEC, how, inputs=inputs)
+        yield context.check("001.table4.root_sum").evaluate(total / ARCSEC, sigma / ARCSEC, how, inputs=inputs)
     if "001.table4.together" in context.selected:
         assert images.together is not None
         how = f"{causes} random states with all causes, {budget.FRAMES} noisy frames each, energy centroid."
         value, spread = images.together.spot
         chosen = monitored_errors.all_causes(value / ARCSEC)
-        yield context.check("001.table4.together").judge(value / ARCSEC, spread / ARCSEC, how, inputs=[chosen])
+        yield context.check("001.table4.together").evaluate(value / ARCSEC, spread / ARCSEC, how, inputs=[chosen])
 
 
 def _show(context: Context, lines: dict[str, BudgetLine]) -> None:

@@ -35,7 +35,7 @@ from twin.validation.paper_001.formulas_images import (
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 
 
-def judge(check: Check, backend: Backend) -> CheckResult:
+def plane_mirror(check: Check, backend: Backend) -> CheckResult:
     """Whether the reflected ray turns by twice the turn of the mirror."""
     turns = np.array(MIRROR_TURNS)
     turned, moved = mirror_turns(backend, turns)
@@ -46,7 +46,7 @@ def judge(check: Check, backend: Backend) -> CheckResult:
         f"Exact trace of a ray off a plane mirror at {len(turns)} angles from 1 arcsec to 10°; the ratio farthest from "
         f"2 counts. On a screen at distance f the ray moves by f tan 2θ, as (1) says, to {screen:.0e} of it."
     )
-    return check.judge(worst, None, how)
+    return check.evaluate(worst, None, how)
 
 
 def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,50 +74,50 @@ CHECKS = (
     Check(
         "001.eq1.turn", "section 1.1", "A plane mirror turned by θ turns the reflected ray by 2θ", "1", 2.0, 1e-6,
         "rounding in the smallest angle",
-        tells=1.0, against="once the turn",
+        separation=1.0, alternative="once the turn",
     ),
     Check(
         "001.eq1.displacement", "eq. (1)", "The image then moves by L = f tan 2θ: θ read / θ made", "1", 1.0, 0.01,
         "the camera's distortion at the field of the area CCDs is below 1 %",
-        tells=0.5, against="θ in place of 2θ",
+        separation=0.5, alternative="θ in place of 2θ",
     ),
     Check(
         "001.eq2", "eq. (2)", "Line CCD moved along Y: Δβ read / true turn of the line of sight about X", "1", 1.0,
         5e-4, _COS2, expected=CORRECTED,
-        tells=0.00225, against="a reading without the factor cos²β",
+        separation=0.00225, alternative="a reading without the factor cos²β",
     ),
     Check(
         "001.eq2.cos2", "eq. (2)", "The factor cos²β in (2): true Δβ · 2f / (mean spot shift)", "1",
         None, 5e-4, _COS2, expected=CORRECTED,
-        tells=0.00225, against="no factor",
+        separation=0.00225, alternative="no factor",
     ),
     Check(
         "001.eq3", "eq. (3)", "Line CCD moved along X: Δα read / true turn of the line of sight about Y", "1", 1.0,
         0.01, _ANGLE, expected=CORRECTED,
-        tells=0.03, against="the other focal length, f across the line",
+        separation=0.03, alternative="the other focal length, f across the line",
     ),
     Check(
         "001.eq3.cos2", "eq. (3)", "The factor cos²α in (3): true Δα · 2f / (mean spot shift)", "1",
         None, 0.001, "0.1 %, a tenth of what Table 5 can tell", expected=CORRECTED,
-        tells=0.029, against="f over f across the line",
+        separation=0.029, alternative="f over f across the line",
     ),
     Check(
         "001.eq5", "eqs. (4), (5)",
         "Line CCD turned about the line of sight: Δγ read / turn of the line CCD, and by (4) Δx / L₁ of its ends", "1",
         1.0, 0.01, _ROLL, expected=CORRECTED,
-        tells=1.0, against="twice as much: the doubling by the reflection", also=("001.eq4",),
+        separation=1.0, alternative="twice as much: the doubling by the reflection", also=("001.eq4",),
     ),
     Check(
         "001.eq7", "eqs. (6), (7)",
         "Camera grown with its focus kept: Δf read / true change of the principal distance, and by (6) Δy / (LΔf/f)",
         "1", 1.0, 0.01, _FOCAL,
-        tells=0.5, against="half of it, as Table 1 has it", also=("001.eq6",),
+        separation=0.5, alternative="half of it, as Table 1 has it", also=("001.eq6",),
     ),
     Check(
         "001.eq7.piston", "section 2.4, eq. (7)",
         "Line CCD moved parallel to itself changes the focal length by as much: Δf read / motion", "1", 1.0, 0.02,
         "1 µm in a motion of 50 µm", expected=REFUTED,
-        tells=0.9, against="a motion that is defocus",
+        separation=0.9, alternative="a motion that is defocus",
     ),
 )  # fmt: skip
 
@@ -126,7 +126,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     """All checks of the group; the images of all motions are one batch."""
     if "001.eq1.turn" in context.selected:
         context.progress(0.0, "trace a plane mirror")
-        yield judge(context.check("001.eq1.turn"), context.backend)
+        yield plane_mirror(context.check("001.eq1.turn"), context.backend)
     if not context.selected - {"001.eq1.turn"}:
         return
     context.progress(0.1, f"build {INSTRUMENT}")
@@ -138,7 +138,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     for identifier, same in findings.items():
         if identifier in context.selected:
             check = context.check(identifier)
-            yield check.worse(*(_judged(check, finding) for finding in same))
+            yield check.worse(*(_row(check, finding) for finding in same))
             shown[identifier] = same[0].ratio
     context.progress(0.9, "draw")
     if shown:
@@ -153,7 +153,7 @@ def measured(context: Context) -> SingleMotions:
 
 @dataclass(frozen=True)
 class _Finding:
-    """What the images say for one check, before it is judged; equations that say the same share a check."""
+    """What the images say for one check, before it is evaluated; equations that say the same share a check."""
 
     id: str
     ratio: Ratio
@@ -162,10 +162,10 @@ class _Finding:
     implied: float | None = None
 
 
-def _judged(check: Check, finding: _Finding) -> CheckResult:
+def _row(check: Check, finding: _Finding) -> CheckResult:
     ratio = finding.ratio
     how = f"{finding.how} By camera: {ratio.text}."
-    return check.judge(ratio.value, ratio.sigma, how, finding.implied, finding.explanations)
+    return check.evaluate(ratio.value, ratio.sigma, how, finding.implied, finding.explanations)
 
 
 def without_cos2(geometry: MonitorGeometry, local: float) -> Explanation:

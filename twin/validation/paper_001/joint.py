@@ -27,89 +27,89 @@ CHECKS = (
     Check(
         "001.eq8.y", "eq. (8)", "Δf and Δβ at once move a spot along the line by the sum of what each does: both / sum",
         "1", 1.0, 0.002, _LINEAR,
-        tells=0.01, against="1 %, what Table 5 can tell",
+        separation=0.01, alternative="1 %, what Table 5 can tell",
     ),
     Check(
         "001.eq8.x", "section 2.5, 2), as eq. (8)",
         "Δα and Δγ at once move a spot across the line by the sum of what each does: both / sum", "1", 1.0, 0.002,
         _LINEAR,
-        tells=0.01, against="1 %, what Table 5 can tell",
+        separation=0.01, alternative="1 %, what Table 5 can tell",
     ),
     Check(
         "001.eq8.d_gamma_alone", "section 2.5", "Δγ moves the spots across the line alone: common Y / X", "1", 0.0,
         0.01, _ROLL,
-        tells=0.02, against="twice what Table 5 can tell",
+        separation=0.02, alternative="twice what Table 5 can tell",
     ),
     Check(
         "001.eq8.d_f_alone", "section 2.5", "Δf moves the spots along the line alone: common X / Y", "1", 0.0, 0.01,
         _FOCAL,
-        tells=0.02, against="twice what Table 5 can tell",
+        separation=0.02, alternative="twice what Table 5 can tell",
     ),
     Check(
         "001.eq9.d_f", "eq. (9)", "A change of the focal length alone moves the spots apart: Y_R / (−Y_L)", "1", 1.0,
         0.01, _FOCAL,
-        tells=2.0, against="spots that move the same way",
+        separation=2.0, alternative="spots that move the same way",
     ),
     Check(
         "001.eq9.d_beta", "eq. (9)", "A turn about X alone moves both spots alike along the line: Y_R / Y_L", "1", 1.0,
         0.01, _ANGLE,
-        tells=2.0, against="spots that move opposite ways",
+        separation=2.0, alternative="spots that move opposite ways",
     ),
     Check(
         "001.eq10.d_f", "eq. (10)", "(Y_L − Y_R)/2 of all four changes over Y_L of Δf alone", "1", 1.0, 0.01, _FOCAL,
-        tells=0.5, against="sums or differences without their half",
+        separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
         "001.eq10.d_beta", "eq. (10)", "(Y_L + Y_R)/2 of all four changes over Y_L of Δβ alone", "1", 1.0, 0.01, _ANGLE,
-        tells=0.5, against="sums or differences without their half",
+        separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
         "001.eq11.d_alpha", "eq. (11)", "(X_L + X_R)/2 of all four changes over X_L of Δα alone", "1", 1.0, 0.01,
         _ANGLE,
-        tells=0.5, against="sums or differences without their half",
+        separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
         "001.eq11.d_gamma", "eq. (11)", "(X_L − X_R)/2 of all four changes over X_L of Δγ alone", "1", 1.0, 0.01, _ROLL,
-        tells=0.5, against="sums or differences without their half",
+        separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
         "001.table1.d_beta", _COLUMN, "Joint Δβ read per true Δβ, all four changing", "1", 1.0, 5e-4,
         "a quarter of 1 − cos²β", expected=CORRECTED,
-        tells=0.00225, against="a reading without the factor cos²β",
+        separation=0.00225, alternative="a reading without the factor cos²β",
     ),
     Check(
         "001.table1.d_alpha", _COLUMN, "Joint Δα read per true Δα, all four changing", "1", 1.0, 0.01, _ANGLE,
         expected=CORRECTED,
-        tells=0.03, against="the other focal length, f across the line",
+        separation=0.03, alternative="the other focal length, f across the line",
     ),
     Check(
         "001.table1.d_gamma", _COLUMN, "Joint Δγ read per true Δγ, all four changing", "1", 1.0, 0.01, _ROLL,
         expected=CORRECTED,
-        tells=1.0, against="twice as much: the doubling by the reflection",
+        separation=1.0, alternative="twice as much: the doubling by the reflection",
     ),
     Check(
         "001.table1.d_f", _COLUMN, "Joint Δf read per true Δf, all four changing, Y_L signed as in (7)", "1", 1.0,
         0.01,
         _FOCAL, expected=CORRECTED,
-        tells=0.5, against="half of it", also=("001.table1.sign",),
+        separation=0.5, alternative="half of it", also=("001.table1.sign",),
     ),
     Check(
         "001.table1.d_gamma_by_d_beta", "section 2.5, Table 1",
         "The four changes do not mix: joint Δγ read per true Δβ", "1", 0.0, 0.02,
         "0.1 arcsec in a change of 5 arcsec, a twentieth of Table 5's error of Δγ", expected=REFUTED,
-        tells=0.5, against="the line tilt of another field",
+        separation=0.5, alternative="the line tilt of another field",
     ),
     Check(
         "001.table1.d_f_by_d_alpha", "section 2.5, Table 1",
         "The four changes do not mix: joint Δf read per true Δα", "µm/arcsec", 0.0, 0.2,
         "1 µm in a change of 5 arcsec, a fortieth of Table 5's error of Δf", expected=REFUTED,
-        tells=6.0, against="the plate scale of another field",
+        separation=6.0, alternative="the plate scale of another field",
     ),
     Check(
         "001.fig4.angle", "Fig. 4, section 3.2.3",
         "Both cameras' images by Table 1 give the change of their intersection angle: read / traced", "1", 1.0, 0.01,
         _ANGLE, expected=CORRECTED,
-        tells=0.03, against="the other focal length, f across the line",
+        separation=0.03, alternative="the other focal length, f across the line",
     ),
 )  # fmt: skip
 
@@ -120,7 +120,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     ratios: dict[str, Ratio] = {}
     for identifier, ratio, how in _spots(images):
         if identifier in context.selected:
-            yield context.check(identifier).judge(ratio.value, ratio.sigma, f"{how} By camera: {ratio.text}.")
+            yield context.check(identifier).evaluate(ratio.value, ratio.sigma, f"{how} By camera: {ratio.text}.")
             ratios[identifier] = ratio
     shown = {identifier: ratio.value for identifier, ratio in ratios.items()}
     if context.wants("001.table1"):
@@ -218,7 +218,7 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
                     f" Table 1 does not say what Y_L is. (2) has y01 − y11 on the left side, by which this is "
                     f"{-matrix[k, k]:.4f}, and (7) y11 − y01; for X, (3) and (5) agree."
                 )
-            yield context.check(identifier).judge(matrix[k, k], sigma[k, k], text, None, reasons[parameter])
+            yield context.check(identifier).evaluate(matrix[k, k], sigma[k, k], text, None, reasons[parameter])
     yield from _couplings(context, images, how, matrix, sigma, right)
     rows: list[list[Cell]] = [
         [
@@ -258,7 +258,7 @@ def _couplings(
             continue
         text = f"{how} With that gradient added (corrected form): {right[k, n]:.4f}."
         reason = Explanation(predicted, REFUTED, common.format(what=what))
-        yield context.check(f"001.table1.{name}").judge(matrix[k, n], sigma[k, n], text, None, [reason])
+        yield context.check(f"001.table1.{name}").evaluate(matrix[k, n], sigma[k, n], text, None, [reason])
 
 
 def _angle(context: Context, images: JointMotions) -> CheckResult:
@@ -275,7 +275,7 @@ def _angle(context: Context, images: JointMotions) -> CheckResult:
     )
     text = "The angle is the difference of two Δα, and both are too large by f_x/f, see 001.table1.d_alpha."
     reason = Explanation(f_x / g.focal_length_m, CORRECTED, text)
-    return context.check("001.fig4.angle").judge(slope, sigma, how, None, [reason])
+    return context.check("001.fig4.angle").evaluate(slope, sigma, how, None, [reason])
 
 
 GROUP = CheckGroup("001.joint", "Joint form (8)–(11), Table 1 and Fig. 4", 3.0, CHECKS, run, fast_seconds=1.0)

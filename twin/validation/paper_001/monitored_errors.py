@@ -34,34 +34,34 @@ _SHOWN = ("paper_single", "paper_joint", "derived")
 CHECKS = (
     *(
         Check(f"001.table5.{name}", "Table 5", f"{text}, all causes at once through images", unit, value, 0.2 * value,
-              _INPUTS, tells=0.5 * value, against="half as much or half as much again", basis="chosen")
+              _INPUTS, separation=0.5 * value, alternative="half as much or half as much again", basis="chosen")
         for name, (_, text, value, unit, *_) in _PARAMETERS.items()
     ),
     *(
         Check(f"001.table5.{name}.propagated", "Table 5, section 3.2.3", f"{text}, from the printed Table 4", unit,
-              value, tolerance, why, tells=0.4 * value, against="spots whose errors are one and the same",
+              value, tolerance, why, separation=0.4 * value, alternative="spots whose errors are one and the same",
               basis="chosen" if name in _OF_GEOMETRY else "printed")
         for name, (_, text, value, unit, tolerance, why) in _PARAMETERS.items()
     ),
     Check("001.table5.d_f.by_table1", "Table 5, section 3.2.3",
           "Table 5 follows from Tables 1 and 4: Δf by Table 1's last column from the printed Table 4", "mm",
           _PRINTED.number("table5.d_f_mm"), 0.005, _DIGITS, expected=CORRECTED,
-          tells=0.02, against="half of it"),
+          separation=0.02, alternative="half of it"),
     Check("001.table5.x_and_y", "section 3.2.3, abstract",
           "The turns about X and Y are determined to better than 0.1″: the larger, 3σ", "arcsec", 0.1, 0.02, _INPUTS,
           "at most",
-          tells=0.045, against="the error of a single spot, 0.145 arcsec", basis="chosen"),
+          separation=0.045, alternative="the error of a single spot, 0.145 arcsec", basis="chosen"),
     Check("001.table5.d_gamma.positioning", "section 3.2.3",
           "The error of Δγ has little influence on positioning: 2.15″ moves the line's end by at most one pixel", "px",
           None, 0.1, "a tenth of a pixel; the text gives no limit, one ground sample is taken for little", "at most",
-          tells=1.0, against="two pixels", basis="chosen"),
+          separation=1.0, alternative="two pixels", basis="chosen"),
     Check("001.table5.d_gamma.removable", "section 3.2.3",
           "Later photogrammetric processing removes the error of Δγ well", "arcsec", None, 0.0,
           "nothing is printed to compare with", expected=NOT_CHECKABLE),
     Check("001.table5.d_f.field", "section 3.2.3",
           "Δf is less accurate than from a calibration field: its 3σ is at least the 0.01 mm of paper 003", "mm", None,
           0.0, "the bound itself", "at least",
-          tells=0.009, against="a monitor ten times as good as a field", basis="chosen"),
+          separation=0.009, alternative="a monitor ten times as good as a field", basis="chosen"),
 )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         value = budget.propagated(TABLE_4, images.geometry, "paper_joint")["d_f"] / 1e-3
         how = "Table 1's joint factors on the printed Table 4; the other three rows come out alike by both columns."
         reason = Explanation(0.02, CORRECTED, "Table 1's joint Δf is half of (7), and Table 5 was made with (7).")
-        yield context.check("001.table5.d_f.by_table1").judge(value, None, how, None, [reason])
+        yield context.check("001.table5.d_f.by_table1").evaluate(value, None, how, None, [reason])
     if images.roll_pixels is not None:
         how = (
             "Line CCD turned by 2.15 arcsec, traced; the shift of the line of sight of its end. At the middle of the "
@@ -91,7 +91,7 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         pixel = Chosen.power("pixel of the line CCD", images.line_pixel * 1e6, "µm", images.roll_pixels, -1.0)
         limit = Supposed("one pixel taken for little", f"holds down to {images.roll_pixels:.2f} px")
         check = context.check("001.table5.d_gamma.positioning")
-        yield check.judge(images.roll_pixels, None, how, 1.0, inputs=[pixel, limit])
+        yield check.evaluate(images.roll_pixels, None, how, 1.0, inputs=[pixel, limit])
     if "001.table5.d_gamma.removable" in context.selected:
         yield context.check("001.table5.d_gamma.removable").not_checkable(
             "The text names neither a method nor what remains after it."
@@ -115,7 +115,7 @@ def _simulated(context: Context, images: BudgetImages, together: Together, name:
         joint = values["paper_joint"]
         how += f" Table 1's joint form gives half: {joint[0]:.3g} ± {joint[1]:.2g} mm."
     single = values["paper_single"]
-    return context.check(f"001.table5.{name}").judge(single[0], single[1], how, inputs=[all_causes(single[0])])
+    return context.check(f"001.table5.{name}").evaluate(single[0], single[1], how, inputs=[all_causes(single[0])])
 
 
 def all_causes(value: float) -> Chosen:
@@ -140,7 +140,7 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
                 return budget.propagated(TABLE_4, changed)[name] / _UNIT[unit]
 
             inputs.append(Chosen(what, size, "m", response))
-    return context.check(f"001.table5.{name}.propagated").judge(value, None, how, inputs=inputs)
+    return context.check(f"001.table5.{name}.propagated").evaluate(value, None, how, inputs=inputs)
 
 
 def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
@@ -153,7 +153,7 @@ def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
             "is determined to 0.145 arcsec only."
         )
         chosen = all_causes(value / ARCSEC)
-        yield context.check("001.table5.x_and_y").judge(value / ARCSEC, sigma / ARCSEC, how, inputs=[chosen])
+        yield context.check("001.table5.x_and_y").evaluate(value / ARCSEC, sigma / ARCSEC, how, inputs=[chosen])
     if "001.table5.d_f.field" in context.selected:
         value, sigma = found["d_f_m"]
         how = (
@@ -161,7 +161,7 @@ def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
             "interior orientation of its fields stable to 0.01 mm."
         )
         chosen = all_causes(value / 1e-3)
-        yield context.check("001.table5.d_f.field").judge(value / 1e-3, sigma / 1e-3, how, 0.01, inputs=[chosen])
+        yield context.check("001.table5.d_f.field").evaluate(value / 1e-3, sigma / 1e-3, how, 0.01, inputs=[chosen])
 
 
 def _show(context: Context, images: BudgetImages, together: Together) -> None:

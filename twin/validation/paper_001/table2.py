@@ -55,37 +55,37 @@ _TURNS = {
 CHECKS = (
     Check("001.table2.x", "Table 2, X", "About X both mirrors turn by Δβ: mean difference", "arcsec",
           MEAN_DIFFERENCE["X"], 0.230, _SPREAD,
-          tells=50.0, against="a wrong relation: cos 30° in place of 1", basis="chosen"),
+          separation=50.0, alternative="a wrong relation: cos 30° in place of 1", basis="chosen"),
     Check("001.table2.y", "Table 2, Y", "About Y mirror 2 reads Δα cos b: mean difference", "arcsec",
           MEAN_DIFFERENCE["Y"], 0.170, _SPREAD,
-          tells=50.0, against="a wrong relation: sine in place of cosine", basis="chosen"),
+          separation=50.0, alternative="a wrong relation: sine in place of cosine", basis="chosen"),
     Check("001.table2.z", "Table 2, Z", "About Z mirror 2 reads Δγ sin b: mean difference", "arcsec",
           MEAN_DIFFERENCE["Z"], 0.089, _SPREAD,
-          tells=50.0, against="a wrong relation: cosine in place of sine", basis="chosen"),
+          separation=50.0, alternative="a wrong relation: cosine in place of sine", basis="chosen"),
     *(
         Check(f"001.table2.relation.{axis}", "section 3.1.1", text, "1", 1.0, 1e-5, _SECOND,
-              tells=0.1, against="another sine or cosine of the angle between the mirrors")
+              separation=0.1, alternative="another sine or cosine of the angle between the mirrors")
         for axis, text in _TURNS.items()
     ),
     Check("001.table2.relation.mirror_1_z", "section 3.1.1, Table 2, Z",
           "About Z mirror 1 turns by Δγ, and autocollimator 1 shows it: read / true", "1", 1.0, 0.01,
           "a hundredth; the printed column grows by 0.866", expected=REFUTED,
-          tells=0.8, against="a mirror that does not turn its beam"),
+          separation=0.8, alternative="a mirror that does not turn its beam"),
     Check("001.table2.z_columns", "Table 2, Z", "The Z columns of mirrors 1 and 2 are two mirrors' readings: largest "
           "difference of the scaled columns", "arcsec", 4.66e-7, 0.01, "the last printed digit",
           expected=REFUTED,
-          tells=100.0, against="columns of mirrors of which one does not turn its beam"),
+          separation=100.0, alternative="columns of mirrors of which one does not turn its beam"),
     Check("001.table2.mean_error", "section 3.1.3", "The mean errors about the three axes are at most 0.5″: largest",
           "arcsec", 0.5, 0.05, "the next printed digit", "at most",
-          tells=0.25, against="half as much again", basis="chosen"),
+          separation=0.25, alternative="half as much again", basis="chosen"),
     Check("001.table2.below_1", "section 3.1.3, abstract", "The mean accuracies are all below 1″: the largest",
           "arcsec", 1.0, 0.05, "the next printed digit", "at most",
-          tells=0.5, against="half as much again", basis="chosen"),
+          separation=0.5, alternative="half as much again", basis="chosen"),
     *(
         Check(f"001.table2.claimed.{name}", "section 3.1.3, conclusion",
               f"The mean accuracy of {_AXES[name][0]} is {claimed}″: mean difference of the rows that are printed",
               "arcsec", claimed, 0.005, "half of the last printed digit", expected=CORRECTED,
-              tells=0.05, against="another first digit")
+              separation=0.05, alternative="another first digit")
         for name, claimed in _CLAIMED.items()
     ),
 )  # fmt: skip
@@ -128,7 +128,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     for axis, one in differences.items():
         identifier = f"001.table2.{axis.lower()}"
         if identifier in context.selected:
-            yield context.check(identifier).judge(one.value, one.sigma, one.how, inputs=[_errors(one.value)])
+            yield context.check(identifier).evaluate(one.value, one.sigma, one.how, inputs=[_errors(one.value)])
     if "001.table2.z_columns" in context.selected:
         yield _z_columns(context, found)
     yield from _relations(context, found)
@@ -213,7 +213,7 @@ def _z_columns(context: Context, found: Measured) -> CheckResult:
         "autocollimator cannot see."
     )
     reason = Explanation(float(ANGLES[-1]), REFUTED, text)
-    return context.check("001.table2.z_columns").judge(float(np.mean(apart)), sigma, how, None, [reason])
+    return context.check("001.table2.z_columns").evaluate(float(np.mean(apart)), sigma, how, None, [reason])
 
 
 def _errors(measured: float) -> Chosen:
@@ -241,7 +241,7 @@ def _relations(context: Context, found: Measured) -> Iterator[CheckResult]:
                     " The text has it about its own Z; that turn is Δγ cos b, and no autocollimator on its normal can "
                     "see it."
                 )
-            yield context.check(identifier).judge(read / factor, None, how)
+            yield context.check(identifier).evaluate(read / factor, None, how)
     identifier = "001.table2.relation.mirror_1_z"
     if identifier in context.selected:
         result = found.ideal["Z"]
@@ -252,7 +252,7 @@ def _relations(context: Context, found: Measured) -> Iterator[CheckResult]:
             "column of mirror 1 grows by 0.866 of the turn, sin 60°, which is mirror 2's."
         )
         expected = [Explanation(autocollimator.relation_factor("Z", 1, 0.0), REFUTED, reason)]
-        yield context.check(identifier).judge(read, None, how, None, expected)
+        yield context.check(identifier).evaluate(read, None, how, None, expected)
 
 
 def _limits(context: Context, axes: Mapping[str, MeanDifference], count: int) -> Iterator[CheckResult]:
@@ -267,7 +267,7 @@ def _limits(context: Context, axes: Mapping[str, MeanDifference], count: int) ->
             )
             sigma = axes[worst].sigma / math.sqrt(count)
             value = axes[worst].value
-            yield context.check(identifier).judge(value, sigma, how, inputs=[_errors(value)])
+            yield context.check(identifier).evaluate(value, sigma, how, inputs=[_errors(value)])
 
 
 def _claimed(context: Context, name: str) -> CheckResult:
@@ -283,7 +283,7 @@ def _claimed(context: Context, name: str) -> CheckResult:
         "the print supports is the table's own."
     )
     reason = Explanation(MEAN_DIFFERENCE[axis], CORRECTED, text)
-    return context.check(f"001.table2.claimed.{name}").judge(value, None, how, None, [reason])
+    return context.check(f"001.table2.claimed.{name}").evaluate(value, None, how, None, [reason])
 
 
 def _show(context: Context, found: Measured) -> None:

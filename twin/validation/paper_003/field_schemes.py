@@ -30,7 +30,7 @@ CHECKS = (
             f"003.scheme{k}.plan", "Table 6, section 4.4",
             f"Scheme {k}, {name}: RMS in plan without ground control, mean of the seven fields, against what the true "
             "biases imply", "m", None, 0.6, "0.3 m of the orbit and 0.12″ = 0.3 m of an estimated bias, both axes",
-            tells=2.4, against="biases that are 1″ off", basis="theory",
+            separation=2.4, alternative="biases that are 1″ off", basis="theory",
             theory="roll and pitch less their mean times the height of flight",
         )
         for k, name in NAMES.items()
@@ -39,7 +39,7 @@ CHECKS = (
         "003.scheme1.height", "Table 7, section 4.4",
         "Scheme 1: RMS in height over that with the true camera and the true biases", "1", None, 0.1,
         "an RMS over 100 check points is known to 7 %", "at most",
-        tells=1.0, against="twice the error", basis="theory",
+        separation=1.0, alternative="twice the error", basis="theory",
         theory="a calibration that gives back the true camera",
     ),
     *(
@@ -47,7 +47,7 @@ CHECKS = (
             f"003.scheme{k}.height", _FINDING,
             f"Height hardly differs between the schemes: RMS by scheme {k} over that by scheme 1", "1", None, 0.1,
             "an RMS over 100 check points is known to 7 %",
-            tells=0.5, against="heights worse or better by half", basis="chosen",
+            separation=0.5, alternative="heights worse or better by half", basis="chosen",
         )
         for k in (2, 3, 4, 5)
     ),
@@ -56,7 +56,7 @@ CHECKS = (
             f"003.scheme{k}.uneven", _FINDING,
             f"With the parameters of {'one field' if k == 1 else 'two fields'} the accuracy is uneven over the fields: "
             "scatter of the RMS in plan over that by six fields", "1", None, 0.1, "less than a tenth is no difference",
-            "at least", tells=1.0, against="an even accuracy", basis="chosen",
+            "at least", separation=1.0, alternative="an even accuracy", basis="chosen",
         )
         for k in (1, 2)
     ),
@@ -64,42 +64,42 @@ CHECKS = (
         "003.scheme4.even", _FINDING,
         "With more fields the accuracy evens out: largest over smallest RMS in plan by scheme 4, over that by scheme 1",
         "1", None, 0.1, "less than a tenth is no difference", "at most",
-        tells=1.0, against="twice as uneven", basis="chosen",
+        separation=1.0, alternative="twice as uneven", basis="chosen",
     ),
     Check(
         "003.scheme4.improves", _FINDING,
         "Plan improves clearly, by a tenth, with the number of fields: mean RMS by scheme 4 over that by scheme 1", "1",
         None, 0.03, "seven RMS over 100 points each know their mean to 3 %", "at most",
-        tells=0.2, against="a tenth worse in place of better", basis="chosen",
+        separation=0.2, alternative="a tenth worse in place of better", basis="chosen",
     ),
     Check(
         "003.scheme4.unseen", _FINDING,
         "The same in Jiangxi, the one field that is in no mean", "1", None, 0.1,
         "less than a tenth is no difference", "at most",
-        tells=1.0, against="twice as bad", basis="chosen",
+        separation=1.0, alternative="twice as bad", basis="chosen",
     ),
     Check(
         "003.scale50000.plan", "section 5, conclusion",
         "With mean parameters of several fields, scheme 4, plan without ground control suffices for 1:50 000: RMS of "
         "the worst field", "m", None, 1.0, "a fifth of a pixel; the limit is assumed, the paper prints none", "at most",
-        tells=25.0, against="1:100 000, twice the limit", basis="chosen",
+        separation=25.0, alternative="1:100 000, twice the limit", basis="chosen",
     ),
     Check(
         "003.scale50000.height", "section 5, conclusion",
         "Height by scheme 4 without ground control suffices for 1:50 000: RMS of the worst field", "m", None, 0.6,
         "a tenth of the limit, which is assumed, the paper prints none", "at most",
-        tells=6.0, against="contours of 40 m, twice the limit", basis="chosen",
+        separation=6.0, alternative="contours of 40 m, twice the limit", basis="chosen",
     ),
     Check(
         "003.before.plan", "section 1", "Before calibration errors are of the class of 100 m: RMS in plan", "m", 100.0,
         100.0 - 10**1.5, "a class reaches down to 1/√10 of its number",
-        tells=90.0, against="the class of 10 m", basis="chosen",
+        separation=90.0, alternative="the class of 10 m", basis="chosen",
     ),
     Check(
         "003.before.height", "section 1", "Before calibration errors are of the class of 100 m: RMS in height", "m",
         100.0, 100.0 - 10**1.5,
         "a class reaches down to 1/√10 of its number",
-        tells=90.0, against="the class of 10 m", basis="chosen",
+        separation=90.0, alternative="the class of 10 m", basis="chosen",
     ),
 )  # fmt: skip
 
@@ -130,7 +130,7 @@ def _plan(context: Context, flights: Flights) -> Iterator[CheckResult]:
         )
         if k == len(NAMES):
             how += " Check points and control points see the same season: this is no test of the next pass."
-        yield context.check(f"003.scheme{k}.plan").judge(value, sigma, how, expected)
+        yield context.check(f"003.scheme{k}.plan").evaluate(value, sigma, how, expected)
 
 
 def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
@@ -142,7 +142,7 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
             "the star trackers from the forward to the aft image, 0.3″ of pitch or 1 m, goes into the calibrated "
             "interior; with the true one it stays in the heights. The numbers of Table 7 are lost."
         )
-        yield context.check("003.scheme1.height").judge(value, sigma, how, 1.0)
+        yield context.check("003.scheme1.height").evaluate(value, sigma, how, 1.0)
     for k in (2, 3, 4, 5):
         if f"003.scheme{k}.height" in context.selected:
             value, sigma = median(height[:, k - 1] / height[:, 0])
@@ -155,7 +155,7 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
             # what an interior of its own in every field would add to the heights in square
             more = np.sqrt((1.0 + check.tolerance + SIGMAS * sigma) ** 2 - 1.0) * float(np.median(height[:, 0]))
             said = f"holds while x of the forward line wanders by up to {1e6 * more / _per_shift(setup):.2g} µm"
-            yield check.judge(value, sigma, how, 1.0, inputs=[Supposed("one interior for all fields", said)])
+            yield check.evaluate(value, sigma, how, 1.0, inputs=[Supposed("one interior for all fields", said)])
 
 
 def _per_shift(setup: CalibrationSetup) -> float:
@@ -205,10 +205,10 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
     spread, mean = flights.plan.std(axis=2), flights.plan.mean(axis=2)
     ratio = flights.plan.max(axis=2) / flights.plan.min(axis=2)
 
-    def judged(identifier: str, statistic: Callable[[np.ndarray], np.ndarray], how: str, implied: float) -> CheckResult:
+    def row(identifier: str, statistic: Callable[[np.ndarray], np.ndarray], how: str, implied: float) -> CheckResult:
         value, sigma = median(statistic(flights.plan))
         chosen = _varied(value, flights, statistic)
-        return context.check(identifier).judge(value, sigma, how, implied, inputs=[chosen])
+        return context.check(identifier).evaluate(value, sigma, how, implied, inputs=[chosen])
 
     for k in (1, 2):
         if f"003.scheme{k}.uneven" in context.selected:
@@ -217,7 +217,7 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
                 f"{_campaigns(flights)}. Medians: {float(np.median(spread[:, k - 1])):.2f} m against "
                 f"{float(np.median(spread[:, 3])):.2f} m. True in {_share(values > 1.0)} campaigns."
             )
-            yield judged(f"003.scheme{k}.uneven", partial(_uneven, k=k), how, 1.0)
+            yield row(f"003.scheme{k}.uneven", partial(_uneven, k=k), how, 1.0)
     if "003.scheme4.even" in context.selected:
         values = _even(flights.plan)
         how = (
@@ -225,7 +225,7 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
             f"{float(np.median(ratio[:, 3])):.1f} by scheme 4, {float(np.median(ratio[:, 4])):.1f} by scheme 5; more "
             f"even than scheme 1 in {_share(values < 1.0)} campaigns. No mean evens out a field's own season."
         )
-        yield judged("003.scheme4.even", _even, how, 1.0)
+        yield row("003.scheme4.even", _even, how, 1.0)
     if "003.scheme4.improves" in context.selected:
         values = _improved(flights.plan)
         steps = ", ".join(f"{float(np.median(v)):.2f}" for v in mean.T)
@@ -234,7 +234,7 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
             f"{_share(values < 1.0)} campaigns. One campaign, as the paper has it, may show anything from "
             f"{float(np.min(values)):.2f} to {float(np.max(values)):.2f}."
         )
-        yield judged("003.scheme4.improves", _improved, how, 0.9)
+        yield row("003.scheme4.improves", _improved, how, 0.9)
     if "003.scheme4.unseen" in context.selected:
         values = _unseen(flights.plan)
         how = (
@@ -242,7 +242,7 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
             f"{float(np.median(flights.plan[:, 3, -1])):.1f} m by scheme 4; better in {_share(values < 1.0)} "
             "campaigns. The six other fields are in the mean that they test."
         )
-        yield judged("003.scheme4.unseen", _unseen, how, 1.0)
+        yield row("003.scheme4.unseen", _unseen, how, 1.0)
 
 
 def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
@@ -263,7 +263,7 @@ def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Itera
             "biases that vary by 1″ a single field's parameters would do as well."
         )
         check, limit = context.check(f"003.scale50000.{what}"), getattr(limits, what)
-        yield check.judge(value, sigma, how, limit, inputs=[all_errors(value)])
+        yield check.evaluate(value, sigma, how, limit, inputs=[all_errors(value)])
 
 
 def _before(context: Context, flights: Flights) -> Iterator[CheckResult]:
@@ -276,7 +276,7 @@ def _before(context: Context, flights: Flights) -> Iterator[CheckResult]:
                 "in plan are 41″ of the look; in height they are 110 µm between x of the forward and the aft line."
             )
             chosen = Chosen.power("what the launch changes, times", 1.0, "1", value)
-            yield context.check(f"003.before.{what}").judge(value, sigma, how, inputs=[chosen])
+            yield context.check(f"003.before.{what}").evaluate(value, sigma, how, inputs=[chosen])
 
 
 def _share(true: np.ndarray) -> str:

@@ -78,7 +78,7 @@ CHECKS = (
         "003.model", _SECTION, "The rigorous model of the line scanner: largest distance of marks in rendered images "
         "from where the model sees their ground points", "px", None, 0.01,
         "a matched point is known to 0.1 px; one percent of a pixel is 5 cm on the ground", "at most",
-        tells=0.1, against="what a matched point is wrong by", basis="theory",
+        separation=0.1, alternative="what a matched point is wrong by", basis="theory",
         theory="collinearity of station, ground point and image point",
     ),
     Check(
@@ -86,7 +86,7 @@ CHECKS = (
         "Coefficients of f, x, y of each line, roll, pitch and yaw: largest difference from the motion of image points "
         "of the rigorous sensor, relative", "1", None, 1e-6,
         "steps of 15 µm and 15 µrad leave 1e-8 of third order and of the sensor's 1e-7 px", "at most",
-        tells=0.5, against="a coefficient with half its size, or with a wrong sign", basis="theory",
+        separation=0.5, alternative="a coefficient with half its size, or with a wrong sign", basis="theory",
         theory="derivatives of the collinearity equations",
     ),
     Check(
@@ -94,60 +94,60 @@ CHECKS = (
         "Exact points give back interior and biases: largest error of an unknown, as image motion", "px", None, 1e-5,
         "the sensor's image points are solved to 1e-7 px, and a hundredth of all points decides on one unknown",
         "at most",
-        tells=0.1, against="what a matched point is wrong by", basis="theory",
+        separation=0.1, alternative="what a matched point is wrong by", basis="theory",
         theory="least squares on exact data gives back what made them",
     ),
     Check(
         "003.model.rank", "section 2, unknowns",
         "f, x and y of three cameras and three attitude biases are determined: rank of these twelve", "1", None, 0.1,
         "a whole number", expected=CORRECTED,
-        tells=1.0, against="one combination of unknowns that is left open",
+        separation=1.0, alternative="one combination of unknowns that is left open",
     ),
     Check(
         "003.model.stepwise", "section 3.1, Fig. 1",
         "Biases and interior solved in turns and iterated give the calibration: largest difference from the "
         "simultaneous solution, sigmas", "1", None, 0.1,
         "a tenth of a sigma is lost in the noise of the points", "at most",
-        tells=1.0, against="a solution one sigma away",
+        separation=1.0, alternative="a solution one sigma away",
     ),
     Check(
         "003.model.points", "section 4.1, control points",
         "Points in rendered images, matched with an orthophoto of another season: RMS of a coordinate against truth; "
         "the campaigns draw 0.3 px", "px", None, 0.0, "what is drawn must not be better than what is measured",
         "at most",
-        tells=0.1, against="points worse by 0.1 px than what is drawn", basis="theory",
+        separation=0.1, alternative="points worse by 0.1 px than what is drawn", basis="theory",
         theory="the 0.3 px of noise that the campaigns draw",
     ),
     Check(
         "003.model.bias", "section 4.3, Table 3",
         "Rendered field by the stepwise solution: roll and pitch are known to the class of 1″, RMS error", "arcsec",
         1.0, _SECOND, _CLASS, "at most",
-        tells=9.0, against="the class of 10″", basis="chosen",
+        separation=9.0, alternative="the class of 10″", basis="chosen",
     ),
     Check(
         "003.model.bias.yaw", "section 4.3, Table 3",
         "The same of yaw, the third axis, in the scatter that its sigma states: error over sigma", "1", None, 4.0,
         "4 sigmas: one false alarm in 16 000", "at most",
-        tells=10.0, against="a sigma three and more times too small", basis="theory",
+        separation=10.0, alternative="a sigma three and more times too small", basis="theory",
         theory="normal errors of the stated sigma",
     ),
     Check(
         "003.model.interior", "section 4.3, Tables 4 and 5",
         "Rendered field by the stepwise solution: the interior is known to the class of 0.01 mm, RMS error", "µm",
         10.0, 10.0 * _SECOND, _CLASS, "at most",
-        tells=90.0, against="the class of 0.1 mm", basis="chosen",
+        separation=90.0, alternative="the class of 0.1 mm", basis="chosen",
     ),
     Check(
         "003.model.plan", "sections 3.2 and 4.5",
         "The same field, check points matched in the images, no ground control: RMS in plan within 1:50 000", "m",
         None, 1.0, "a fifth of a pixel; the limit, 0.5 mm on the map, is assumed, the paper prints none", "at most",
-        tells=25.0, against="1:100 000, twice the limit", basis="chosen",
+        separation=25.0, alternative="1:100 000, twice the limit", basis="chosen",
     ),
     Check(
         "003.model.height", "sections 3.2 and 4.5",
         "The same check points of the rendered field: RMS in height within 1:50 000", "m", None, 0.6,
         "a tenth of the limit, which is usual for contours of 20 m and assumed, the paper prints none", "at most",
-        tells=6.0, against="contours of 40 m, twice the limit", basis="chosen",
+        separation=6.0, alternative="contours of 40 m, twice the limit", basis="chosen",
     ),
     Check(
         "003.fig1", "Fig. 1", "Flow of the calibration", "1", None, 0.0, "the figure is lost", expected=NOT_CHECKABLE,
@@ -211,7 +211,7 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             "time, aberration (2.5 px) and refraction, which the text does not mention, are taken out of image points "
             "before the model is used."
         )
-        yield context.check("003.model").judge(worst, None, how, 0.0)
+        yield context.check("003.model").evaluate(worst, None, how, 0.0)
     if "003.equations" in context.selected:
         found = exact.derivatives(setup, one, one.bias)
         line, name, worst = found.worst
@@ -220,7 +220,7 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             "unknown of the rigorous sensor is changed to either side, and what the unchanged model misses at the new "
             f"image points is minus the coefficient. Worst: {name} of the {line} line."
         )
-        yield context.check("003.equations").judge(worst, None, how, 0.0)
+        yield context.check("003.equations").evaluate(worst, None, how, 0.0)
     if "003.equations.exact" in context.selected:
         worst, name = exact.recovered(campaign, pitch)
         how = (
@@ -228,7 +228,7 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             f"changes of 50 to 95 µm are found from the laboratory's values. Worst: {name}. The gauge of "
             "003.model.rank holds x and y of the nadir line."
         )
-        yield context.check("003.equations.exact").judge(worst, None, how, 0.0)
+        yield context.check("003.equations.exact").evaluate(worst, None, how, 0.0)
 
 
 def exact_misses(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, np.ndarray]:
@@ -254,7 +254,7 @@ def _drawn(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             "x of all three lines against pitch, x_l = x_v = x_r: one of them must be held (gauge), which the text "
             "does not say; the stepwise solution hides it, for each of its steps has full rank.",
         )
-        yield context.check("003.model.rank").judge(found.rank, None, how, float(UNKNOWNS), (reason,))
+        yield context.check("003.model.rank").evaluate(found.rank, None, how, float(UNKNOWNS), (reason,))
         context.add(
             SvgFigure(
                 "open",
@@ -273,7 +273,7 @@ def _drawn(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             f"against y of the outer lines. Sigmas away: {after} rounds. The simultaneous adjustment takes "
             f"{way.together.iterations} steps. A few rounds are not enough, and small steps are no sign of an end."
         )
-        yield context.check("003.model.stepwise").judge(way.distance, None, how, 0.0)
+        yield context.check("003.model.stepwise").evaluate(way.distance, None, how, 0.0)
 
 
 UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
@@ -312,7 +312,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             f"{size}. {total.matched} places pass the matching, {total.wrong_matched} of them wrong by truth; "
             "control points are identified less well by eye, and the campaigns take 0.3 px."
         )
-        yield context.check("003.model.points").judge(rms, None, how, setup_of(FIELDS).test.errors.image)
+        yield context.check("003.model.points").evaluate(rms, None, how, setup_of(FIELDS).test.errors.image)
     rounds = ", ".join(str(f.way.rounds) for f in found)
     for identifier, names, unit in (
         ("003.model.bias", tuple(ROLL_PITCH), ARCSEC),
@@ -322,7 +322,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             rms, sigma = _worst(found, names)
             said = " ".join(rendered.told(f, names) for f in found)
             how = f"{size}. Error and sigma: {said} The worst field counts. Rounds of the stepwise solution: {rounds}."
-            yield context.check(identifier).judge(rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)])
+            yield context.check(identifier).evaluate(rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)])
     if "003.model.bias.yaw" in context.selected:
         values = {f.name: abs(f.error[n]) / f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW}
         sigma = max(f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW) / ARCSEC
@@ -332,7 +332,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             + f" Yaw of one field by itself is known to {sigma:.1f}″ only: it goes with y of the forward and aft "
             "lines. In plan that does not show, for the two cancel."
         )
-        yield context.check("003.model.bias.yaw").judge(max(values.values()), None, how, 0.0)
+        yield context.check("003.model.bias.yaw").evaluate(max(values.values()), None, how, 0.0)
     for what in ("plan", "height"):
         if f"003.model.{what}" in context.selected:
             worst = max(found, key=lambda f: getattr(f.after, f"{what}_rms"))
@@ -344,7 +344,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
                 "points, whose error in the orthophoto they share."
             )
             limit = getattr(setup.test.limits, what)
-            yield context.check(f"003.model.{what}").judge(rms, sigma, how, limit, inputs=[all_errors(rms)])
+            yield context.check(f"003.model.{what}").evaluate(rms, sigma, how, limit, inputs=[all_errors(rms)])
     _table(context, found)
 
 

@@ -86,33 +86,33 @@ CHECKS = (
         "RMS of third differences of orbit and attitude are of one order of magnitude in the seven fields: largest "
         "over smallest, worst axis", "1", None, 1.0, "a tenth of the factor of ten that an order of magnitude is",
         "at most",
-        tells=20.0, against="two orders of magnitude, which begin at 10 √10", basis="chosen",
+        separation=20.0, alternative="two orders of magnitude, which begin at 10 √10", basis="chosen",
     ),
     Check(
         "003.table2.white", "Table 2, section 4.2",
         "Third differences tell the precision of the attitude: RMS / √20 over the true error of a reading against its "
         "neighbours", "1", None, 0.03, "960 readings of a pass know it to 4 %, and there are many passes",
-        tells=0.4, against="second differences taken for third ones", basis="theory",
+        separation=0.4, alternative="second differences taken for third ones", basis="theory",
         theory="third differences of white noise have √20 of its sigma",
     ),
     Check(
         "003.table2.orbit", "Table 2, section 4.2",
         "Third differences tell the accuracy of the orbit: RMS / √20 over the true error of a position", "1", None,
         0.05, "a twentieth; the orbit's slow errors of all passes are known to 7 %", expected=CORRECTED,
-        tells=0.8, against="the noise alone",
+        separation=0.8, alternative="the noise alone",
     ),
     Check(
         "003.table2.equal", "Table 2, section 4.2",
         "Fields whose third differences are alike may have equal weights: their ratio goes with that of the true "
         "attitude errors", "1", None, 0.2, "a fifth, where the true errors differ by more than two", expected=CORRECTED,
-        tells=1.5, against="differences that show nothing",
+        separation=1.5, alternative="differences that show nothing",
     ),
     *(
         Check(
             f"003.table3.{axis}", "Table 3, section 4.3",
             f"{axis} of the seven fields, each calibrated by itself, agrees to the class of 1″: scatter over the "
             "fields", "arcsec", 1.0, ROOT_TEN - 1.0, _CLASS, "at most",
-            tells=9.0, against="the class of 10″", basis="chosen",
+            separation=9.0, alternative="the class of 10″", basis="chosen",
         )
         for axis in BIAS
     ),
@@ -120,20 +120,20 @@ CHECKS = (
         "003.table3.truth", "Table 3, section 4.3",
         "The biases of Table 3 are true to the class of 1″: RMS error of roll and pitch", "arcsec", 1.0,
         ROOT_TEN - 1.0, _CLASS, "at most",
-        tells=9.0, against="the class of 10″", basis="chosen",
+        separation=9.0, alternative="the class of 10″", basis="chosen",
     ),
     Check(
         "003.table3.latitude", "Table 3, Figs. 4 to 6",
         "The biases vary with latitude: slope of roll and pitch over its own sigma, three would tell it", "1", None,
         0.3, "a tenth of the three sigmas", "at least", expected=CORRECTED,
-        tells=3.0, against="no slope at all",
+        separation=3.0, alternative="no slope at all",
     ),
     *(
         Check(
             f"003.fig{number}", f"Fig. {number}",
             f"{axis} over latitude: amplitude of its sine from the estimates of seven fields against that of the true "
-            "biases", "arcsec", None, 1.0, "the class of 1″", expected=expected, tells=tells, basis="theory",
-            against="three quarters of the assumed amplitude less", theory="the same fit of the true biases",
+            "biases", "arcsec", None, 1.0, "the class of 1″", expected=expected, separation=tells, basis="theory",
+            alternative="three quarters of the assumed amplitude less", theory="the same fit of the true biases",
         )
         for number, axis, tells, expected in (
             (4, "roll", 3.0, CONSISTENT), (5, "pitch", 3.0, CONSISTENT), (6, "yaw", 2.25, UNDECIDED),
@@ -143,13 +143,13 @@ CHECKS = (
         "003.table4", "Table 4, section 4.3",
         "Interior orientation repeats to the class of 0.01 mm, taken for the principal points: scatter of x and y over "
         "the fields", "µm", 10.0, 10.0 * (ROOT_TEN - 1.0), _CLASS, "at most",
-        tells=90.0, against="the class of 0.1 mm", basis="chosen",
+        separation=90.0, alternative="the class of 0.1 mm", basis="chosen",
     ),
     Check(
         "003.table5", "Table 5, section 4.3",
         "Interior orientation repeats to the class of 0.01 mm, taken for the principal distances: scatter of f over "
         "the fields", "µm", 10.0, 10.0 * (ROOT_TEN - 1.0), _CLASS, "at most",
-        tells=90.0, against="the class of 0.1 mm", basis="chosen",
+        separation=90.0, alternative="the class of 0.1 mm", basis="chosen",
     ),
 )  # fmt: skip
 
@@ -183,7 +183,7 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
             "All fields are given the same noise here, so that this is what chance does to seven equal fields."
         )
         noise = Chosen.power("noise of the worst field over that of the best, times", 1.0, "1", worst)
-        yield context.check("003.table2").judge(worst, sigma, how, 10.0, inputs=[noise])
+        yield context.check("003.table2").evaluate(worst, sigma, how, 10.0, inputs=[noise])
     if "003.table2.white" in context.selected:
         ratio = found.attitude_sigma / found.attitude_jump
         how = (
@@ -191,7 +191,7 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
             f"with the next: {float(np.sqrt(np.mean(found.attitude_jump**2))) / ARCSEC:.3f}″. White noise has third "
             "differences of √20 of its sigma."
         )
-        yield context.check("003.table2.white").judge(
+        yield context.check("003.table2.white").evaluate(
             float(np.mean(ratio)), float(np.std(ratio) / np.sqrt(ratio.size)), how, 1.0
         )
     if "003.table2.orbit" in context.selected:
@@ -216,7 +216,7 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
             "Third differences see only what changes from one reading to the next. Errors that last for seconds or "
             "more, which move ground points alike, are not in Table 2; equal weights need equal slow errors as well.",
         )
-        yield context.check("003.table2.equal").judge(
+        yield context.check("003.table2.equal").evaluate(
             float(np.mean(shown)), float(np.std(shown) / np.sqrt(shown.size)), how, truth, (reason,)
         )
 
@@ -238,7 +238,7 @@ def _orbit(context: Context, told: np.ndarray, error: np.ndarray, setup: Calibra
         f"Third differences see the noise of {noise:g} m; the orbit's slow error of {drift:g} m, which lasts for half "
         "an hour and moves the whole field, is not in them.",
     )
-    return context.check("003.table2.orbit").judge(implied / true, sigma, how, 1.0, (reason,))
+    return context.check("003.table2.orbit").evaluate(implied / true, sigma, how, 1.0, (reason,))
 
 
 def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
@@ -257,7 +257,7 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
             )
             if axis == "yaw":
                 how += " The scatter is mostly that of the estimate: yaw goes with y of the outer lines."
-            yield context.check(f"003.table3.{axis}").judge(value, sigma, how, inputs=[all_errors(value)])
+            yield context.check(f"003.table3.{axis}").evaluate(value, sigma, how, inputs=[all_errors(value)])
     if "003.table3.truth" in context.selected:
         values = np.sqrt(np.mean(error[:, :, :2] ** 2, axis=(1, 2)))
         ratio = float(np.sqrt(np.mean((error[:, :, :2] * ARCSEC / flights.bias_sigma[:, :, :2]) ** 2)))
@@ -267,7 +267,7 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
             "0.12″, nor that readings are shared."
         )
         value, sigma = median(values)
-        yield context.check("003.table3.truth").judge(value, sigma, how, inputs=[all_errors(value)])
+        yield context.check("003.table3.truth").evaluate(value, sigma, how, inputs=[all_errors(value)])
     if "003.table3.latitude" in context.selected:
         told = np.array([[abs(f.amplitude) / f.amplitude_sigma for f in row[:2]] for row in flights.fits])
         share = float(np.mean(told >= _TOLD))
@@ -284,7 +284,7 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
         # quartiles, for few fields make long tails; roll and pitch are drawn apart
         low, value, high = np.percentile(told, [25.0, 50.0, 75.0])
         sigma = MEDIAN * (high - low) / (2.0 * _QUARTILE) / float(np.sqrt(told.size))
-        yield context.check("003.table3.latitude").judge(float(value), float(sigma), how, _TOLD, (reason,))
+        yield context.check("003.table3.latitude").evaluate(float(value), float(sigma), how, _TOLD, (reason,))
 
 
 def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResult:
@@ -299,7 +299,7 @@ def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResu
         f"scatter by {float(np.std(away, ddof=1)):.1f}″ about that of the true biases. Which figure shows which angle "
         "is not in the text."
     )
-    return context.check(f"003.fig{number}").judge(float(amplitude.mean()), sigma, how, float(true.mean()))
+    return context.check(f"003.fig{number}").evaluate(float(amplitude.mean()), sigma, how, float(true.mean()))
 
 
 def _interior(context: Context, flights: Flights, number: int, parts: tuple[str, ...], what: str) -> CheckResult:
@@ -318,7 +318,7 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
         f"that is the same in all fields. Which of Tables 4 and 5 holds the {what} is not in the text."
     )
     value, sigma = median(rms)
-    return context.check(f"003.table{number}").judge(value, sigma, how, inputs=[all_errors(value)])
+    return context.check(f"003.table{number}").evaluate(value, sigma, how, inputs=[all_errors(value)])
 
 
 def _campaigns(flights: Flights) -> str:

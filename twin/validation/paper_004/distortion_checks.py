@@ -18,7 +18,7 @@ from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.checks.printed import load_printed
 from twin.validation.paper_004 import orientation, sensitivity_checks
 from twin.validation.paper_004.figures_004 import points_svg, reduction_svg
-from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS, SpotTest, judge_equations
+from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS, SpotTest, evaluate_equations
 from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]
@@ -36,27 +36,27 @@ CHECKS = (
     *sensitivity_checks.CHECKS,
     Check("004.table2.reduction", "Table 2, section 3.3", "By Table 2, compensated angles lower the RMS of the "
           "distortion by 35 %: RMS over the points", "%", 100.0 * REDUCTION, 1.0, _DIGIT,
-          expected=REFUTED, tells=8.7, against="the reduction of the mean, 26.3 %"),
+          expected=REFUTED, separation=8.7, alternative="the reduction of the mean, 26.3 %"),
     Check("004.table2.mean", "Table 2, section 3.3", "The same: mean over the points", "%",
           100.0 * REDUCTION, 1.0, _DIGIT, expected=REFUTED,
-          tells=8.7, against="the reduction that the columns give"),
+          separation=8.7, alternative="the reduction that the columns give"),
     Check("004.table2.largest", "Table 2, section 3.3", "The same: largest value of any point", "%",
           100.0 * REDUCTION, 1.0, _DIGIT,
-          tells=8.7, against="the reduction of the mean"),
+          separation=8.7, alternative="the reduction of the mean"),
     Check("004.table2.bound", "Table 2, abstract", "The distortion is tested to better than 2.3 µm: largest value of "
           "the compensated column", "µm", ACCURACY_UM, 0.0, "the bound itself", "at most",
-          tells=1.2, against="the raw column's largest value"),
+          separation=1.2, alternative="the raw column's largest value"),
     Check("004.table2.accuracy", "abstract", "Accuracy of the distortion with compensated angles: largest RMS error "
           "over the field of any test", "µm", ACCURACY_UM, 0.05,
           "half of the last printed digit", "at most",
-          tells=2.3, against="twice the accuracy that the paper claims", basis="chosen"),
+          separation=2.3, alternative="twice the accuracy that the paper claims", basis="chosen"),
     Check("004.table2.compensation", "section 3.3", "Compensated angles lower the RMS of the distortion: median "
           "reduction of its error", "%", 100.0 * REDUCTION, 1.0, _DIGIT, expected=UNDECIDED,
-          tells=11.0, against="the 24 % of Table 2 itself", basis="chosen"),
+          separation=11.0, alternative="the 24 % of Table 2 itself", basis="chosen"),
     Check("004.table2.points", "Table 2", "Compensation changes 19 of 55 points by 0.1 µm or more: share of the points",
           "%", 100.0 * float(np.mean(RAW != COMPENSATED)), 15.0,
           "eight points of 55: how far a dividing error goes from table to table", expected=REFUTED,
-          tells=50.0, against="a correction that changes nearly every point"),
+          separation=50.0, alternative="a correction that changes nearly every point"),
 )  # fmt: skip
 
 _PRINTED_ONLY = ("004.table2.reduction", "004.table2.mean", "004.table2.largest", "004.table2.bound")
@@ -70,15 +70,15 @@ def run(context: Context) -> Iterator[CheckResult]:
     if not context.selected - set(_PRINTED_ONLY):
         return
     runs = measured_tests(context)
-    yield from judge_equations(context, runs)
-    for result in sensitivity_checks.judge_sensitivity(context, runs):
+    yield from evaluate_equations(context, runs)
+    for result in sensitivity_checks.evaluate_sensitivity(context, runs):
         if result.id in context.selected:
             yield result
     if "004.turntable.compensated" in context.selected:
-        yield sensitivity_checks.judge_angles(context.check("004.turntable.compensated"), runs)
-    for identifier, judge in _JUDGES.items():
+        yield sensitivity_checks.evaluate_angles(context.check("004.turntable.compensated"), runs)
+    for identifier, evaluate in _EVALUATIONS.items():
         if identifier in context.selected:
-            yield judge(context.check(identifier), runs)
+            yield evaluate(context.check(identifier), runs)
     _show(context, runs)
 
 
@@ -127,13 +127,13 @@ def _table2(context: Context) -> Iterator[CheckResult]:
             f"The table's own columns give {value:.1f} %. Text and table are both the paper's and contradict each "
             "other; 35 % can be had of the largest values alone, see 004.table2.largest."
         )
-        yield check.judge(value, sigma, how + more * (name == "reduction"), otherwise=text)
+        yield check.evaluate(value, sigma, how + more * (name == "reduction"), otherwise=text)
     how = (
         f"Point {int(np.argmax(own)) + 1} of the printed column. An RMS of the distortion over repeated tests is no "
         "accuracy, for it holds the camera's distortion and not what the table's dividing error adds to every test "
         "alike; 004.table2.accuracy compares with the truth."
     )
-    yield context.check("004.table2.bound").judge(float(np.max(own)), None, how)
+    yield context.check("004.table2.bound").evaluate(float(np.max(own)), None, how)
 
 
 def _accuracy(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
@@ -144,7 +144,7 @@ def _accuracy(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         f"{np.median(raw):.2f} and {np.max(raw):.2f} µm. The fit has the constant term that (1) lacks."
     )
     value = float(np.max(own))
-    return check.judge(value, None, how, inputs=[dividing(value)])
+    return check.evaluate(value, None, how, inputs=[dividing(value)])
 
 
 def _compensation(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
@@ -161,7 +161,7 @@ def _compensation(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         "is the scatter of one."
     )
     value = float(np.median(less))
-    return check.judge(value, float(np.std(less, ddof=1)), how, inputs=[dividing(value, 0.0)])
+    return check.evaluate(value, float(np.std(less, ddof=1)), how, inputs=[dividing(value, 0.0)])
 
 
 def _points(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
@@ -183,7 +183,7 @@ def _points(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         "every point changes; a change d shows in tenths of a micrometre with a chance of d / 0.1 µm. The table's two "
         "thirds of equal entries do not come from such a correction."
     )
-    return check.judge(value, sigma, how, None, [Explanation(expected, REFUTED, text)])
+    return check.evaluate(value, sigma, how, None, [Explanation(expected, REFUTED, text)])
 
 
 def _moved(test: SpotTest) -> Array:
@@ -195,7 +195,7 @@ def _moved(test: SpotTest) -> Array:
     return np.asarray(correction - columns @ np.linalg.lstsq(columns, correction)[0])
 
 
-_JUDGES = {
+_EVALUATIONS = {
     "004.table2.accuracy": _accuracy,
     "004.table2.compensation": _compensation,
     "004.table2.points": _points,

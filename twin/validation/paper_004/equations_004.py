@@ -33,20 +33,20 @@ _ROUNDING = "rounding of float64, 2e-16 f, over tan W of the edge, 0.02, and ten
 CHECKS = (
     Check("004.eq2.solution", "eq. (2)", "f and p of (2) make the sum of D² least: largest difference from a "
           "least-squares solution", "µm", None, 1e-6, _ROUNDING,
-          tells=1.0, against="half of the accuracy that the paper claims"),
+          separation=1.0, alternative="half of the accuracy that the paper claims"),
     Check("004.eq3.solution", "eq. (3)", "With p = 0, f of (3) makes the sum of D² least: difference from a "
           "least-squares solution", "µm", None, 1e-6, _ROUNDING,
-          tells=1.0, against="half of the accuracy that the paper claims"),
+          separation=1.0, alternative="half of the accuracy that the paper claims"),
     Check("004.eq4.solution", "eq. (4)", "With f known, p of (4) makes the sum of D² least: difference from a "
           "least-squares solution", "µm", None, 1e-6, _ROUNDING,
-          tells=1.0, against="half of the accuracy that the paper claims"),
+          separation=1.0, alternative="half of the accuracy that the paper claims"),
     Check("004.eq3.ignored", "section 3.1, eq. (3)", "A principal point one pixel from the middle of the line can be "
           "ignored: largest change of D by (3)", "µm", ACCURACY_UM, 0.05,
           "half of the last printed digit", "at most",
-          tells=2.3, against="twice the accuracy that the paper claims"),
+          separation=2.3, alternative="twice the accuracy that the paper claims"),
     Check("004.turntable.range", "section 3.2", "The test turns the camera by no more than 5°: angle between the "
           "directions that are imaged to the ends of the line", "deg", 5.0, 0.0, "the bound itself", "at most",
-          tells=5.0, against="twice the bound"),
+          separation=5.0, alternative="twice the bound"),
 )  # fmt: skip
 
 
@@ -87,7 +87,7 @@ def run(context: Context) -> Iterator[CheckResult]:
             f"Traced chief rays of gf7 to both ends of the {band.pixels} pixels. Paper 004 does not print the field; "
             "the camera file has it from other publications."
         )
-        yield context.check("004.turntable.range").judge(float(np.degrees(whole)), None, how)
+        yield context.check("004.turntable.range").evaluate(float(np.degrees(whole)), None, how)
 
 
 def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
@@ -111,7 +111,7 @@ def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pi
         f"{1e3 * UM * pitch * edge**2:.1f} nm; a radial distortion whose centre is off adds the rest. To make "
         f"{ACCURACY_UM:g} µm p would have to be {most:.1f} mm."
     )
-    return context.check("004.eq3.ignored").judge(UM * change, None, how)
+    return context.check("004.eq3.ignored").evaluate(UM * change, None, how)
 
 
 def _solutions(context: Context, places: Callable[[Array], Array], edge: float) -> Iterator[CheckResult]:
@@ -137,7 +137,7 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
             how = f"{rays}; {values}, against a singular value decomposition of (1)."
             if identifier != "004.eq3.solution":
                 how += " Over points that are not even about the middle, p takes up radial distortion."
-            yield context.check(identifier).judge(UM * float(np.max(np.abs(difference))), None, how, 0.0)
+            yield context.check(identifier).evaluate(UM * float(np.max(np.abs(difference))), None, how, 0.0)
 
 
 GROUP = CheckGroup("004.equations", "Interior orientation and distortion: equations (section 3.1)", 1.0, CHECKS, run)

@@ -79,7 +79,7 @@ def _parameters(bench: FocusBench, pose: Pose) -> Array:
     return np.array([slope_y, -slope_x, line_turn(pose), *pose.translation[:2], piston])
 
 
-def judge_coupling(check: Check, bench: FocusBench) -> CheckResult:
+def evaluate_coupling(check: Check, bench: FocusBench) -> CheckResult:
     """How many parameters no adjustment of the mount changes alone."""
     change = effects(bench)
     seen = np.abs(change) > LIMITS
@@ -99,7 +99,7 @@ def judge_coupling(check: Check, bench: FocusBench) -> CheckResult:
         "inclination of the mounting surface", float(np.degrees(bench.setup.test.mount.tilt)), "deg",
         lambda factor: _coupled(effects(bench, factor)),
     )  # fmt: skip
-    return check.judge(_coupled(change), None, how, inputs=[inclination])
+    return check.evaluate(_coupled(change), None, how, inputs=[inclination])
 
 
 def _coupled(change: Array) -> float:
@@ -121,42 +121,43 @@ _REASONS = {
 CHECKS = (
     *(
         Check(f"004.table1.{band}", "Table 1", f"MTF of the camera at the Nyquist frequency of {band}", "1", value,
-              0.1 * value, _REASONS[band[0]], tells=0.3 * value, against="a third more or less", basis="chosen")
+              0.1 * value, _REASONS[band[0]],
+              separation=0.3 * value, alternative="a third more or less", basis="chosen")
         for band, value in MTF_NYQUIST.items()
     ),
     Check("004.table1.frequency", "Table 1", "The values are those at the Nyquist frequency, which the table does not "
           "print: frequency at which the rendered edges have them, over Nyquist", "1", None, 0.1,
           "10 % of an MTF, the tolerance of the values, is 5 to 10 % of the frequency",
-          tells=0.5, against="half the Nyquist frequency", basis="chosen"),
+          separation=0.5, alternative="half the Nyquist frequency", basis="chosen"),
     Check("004.table1.average", "Table 1", "The values are averages", "1", None, 0.0, "nothing is compared",
           expected=NOT_CHECKABLE),
     Check("004.alignment.coupling", "section 1.2", "All six parameters of the assembly are coupled when it is "
           "adjusted: number of those that an adjustment changes together with another one", "1", 6.0, 0.0,
           "they are counted",
-          tells=1.0, against="five, one that is adjusted by itself", basis="chosen"),
+          separation=1.0, alternative="five, one that is adjusted by itself", basis="chosen"),
     Check("004.alignment.defocus", "section 2.1", "MTF through focus gives the defocus of every CCD in every field and "
           "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached",
-          tells=40.0, against="a defocus as large as what is to be reached"),
+          separation=40.0, alternative="a defocus as large as what is to be reached"),
     Check("004.alignment.plane", "section 2.2", "A turn about X' and Y' and a shift along Z' make up for the defocus: "
           "largest true distance from best focus after exactly the motion found", "mm", 1e-3 * CONFOCAL_UM, 0.0,
           "the bound itself", "at most",
-          tells=0.04, against="twice the bound", basis="chosen"),
+          separation=0.04, alternative="twice the bound", basis="chosen"),
     Check("004.alignment.constraint", "section 2.2", "The motion found keeps the line level: true turn of the line "
           "after it", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
-          tells=1.0, against="twice the bound", basis="chosen"),
+          separation=1.0, alternative="twice the bound", basis="chosen"),
     Check("004.alignment.shims", "section 2.2", "The motion gives the shims' changes at the holes: RMS difference from "
           "those that the traced defocus asks for", "µm", None, 5.0, "the steps to which the shims are ground",
-          tells=50.0, against="a shim that is turned or swapped with another"),
+          separation=50.0, alternative="a shim that is turned or swapped with another"),
     Check("004.alignment.confocal", "section 2.3", "One round of shims brings every CCD to within 0.04 mm of best "
           "focus: largest true distance of any alignment", "mm", 1e-3 * CONFOCAL_UM, 0.0, "the bound itself",
           "at most",
-          tells=0.04, against="twice the bound", basis="chosen"),
+          separation=0.04, alternative="twice the bound", basis="chosen"),
     Check("004.alignment.level", "section 2.3", "One round of shims leaves the line level to 1 arcmin: largest true "
           "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
-          tells=1.0, against="twice the bound", basis="chosen"),
+          separation=1.0, alternative="twice the bound", basis="chosen"),
     Check("004.alignment.rounds", "section 2.3", "One round of shims is enough: rounds until both bounds are kept, "
           "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most",
-          tells=1.0, against="two rounds", basis="chosen"),
+          separation=1.0, alternative="two rounds", basis="chosen"),
 )  # fmt: skip
 
 
@@ -237,12 +238,12 @@ def run(context: Context) -> Iterator[CheckResult]:
     with one_blas_thread():
         bench = FocusBench(resolve_focus(TEST), context.backend)
         if "004.alignment.coupling" in context.selected:
-            yield judge_coupling(context.check("004.alignment.coupling"), bench)
+            yield evaluate_coupling(context.check("004.alignment.coupling"), bench)
         if not context.selected - {"004.table1.average", "004.alignment.coupling"}:
             return
         alignments = measured_alignments(context, bench)
-        for judge in (_mtf, _measured, _reached):
-            for result in judge(context, alignments):
+        for evaluate in (_mtf, _measured, _reached):
+            for result in evaluate(context, alignments):
                 if result.id in context.selected:
                     yield result
 
@@ -324,7 +325,7 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
             f"after {_alignments(len(alignments)).lower()}; traced truth there {true[band]:.4f}. A perfect camera with "
             f"these pixels has {perfect:.3f}; what the scene file assumes beyond the paper takes the rest ({lost})."
         )
-        yield context.check(f"004.table1.{band}").judge(value, sigma, how, inputs=_losses(rest, value))
+        yield context.check(f"004.table1.{band}").evaluate(value, sigma, how, inputs=_losses(rest, value))
         logs.append((_slope(edges), float(np.prod(list(rest.values())))))
     each = np.array(ratios)
     by_band = ", ".join(f"{band} {value:.3f}" for band, value in zip(MTF_NYQUIST, each.mean(axis=1), strict=True))
@@ -335,7 +336,7 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
     value, sigma = mean_of(each.mean(axis=1))
     slope, lost = np.mean(logs, axis=0)
     chosen = Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * lost ** ((factor**2 - 1.0) * slope))
-    yield context.check("004.table1.frequency").judge(value, sigma, how, 1.0, inputs=[chosen])
+    yield context.check("004.table1.frequency").evaluate(value, sigma, how, 1.0, inputs=[chosen])
     context.add(
         Table(
             "table1",
@@ -363,7 +364,7 @@ def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[Che
         f"{UM * np.max(np.abs(error)):.1f} µm. Truth: focus of the traced pupils."
     )
     total = UM * float(np.sqrt(np.mean(error**2)))
-    yield context.check("004.alignment.defocus").judge(total, None, how, 0.0)
+    yield context.check("004.alignment.defocus").evaluate(total, None, how, 0.0)
     plans = [Plan(a) for a in alignments]
     left = np.array([MM * np.max(np.abs(p.left)) for p in plans])
     how = (
@@ -372,12 +373,12 @@ def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[Che
     )
     moved = [(a, p.moved, a.states[0].standing.heights) for a, p in zip(alignments, plans, strict=True)]
     value = float(np.max(left))
-    yield context.check("004.alignment.plane").judge(value, None, how, inputs=[_chips(moved)])
+    yield context.check("004.alignment.plane").evaluate(value, None, how, inputs=[_chips(moved)])
     turns = np.array([abs(line_turn(p.moved)) / ARCMIN for p in plans])
     begin = np.array([abs(a.states[0].true_level) / ARCMIN for a in alignments])
     how = f"{_alignments(count)}: before {_list(begin, 2)}′, after {_list(turns, 2)}′; the theodolite errs by 10″."
     value = float(np.max(turns))
-    yield context.check("004.alignment.constraint").judge(value, None, how, inputs=[_theodolite(alignments, value)])
+    yield context.check("004.alignment.constraint").evaluate(value, None, how, inputs=[_theodolite(alignments, value)])
     asked = np.array([p.asked for p in plans])
     changes = np.array([p.shims.change for p in plans])
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])
@@ -387,7 +388,7 @@ def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[Che
         f"{_list(alone, 2)}′."
     )
     value = UM * float(np.sqrt(np.mean((changes - asked) ** 2)))
-    yield context.check("004.alignment.shims").judge(value, None, how, 0.0)
+    yield context.check("004.alignment.shims").evaluate(value, None, how, 0.0)
 
 
 def _chips(placed: Sequence[tuple[Alignment, Pose, Mapping[str, float]]]) -> Chosen:
@@ -421,13 +422,13 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
     sites = f"{_alignments(count)} of {len(alignments[0].bench.sites)} fields and bands, by the traced pupils"
     how = f"{sites}: before {_list(far[:, 0], 2)} mm, after {_list(far[:, -1], 4)} mm."
     after = [(a, a.states[-1].standing.pose, a.states[-1].standing.heights) for a in alignments]
-    yield context.check("004.alignment.confocal").judge(float(np.max(far[:, -1])), None, how, inputs=[_chips(after)])
+    yield context.check("004.alignment.confocal").evaluate(float(np.max(far[:, -1])), None, how, inputs=[_chips(after)])
     how = (
         f"{_alignments(count)}: before {_list(turns[:, 0], 2)}′, after {_list(turns[:, -1], 2)}′; theodolite and "
         f"setting have {plan.level / ARCMIN:.2f}′ each."
     )
     value = float(np.max(turns[:, -1]))
-    yield context.check("004.alignment.level").judge(value, None, how, inputs=[_theodolite(alignments, value)])
+    yield context.check("004.alignment.level").evaluate(value, None, how, inputs=[_theodolite(alignments, value)])
     kept = (far <= 1e-3 * CONFOCAL_UM) & (turns <= LINE_LEVEL_ARCMIN)
     rounds = np.where(kept.any(axis=1), np.argmax(kept, axis=1), far.shape[1])
     more = [_second_round(a) for a in alignments]
@@ -439,7 +440,7 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
     value = float(np.max(rounds))
     share = max(float(np.max(far[:, -1])) / (1e-3 * CONFOCAL_UM), float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
     chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: value if k * share <= 1.0 else value + 1.0)
-    yield context.check("004.alignment.rounds").judge(value, None, how, inputs=[chosen])
+    yield context.check("004.alignment.rounds").evaluate(value, None, how, inputs=[chosen])
     context.add(
         SvgFigure(
             "alignments",

@@ -46,32 +46,32 @@ _SQUARES = "other errors, near 1 µm, add in square, and 0.3 µm for how the zer
 CHECKS = (
     Check("004.eq1.constant", "eqs. (1), (2)", "D by (1) with f and p of (2), W counted from where the operator set "
           "the zero: RMS error of all tests", "µm", ACCURACY_UM, 0.5, _SQUARES, "at most", CORRECTED,
-          tells=2.3, against="twice the accuracy that the paper claims"),
+          separation=2.3, alternative="twice the accuracy that the paper claims"),
     Check("004.eq1.zero", "eqs. (1), (2)", "D by (1) with f and p of (2), W counted from the zero that a constant term "
           "finds: largest RMS error of any test", "µm", ACCURACY_UM, 0.05,
           "half of the last printed digit", "at most",
-          tells=2.3, against="twice the accuracy that the paper claims", basis="chosen"),
+          separation=2.3, alternative="twice the accuracy that the paper claims", basis="chosen"),
     Check("004.eq2.f", "eqs. (2), (3)", "(2), and (3) with p = 0, give the principal distance: mean over the tests "
           "against the traced camera's", "mm", None, 0.05, _F,
-          tells=0.115, against="an error that moves the edge by the 2.3 µm of the paper", also=("004.eq3.f",)),
+          separation=0.115, alternative="an error that moves the edge by the 2.3 µm of the paper", also=("004.eq3.f",)),
     Check("004.eq2.distance", "eq. (2)", "Least squares gives the principal distance: RMS of its error over its sigma",
           "1", None, 0.5, "at 1.5, two sigma would still hold in four tests of five",
-          tells=1.5, against="an error of two and a half sigma", basis="theory",
+          separation=1.5, alternative="an error of two and a half sigma", basis="theory",
           theory="normal errors of the stated sigma"),
     Check("004.eq2.p", "eqs. (2), (4)", "(2), and (4) with f known, give the principal point, which is about a pixel "
           "from the middle: RMS error of p, W counted from where the operator set the zero", "mm", PIXEL_MM, 5.5, _P,
           "at most", CORRECTED,
-          tells=40.0, against="what an error of the zero makes", also=("004.eq4.p",)),
+          separation=40.0, alternative="what an error of the zero makes", also=("004.eq4.p",)),
     Check("004.eq2.uneven", "eq. (2)", "(2) over points that are not even about the middle: p against the traced "
           "camera's there", "mm", None, 5.5, _P,
-          tells=25.0, against="half of it"),
+          separation=25.0, alternative="half of it"),
     Check("004.eq2.point", "section 3.1, eq. (2)", "The test tells the principal point to a pixel: RMS error of p in "
           "pixels, with a constant term beside (2)", "1", 1.0, 9.0,
           "the paper says no more than its size: up to ten pixels", "at most", REFUTED,
-          tells=9.0, against="ten pixels"),
+          separation=9.0, alternative="ten pixels"),
     Check("004.eq4.uneven", "eq. (4)", "(4) with the traced f over points that are not even about the middle: p "
           "against the traced camera's there", "mm", None, 5.5, _P,
-          tells=25.0, against="half of it"),
+          separation=25.0, alternative="half of it"),
 )  # fmt: skip
 
 
@@ -189,7 +189,7 @@ def _fitted(where: Array, turn: Array) -> tuple[float, Array]:
     return float(found[1]), np.asarray(where - columns @ found)
 
 
-def judge_equations(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
+def evaluate_equations(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
     """The rows of (1) to (4)."""
     tests = [SpotTest(run) for run in runs]
     for equation in (_eq1, _eq2, _eq4):
@@ -216,13 +216,13 @@ def _eq1(context: Context, tests: Sequence[SpotTest]) -> Iterator[CheckResult]:
         UM * left, CORRECTED, "(1) lacks a constant term, and two thirds of f times the error of the zero stay in D."
     )
     noise = rms(freed) / np.sqrt(len(tests))
-    yield context.check("004.eq1.constant").judge(UM * rms(printed), UM * noise, how, None, [reason])
+    yield context.check("004.eq1.constant").evaluate(UM * rms(printed), UM * noise, how, None, [reason])
     how = (
         f"The same tests, W moved to the zero that a least-squares fit with a constant finds: median RMS error "
         f"{UM * np.median(freed):.2f} µm."
     )
     value = UM * float(np.max(freed))
-    yield context.check("004.eq1.zero").judge(value, None, how, inputs=[dividing(value)])
+    yield context.check("004.eq1.zero").evaluate(value, None, how, inputs=[dividing(value)])
 
 
 def _by_eq1(test: SpotTest, turn: Array) -> float:
@@ -266,7 +266,7 @@ def _distance(check: Check, tests: Sequence[SpotTest], found: Array, equation: s
     )
     # truth differs by a micrometre between tests
     measured = np.mean(true) + np.mean(found - true)
-    return check.judge(MM * measured, MM * scatter / np.sqrt(len(tests)), how, MM * float(np.mean(true)))
+    return check.evaluate(MM * measured, MM * scatter / np.sqrt(len(tests)), how, MM * float(np.mean(true)))
 
 
 def _chi(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
@@ -278,7 +278,7 @@ def _chi(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
         f"{rendered(tests)}, fitted with a constant: {np.sum(np.abs(score) < 2.0)} within two sigma of the traced "
         f"camera; sigma of f {sigma:.3f} mm."
     )
-    return check.judge(rms(score), 1.0 / np.sqrt(2 * len(tests)), how, 1.0)
+    return check.evaluate(rms(score), 1.0 / np.sqrt(2 * len(tests)), how, 1.0)
 
 
 def _zero(check: Check, tests: Sequence[SpotTest], found: Array, predicted: Array, equation: str) -> CheckResult:
@@ -295,7 +295,7 @@ def _zero(check: Check, tests: Sequence[SpotTest], found: Array, predicted: Arra
     reason = Explanation(
         MM * rms(predicted), CORRECTED, "(1) has no constant term, so that p takes up the error of the zero of W."
     )
-    return check.judge(MM * rms(error), MM * stated / np.sqrt(len(tests)), how, None, [reason])
+    return check.evaluate(MM * rms(error), MM * stated / np.sqrt(len(tests)), how, None, [reason])
 
 
 def _uneven(check: Check, tests: Sequence[SpotTest], found: Array) -> CheckResult:
@@ -309,7 +309,7 @@ def _uneven(check: Check, tests: Sequence[SpotTest], found: Array) -> CheckResul
         f"longer small: the equation with all its sums is seen at work. One test scatters by {MM * scatter:.1f} mm."
     )
     value = float(np.mean(true) + np.mean(error))
-    return check.judge(MM * value, MM * scatter / np.sqrt(len(tests)), how, MM * float(np.mean(true)))
+    return check.evaluate(MM * value, MM * scatter / np.sqrt(len(tests)), how, MM * float(np.mean(true)))
 
 
 def _point(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
@@ -329,7 +329,7 @@ def _point(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
         f"p is not observable over so narrow a field, where tan² W is at most {edge:.1e}: the propagated sigma is as "
         "large as the error. No test of the paper's kind can tell that p is about a pixel."
     )
-    return check.judge(error, error / np.sqrt(2 * len(tests)), how, None, [Explanation(stated, REFUTED, text)])
+    return check.evaluate(error, error / np.sqrt(2 * len(tests)), how, None, [Explanation(stated, REFUTED, text)])
 
 
 def principal_points(tests: Sequence[SpotTest]) -> tuple[Array, Array]:

@@ -24,28 +24,28 @@ FEW = 5
 CHECKS = (
     Check("004.sensitivity.angle", "section 3.1", "Angles are the main source of error: their share in the mean square "
           "error of D, angles compensated", "%", None, 0.0, "the main source has more than half", "at least",
-          tells=50.0, against="no share at all", basis="chosen"),
+          separation=50.0, alternative="no share at all", basis="chosen"),
     Check("004.sensitivity.field", "section 3.1", "The error of the distortion grows with the field: whole field over "
           "its inner half, angles as read", "1", None, 0.0, "growth is a ratio above one", "at least",
-          tells=0.8, against="an error that falls to a fifth"),
+          separation=0.8, alternative="an error that falls to a fifth"),
     Check("004.sensitivity.distance", "section 3.1", "The error of the principal distance grows as the field shrinks: "
           "inner half over the whole field, angles as read", "1", None, 0.0, "growth is a ratio above one", "at least",
-          tells=0.5, against="an error that falls to half"),
+          separation=0.5, alternative="an error that falls to half"),
     Check("004.sensitivity.points", "section 3.1", "More points make f and D more precise: error of f with every fifth "
           "point over that with all", "1", None, 0.0, "a gain is a ratio above one", "at least",
-          tells=0.17, against="a loss as large as the gain"),
+          separation=0.17, alternative="a loss as large as the gain"),
     Check("004.turntable.compensated", "section 3.3", "In the small region of the test the compensated dividing error "
           "is better than 0.2 arcsec: largest RMS error of the angles of any test about its mean", "arcsec",
           FIT_RMS_ARCSEC, 0.0, "the bound itself", "at most",
-          tells=0.2, against="twice the bound", basis="chosen"),
+          separation=0.2, alternative="twice the bound", basis="chosen"),
     Check("004.sensitivity.requirement", "section 3.3", "A dividing error known to 0.2 arcsec RMS satisfies the "
           "distortion test: error of D with angles that err so much from point to point", "µm",
           ACCURACY_UM, 0.05, "half of the last printed digit", "at most", REFUTED,
-          tells=2.3, against="twice the accuracy that the paper claims"),
+          separation=2.3, alternative="twice the accuracy that the paper claims"),
 )  # fmt: skip
 
 
-def judge_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
+def evaluate_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
     """The rows of the sources of error."""
     if not context.wants("004.sensitivity"):
         return
@@ -67,13 +67,13 @@ def judge_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterat
         "dividing error of scenes/lab/turntable.yaml, times", 1.0, "1",
         lambda factor: 100.0 * (1.0 - by_spots / (by_spots + factor**2 * by_angles)),
     )  # fmt: skip
-    yield context.check("004.sensitivity.angle").judge(share, None, how, 50.0, inputs=[chosen])
+    yield context.check("004.sensitivity.angle").evaluate(share, None, how, 50.0, inputs=[chosen])
     for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
         top, bottom = rms(over[:, column]), rms(under[:, column])
         unit, scale = ("µm", UM) if column else ("mm", MM)
         how = f"{count} tests of {POINTS} points; {len(half)} of them lie in the inner half: {scale * top:.3g} "
         how += f"against {scale * bottom:.3g} {unit} RMS."
-        yield context.check(f"004.sensitivity.{name}").judge(top / bottom, _ratio(over, under, column), how, 1.0)
+        yield context.check(f"004.sensitivity.{name}").evaluate(top / bottom, _ratio(over, under, column), how, 1.0)
     few = np.array([[t.errors(t.turn, slice(k, None, FEW))[0] for k in range(FEW)] for t in tests])
     every = np.array([t.errors(t.turn, whole)[0] for t in tests])
     gain = rms(few) / rms(every)
@@ -82,7 +82,7 @@ def judge_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterat
         f"{MM * rms(few):.3f} mm with {POINTS // FEW}. Independent errors would gain {FEW**0.5:.2f}; what the "
         "compensation leaves is common to neighbouring points and gains nothing."
     )
-    yield context.check("004.sensitivity.points").judge(gain, None, how, 1.0)
+    yield context.check("004.sensitivity.points").evaluate(gain, None, how, 1.0)
     yield _requirement(context, tests)
 
 
@@ -94,7 +94,7 @@ def _ratio(over: Array, under: Array, column: int) -> float:
     return float(np.sqrt((n - 1) * np.var(values)))
 
 
-def judge_angles(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
+def evaluate_angles(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
     """What is left of the dividing error in the angles of the tests."""
     tests = [SpotTest(run) for run in runs]
     own, raw = (
@@ -107,7 +107,7 @@ def judge_angles(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
         "004.eq1.constant."
     )
     value = float(np.max(own))
-    return check.judge(value, None, how, inputs=[dividing(value)])
+    return check.evaluate(value, None, how, inputs=[dividing(value)])
 
 
 def _requirement(context: Context, tests: Sequence[SpotTest]) -> CheckResult:
@@ -126,4 +126,4 @@ def _requirement(context: Context, tests: Sequence[SpotTest]) -> CheckResult:
     )
     reason = Explanation(UM * expected, REFUTED, text)
     sigma = UM * expected / np.sqrt(2.0 * points * len(tests))
-    return context.check("004.sensitivity.requirement").judge(UM * rms(np.array(error)), sigma, how, None, [reason])
+    return context.check("004.sensitivity.requirement").evaluate(UM * rms(np.array(error)), sigma, how, None, [reason])

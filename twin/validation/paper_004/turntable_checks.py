@@ -52,31 +52,31 @@ _ONE_TABLE = (
 CHECKS = (
     Check("004.turntable.repeat", "section 3.3", "Ten repeats of the dividing error: largest RMS of 41 angles",
           "arcsec", REPEAT_RMS_ARCSEC, 0.2 * REPEAT_RMS_ARCSEC, _ONE_TABLE,
-          tells=0.04, against="half as much or half as much again", basis="chosen"),
+          separation=0.04, alternative="half as much or half as much again", basis="chosen"),
     Check("004.turntable.criterion", "section 3.3", "Chauvenet's criterion rejects a reading where so large a "
           "deviation is expected fewer than half a time: deviation at which it begins, of ten readings, over their RMS",
           "1", None, 0.01, "textbooks tabulate it to two decimals",
-          tells=0.3, against="one tail for two", basis="theory",
+          separation=0.3, alternative="one tail for two", basis="theory",
           theory="Chauvenet's criterion, the root of 10 P(|z| > x) = 1/2"),
     Check("004.turntable.chauvenet", "section 3.3", "After Chauvenet's criterion, largest RMS of 41 angles: of the "
           "single readings that are kept", "arcsec", CHAUVENET_RMS_ARCSEC, 0.2 * CHAUVENET_RMS_ARCSEC, _ONE_TABLE,
-          tells=0.0185, against="half as much or half as much again", basis="chosen"),
+          separation=0.0185, alternative="half as much or half as much again", basis="chosen"),
     Check("004.turntable.chauvenet_mean", "section 3.3, Fig. 8", "The same number, as an RMS of the averages: of the "
           "mean of ten readings, nothing rejected", "arcsec", CHAUVENET_RMS_ARCSEC,
           0.2 * REPEAT_RMS_ARCSEC / REPEATS**0.5, _ONE_TABLE, expected=CORRECTED,
-          tells=0.011, against="averaging alone"),
+          separation=0.011, alternative="averaging alone"),
     Check("004.turntable.interpolation", "section 3.2", "Interpolated between calibrated angles, the dividing error is "
           "better than 2 arcsec: straight lines, largest RMS at held-out angles of any table", "arcsec", 2.0, 0.0,
           "the bound itself", "at most",
-          tells=2.0, against="twice the bound", basis="chosen"),
+          separation=2.0, alternative="twice the bound", basis="chosen"),
     Check("004.turntable.fit", "section 3.3", "The fitted dividing error is better than 0.2 arcsec: largest RMS at "
           "held-out angles of any table", "arcsec", FIT_RMS_ARCSEC, 0.0, "the bound itself", "at most",
-          tells=0.2, against="twice the bound", basis="chosen"),
+          separation=0.2, alternative="twice the bound", basis="chosen"),
     Check("004.turntable.network", "section 3.3", "The BP network fits the dividing error more precisely than other "
           "fits, by a tenth or more: its RMS at held-out angles over that of the one cross-validation takes, median",
           "1", None, 0.02, "by so much the ratio hangs on which of two equal fits cross-validation prefers", "at most",
           REFUTED,
-          tells=0.1, against="no advantage"),
+          separation=0.1, alternative="no advantage"),
     Check("004.turntable.architecture", "section 3.3", "A BP network fits the dividing error", "1", None, 0.0,
           "nothing is compared", expected=NOT_CHECKABLE),
     Check("004.turntable.time", "section 3.3", "The prediction of the dividing error halves the time of the test", "%",
@@ -120,8 +120,8 @@ def run(context: Context) -> Iterator[CheckResult]:
         if "004.turntable.criterion" in context.selected:
             yield _criterion(context.check("004.turntable.criterion"), series)
         yield from _repeats(context, series, spec, seeds)
-    judges = {"interpolation": _interpolation, "fit": _bound, "network": _network}
-    if not context.wants(*(f"004.turntable.{name}" for name in judges)):
+    rows = {"interpolation": _interpolation, "fit": _bound, "network": _network}
+    if not context.wants(*(f"004.turntable.{name}" for name in rows)):
         return
     tables = []
     count = context.count(FITTED, FAST_FITTED)
@@ -129,9 +129,9 @@ def run(context: Context) -> Iterator[CheckResult]:
         for k, seed in enumerate(second.generate_state(count)):
             context.progress(0.05 + 0.95 * k / count, f"fit table {k + 1} of {count}")
             tables.append(fit_table(spec, int(seed)))
-    for name, judge in judges.items():
+    for name, row in rows.items():
         if f"004.turntable.{name}" in context.selected:
-            yield judge(context.check(f"004.turntable.{name}"), tables)
+            yield row(context.check(f"004.turntable.{name}"), tables)
     context.add(_table(tables))
 
 
@@ -146,7 +146,7 @@ def _criterion(check: Check, series: Sequence[CalibrationSeries]) -> CheckResult
         f"{len(series)} simulated tables, {size.size} readings: largest deviation that is kept {kept:.4f}, smallest "
         f"that is rejected {gone:.4f}; the middle of the two counts. Implied is the root of 10 P(|z| > x) = 1/2."
     )
-    return check.judge(0.5 * (kept + gone), None, how, wanted)
+    return check.evaluate(0.5 * (kept + gone), None, how, wanted)
 
 
 def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
@@ -196,7 +196,7 @@ def _repeats(
             )
             check, (value, sigma) = context.check(identifier), median_of(found)
             inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if check.basis == "chosen" else []
-            yield check.judge(value, sigma, how, None, reasons.get(identifier, ()), inputs)
+            yield check.evaluate(value, sigma, how, None, reasons.get(identifier, ()), inputs)
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
@@ -240,7 +240,7 @@ def _interpolation(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
     lines = np.array([table.held_out["piecewise_linear"] for table in tables]) / ARCSEC
     how = f"{len(tables)} simulated tables, straight lines between 41 means: median {np.median(lines):.3f}″."
     value = float(np.max(lines))
-    return check.judge(value, None, how, inputs=[dividing(value)])
+    return check.evaluate(value, None, how, inputs=[dividing(value)])
 
 
 def _bound(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
@@ -254,7 +254,7 @@ def _bound(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
         f"{np.max(chosen):.3f}″; the network: {np.median(network):.3f}″ and {np.max(network):.3f}″."
     )
     value = float(np.max(chosen))
-    return check.judge(value, None, how, inputs=[dividing(value)])
+    return check.evaluate(value, None, how, inputs=[dividing(value)])
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
@@ -282,7 +282,7 @@ def _network(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
     # of a median, by the median distance from it: a training that ends in a bad minimum now and then is far off
     middle = float(np.median(ratio))
     sigma = float(np.sqrt(0.5 * np.pi / len(ratio)) * np.median(np.abs(ratio - middle)) / norm.ppf(0.75))
-    return check.judge(middle, sigma, how, 0.9, [Explanation(1.0, REFUTED, text)])
+    return check.evaluate(middle, sigma, how, 0.9, [Explanation(1.0, REFUTED, text)])
 
 
 def _table(tables: Sequence[FittedTable]) -> Table:

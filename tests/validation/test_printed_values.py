@@ -1,0 +1,70 @@
+"""What papers print, read from YAML: as printed, and with an error that says where."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import parse_yaml
+from twin.validation.checks.printed import FILE, Printed, load_printed
+from twin.validation.registry import GROUPS
+
+FOLDERS = sorted((Path(__file__).parents[2] / "twin/validation").glob("paper_*"))
+
+SMALL = Printed(
+    parse_yaml(
+        "table1:\n  size_um: 2.30\n  points: 55\n  rows: [1, 2.5]\n  bands: {P: 0.2, B: 1}\n"
+        "  columns: {X: [0.04], Y: []}\n",
+        "paper.yaml",
+    )
+)
+
+
+def test_readers() -> None:
+    assert SMALL.number("table1.size_um") == 2.3
+    assert isinstance(SMALL.number("table1.points"), float)
+    assert SMALL.whole("table1.points") == 55
+    assert SMALL.column("table1.rows") == (1.0, 2.5)
+    assert dict(SMALL.numbers("table1.bands")) == {"P": 0.2, "B": 1.0}
+    assert list(SMALL.numbers("table1.bands")) == ["P", "B"]
+    assert dict(SMALL.columns("table1.columns")) == {"X": (0.04,), "Y": ()}
+
+
+@pytest.mark.parametrize(
+    ("reader", "key", "words"),
+    [
+        ("number", "table1.size_mm", r"paper\.yaml:1: table1: nothing is printed as 'size_mm'.*'size_um'"),
+        ("number", "table1.size_um.more", r"paper\.yaml:2: table1\.size_um: nothing is printed as 'more'"),
+        ("number", "table1.rows", r"paper\.yaml:4: table1\.rows: no number"),
+        ("whole", "table1.size_um", r"paper\.yaml:2: table1\.size_um: no whole number; found 2\.3"),
+        ("column", "table1.bands", r"paper\.yaml:5: table1\.bands: no list"),
+        ("numbers", "table1.rows", r"paper\.yaml:4: table1\.rows: no mapping"),
+        ("numbers", "table1.columns", r"paper\.yaml:6: table1\.columns\.X: no number"),
+        ("columns", "table1.bands", r"paper\.yaml:5: table1\.bands\.P: no list"),
+    ],
+)
+def test_errors_say_where(reader: str, key: str, words: str) -> None:
+    with pytest.raises(InputError) as error:
+        getattr(SMALL, reader)(key)
+    assert re.search(words, str(error.value)), str(error.value)
+
+
+def test_a_paper_without_a_file() -> None:
+    with pytest.raises(InputError, match="paper_002"):
+        load_printed("002")
+
+
+def test_the_papers_files() -> None:
+    """Their numbers are those of the checks; Table 2 of paper 004 has its 55 points, twice."""
+    assert {path.name[-3:] for path in FOLDERS if (path / FILE).exists()} == {"000", "001", "004"}
+    printed = {check.id: check.printed for group in GROUPS for check in group.checks}
+    assert printed["001.table4.together"] == load_printed("001").number("table4.spot_arcsec") == 0.145
+    assert printed["004.table1.B3"] == load_printed("004").numbers("table1.mtf_nyquist")["B3"] == 0.37
+    assert printed["000.table1.beta"] == load_printed("000").numbers("table1.difference_arcsec")["beta"] == 1.53
+    points = load_printed("004").whole("distortion.points")
+    assert {len(load_printed("004").column(f"table2.{name}_um")) for name in ("raw", "compensated")} == {points} == {55}
+    for rows in ("mirror_1_arcsec", "mirror_2_arcsec"):
+        columns = load_printed("001").columns(f"table2.{rows}")
+        assert list(columns) == ["X", "Y", "Z"]
+        assert {len(column) for column in columns.values()} == {11}
