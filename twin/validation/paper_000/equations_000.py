@@ -17,7 +17,7 @@ from scenes.specs.orbit_angle import LINES
 from twin.orbit.angle.angle_run import values_of
 from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
 from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of, worst
+from twin.validation.paper_000.passes import TENTH, TEST, Passes, planes_of, repeated, setup_of, worst
 
 Array = NDArray[np.float64]
 _STEP = 1e-3
@@ -72,7 +72,6 @@ def least_slopes(points: Array, station: Array) -> Array:
 TWIST = np.radians(10.0 / 60.0)
 """How far the forward array is turned about its line of sight for eq6.parallel, radians."""
 
-_TENTH = "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"
 _ROUNDING = "rounding of coordinates of 6.4e6 m, 1e-9 m over 500 km, and a hundred for the sums"
 
 CHECKS = (
@@ -81,7 +80,7 @@ CHECKS = (
           separation=1000.0, alternative="a wrong sign or factor in (1), which puts the plane kilometres away"),
     Check("000.eq2", "eqs. (2), (5)", "The plane that makes S least, and that (5) gives without the minus signs on its "
           "right side, is the line's plane: its pitch minus the true one, the line farthest off", "arcsec", None, 0.05,
-          _TENTH,
+          TENTH,
           separation=0.44, alternative="a difference as large as the smaller one of Table 1", also=("000.eq5.sign",)),
     Check("000.eq3", "eq. (3)", "Both derivatives of S vanish at the plane: at (5)'s solution, over those 1 arcsec "
           "beside it", "1", None, 1e-3, "0.001 arcsec is a hundredth of what the points' noise leaves",
@@ -101,17 +100,17 @@ CHECKS = (
           "2/n of n = 60 points, the order that the law for many points leaves out", expected=CORRECTED,
           separation=0.5, alternative="half of the slope"),
     Check("000.eq6", "eq. (6)", "α by (5) and (6) minus the camera's true dihedral angle", "arcsec", None, 0.05,
-          _TENTH,
+          TENTH,
           separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.eq6.arccos", "eqs. (6), (7)", "The arccos keeps its digits: largest difference from an exact evaluation",
           "arcsec", None, 1e-6, "a millionth of the arc second in which the paper counts",
           separation=0.03, alternative="single precision", basis="theory",
           theory="rounding of float64 in the cosine, over the sine of the angle"),
     Check("000.eq6.parallel", "section 1.2", "The angle between the planes is the angle between the looks, also when "
-          "an array is 10 arcmin off parallel: their difference", "arcsec", None, 0.05, _TENTH, expected=CORRECTED,
+          "an array is 10 arcmin off parallel: their difference", "arcsec", None, 0.05, TENTH, expected=CORRECTED,
           separation=1.8, alternative="an angle between looks that differs by twist² / (2 tan α)"),
     Check("000.eq7", "eq. (7)", "β by (5) and (7) minus the camera's true dihedral angle", "arcsec", None, 0.05,
-          _TENTH,
+          TENTH,
           separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
 )  # fmt: skip
 

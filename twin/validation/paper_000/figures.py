@@ -20,10 +20,9 @@ from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, REFUTED, Chec
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of
-from twin.validation.paper_000.sentences import ALIKE, AXES, SENTENCES, Rises, Sentence
+from twin.validation.paper_000.sentences import ALIKE, AXES, GREEK, SENTENCES, Rises, Sentence
 
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
-_GREEK = {"alpha": "α", "beta": "β"}
 
 
 def sensitivity_svg(
@@ -47,7 +46,7 @@ def sensitivity_svg(
                     axis, (amount[-1], place), (6, 0), textcoords="offset points", va="center", color=_STYLES[axis][0]
                 )
             moved = "station" if what == "station" else f"{what} points"
-            axes.set(title=f"{_GREEK[angle]} over the error of the {moved}", xlabel="error, m")
+            axes.set(title=f"{GREEK[angle]} over the error of the {moved}", xlabel="error, m")
             axes.margins(x=0.06)
             axes.grid(color=LIGHT, lw=0.5)
             plain_axes(axes)

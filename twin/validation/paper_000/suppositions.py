@@ -18,7 +18,7 @@ from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, standard_refractivit
 from twin.orbit.flight.line_camera import dihedral_angle
 from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
 from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.paper_000.passes import TEST, TRACED, Passes, repeated, setup_of
+from twin.validation.paper_000.passes import TENTH, TEST, TRACED, Passes, repeated, setup_of
 
 SCALE_HEIGHT = 8435.0
 """Of the standard atmosphere's pressure at 15 °C, R T/(M g), metres."""
@@ -40,11 +40,11 @@ CHECKS = (
           separation=0.9, alternative="points that both have moved"),
     Check("000.traced", "eqs. (5), (6)", "Change of the angle of gf7_pair as the planes show it, minus the change by "
           "exact trace of the instrument", "arcsec", None, 0.05,
-          "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec",
+          TENTH,
           separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.centres", "section 1.2", "The lines may be taken to have one projection centre: the same of gf7_pair, "
           "whose centres lie 2.8 m apart", "arcsec", None, 0.05,
-          "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec", expected=CORRECTED,
+          TENTH, expected=CORRECTED,
           separation=1.0, alternative="what centres so far apart make"),
 )  # fmt: skip
 

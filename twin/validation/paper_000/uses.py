@@ -13,9 +13,7 @@ from twin.orbit.angle.angle_flight import AnglePass
 from twin.orbit.angle.angle_run import sighted
 from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
 from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.paper_000.passes import OFF_AXIS, TEST, Passes, planes_of, repeated, setup_of
-
-_TENTH = "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"
+from twin.validation.paper_000.passes import OFF_AXIS, TENTH, TEST, Passes, planes_of, repeated, setup_of
 
 CHECKS = (
     Check("000.height.alpha", "section 0", "1 arcsec of α makes more than 5 m of height", "m", 5.0, 0.0,
@@ -31,10 +29,10 @@ CHECKS = (
           separation=0.068, alternative="flat ground", basis="theory",
           theory="intersection of two rays on a sphere, range times angle over the sine of theirs"),
     Check("000.outlook.high_resolution", "section 3", "Off-axis angle of the high-resolution line by planes: "
-          "angle along the track minus the true one", "arcsec", None, 0.05, _TENTH,
+          "angle along the track minus the true one", "arcsec", None, 0.05, TENTH,
           separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.outlook.multispectral", "section 3", "Off-axis angle of the multispectral line by planes: angle "
-          "along the track minus the true one", "arcsec", None, 0.05, _TENTH,
+          "along the track minus the true one", "arcsec", None, 0.05, TENTH,
           separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
     Check("000.outlook.unsigned", "section 3, eq. (6)", "(6) gives the off-axis angle of the multispectral line: its "
           "value minus the angle between the looks", "arcsec", None, 1.0, "half of the noise of one measurement",

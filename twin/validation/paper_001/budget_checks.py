@@ -14,9 +14,8 @@ from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget, monitored_errors
-from twin.validation.paper_001.budget import FEW_DRAWS, BudgetImages
+from twin.validation.paper_001.budget import FEW_DRAWS, INPUTS, TABLE_3, TABLE_4, BudgetImages
 
 
 def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:
@@ -41,7 +40,6 @@ def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:
         return to_svg(figure)
 
 
-_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
 _LINES = {
     "centroid": "Energy centre of one image",
     "coordinate_thermal": "Thermal distortion of the coordinate system (recorder's board)",
@@ -63,13 +61,11 @@ _INPUT_OF = {
     "central_prism_thermal": "gradient in the central prism",
 }
 """What a line's input is; those of rotations act through the prisms' residual angle errors, which are chosen too."""
-TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
-TABLE_4 = load_printed("001").number("table4.spot_arcsec")
 
 CHECKS = (
     *(
         Check(f"001.table3.{name}", "Table 3", f"{text}, error of one spot", "arcsec", TABLE_3[name],
-              0.2 * TABLE_3[name], _INPUTS,
+              0.2 * TABLE_3[name], INPUTS,
               separation=0.5 * TABLE_3[name], alternative="half as much or half as much again", basis="chosen")
         for name, text in _LINES.items()
     ),
@@ -91,10 +87,10 @@ CHECKS = (
           TABLE_4, 0.0005, "half of the last printed digit",
           separation=0.0013, alternative="(12) without the mean over the frames"),
     Check("001.table4.root_sum", "Table 4, eq. (12)", "(12) of the simulated lines, the centroid's over 9 frames",
-          "arcsec", TABLE_4, 0.029, _INPUTS,
+          "arcsec", TABLE_4, 0.029, INPUTS,
           separation=0.07, alternative="half as much or half as much again", basis="chosen"),
     Check("001.table4.together", "Table 4", "Error of one spot with all causes at once in the images", "arcsec",
-          TABLE_4, 0.029, _INPUTS,
+          TABLE_4, 0.029, INPUTS,
           separation=0.07, alternative="half as much or half as much again", basis="chosen"),
     *monitored_errors.CHECKS,
 )  # fmt: skip

@@ -65,10 +65,10 @@ def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.nd
 INSTRUMENT = "monitor_pair"
 """The camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
 
-_ANGLE = "1 % of a change of 5 arcsec is the 0.05 arcsec of Table 5"
+ANGLE_DIGIT = "1 % of a change of 5 arcsec is the 0.05 arcsec of Table 5"
 _COS2 = "a quarter of 1 − cos²β"
-_ROLL = "1 % of a change of 215 arcsec is the 2.15 arcsec of Table 5"
-_FOCAL = "1 % of a change of 4 mm is the 0.04 mm of Table 5"
+ROLL_DIGIT = "1 % of a change of 215 arcsec is the 2.15 arcsec of Table 5"
+FOCAL_DIGIT = "1 % of a change of 4 mm is the 0.04 mm of Table 5"
 
 CHECKS = (
     Check(
@@ -93,7 +93,7 @@ CHECKS = (
     ),
     Check(
         "001.eq3", "eq. (3)", "Line CCD moved along X: Δα read / true turn of the line of sight about Y", "1", 1.0,
-        0.01, _ANGLE, expected=CORRECTED,
+        0.01, ANGLE_DIGIT, expected=CORRECTED,
         separation=0.03, alternative="the other focal length, f across the line",
     ),
     Check(
@@ -104,13 +104,13 @@ CHECKS = (
     Check(
         "001.eq5", "eqs. (4), (5)",
         "Line CCD turned about the line of sight: Δγ read / turn of the line CCD, and by (4) Δx / L₁ of its ends", "1",
-        1.0, 0.01, _ROLL, expected=CORRECTED,
+        1.0, 0.01, ROLL_DIGIT, expected=CORRECTED,
         separation=1.0, alternative="twice as much: the doubling by the reflection", also=("001.eq4",),
     ),
     Check(
         "001.eq7", "eqs. (6), (7)",
         "Camera grown with its focus kept: Δf read / true change of the principal distance, and by (6) Δy / (LΔf/f)",
-        "1", 1.0, 0.01, _FOCAL,
+        "1", 1.0, 0.01, FOCAL_DIGIT,
         separation=0.5, alternative="half of it, as Table 1 has it", also=("001.eq6",),
     ),
     Check(

@@ -13,14 +13,11 @@ from twin.run.artefact import Cell, SvgFigure, Table
 from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.paper_001 import formulas_images
-from twin.validation.paper_001.formulas import INSTRUMENT, without_cos2
+from twin.validation.paper_001.formulas import ANGLE_DIGIT, FOCAL_DIGIT, INSTRUMENT, ROLL_DIGIT, without_cos2
 from twin.validation.paper_001.formulas_images import FRAMES, PARAMETERS, Ratio, ratios_svg
 from twin.validation.paper_001.joint_images import AMOUNTS, JointMotions
 
 _LINEAR = "0.2 %, a fifth of what Table 5 can tell of such changes"
-_ANGLE = "1 % of a change of 5 arcsec is the 0.05 arcsec of Table 5"
-_ROLL = "1 % of a change of 215 arcsec is the 2.15 arcsec of Table 5"
-_FOCAL = "1 % of a change of 4 mm is the 0.04 mm of Table 5"
 _COLUMN = "Table 1, uncertain changes"
 
 CHECKS = (
@@ -37,39 +34,42 @@ CHECKS = (
     ),
     Check(
         "001.eq8.d_gamma_alone", "section 2.5", "Δγ moves the spots across the line alone: common Y / X", "1", 0.0,
-        0.01, _ROLL,
+        0.01, ROLL_DIGIT,
         separation=0.02, alternative="twice what Table 5 can tell",
     ),
     Check(
         "001.eq8.d_f_alone", "section 2.5", "Δf moves the spots along the line alone: common X / Y", "1", 0.0, 0.01,
-        _FOCAL,
+        FOCAL_DIGIT,
         separation=0.02, alternative="twice what Table 5 can tell",
     ),
     Check(
         "001.eq9.d_f", "eq. (9)", "A change of the focal length alone moves the spots apart: Y_R / (−Y_L)", "1", 1.0,
-        0.01, _FOCAL,
+        0.01, FOCAL_DIGIT,
         separation=2.0, alternative="spots that move the same way",
     ),
     Check(
         "001.eq9.d_beta", "eq. (9)", "A turn about X alone moves both spots alike along the line: Y_R / Y_L", "1", 1.0,
-        0.01, _ANGLE,
+        0.01, ANGLE_DIGIT,
         separation=2.0, alternative="spots that move opposite ways",
     ),
     Check(
-        "001.eq10.d_f", "eq. (10)", "(Y_L − Y_R)/2 of all four changes over Y_L of Δf alone", "1", 1.0, 0.01, _FOCAL,
+        "001.eq10.d_f", "eq. (10)", "(Y_L − Y_R)/2 of all four changes over Y_L of Δf alone", "1", 1.0, 0.01,
+        FOCAL_DIGIT,
         separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
-        "001.eq10.d_beta", "eq. (10)", "(Y_L + Y_R)/2 of all four changes over Y_L of Δβ alone", "1", 1.0, 0.01, _ANGLE,
+        "001.eq10.d_beta", "eq. (10)", "(Y_L + Y_R)/2 of all four changes over Y_L of Δβ alone", "1", 1.0, 0.01,
+        ANGLE_DIGIT,
         separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
         "001.eq11.d_alpha", "eq. (11)", "(X_L + X_R)/2 of all four changes over X_L of Δα alone", "1", 1.0, 0.01,
-        _ANGLE,
+        ANGLE_DIGIT,
         separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
-        "001.eq11.d_gamma", "eq. (11)", "(X_L − X_R)/2 of all four changes over X_L of Δγ alone", "1", 1.0, 0.01, _ROLL,
+        "001.eq11.d_gamma", "eq. (11)", "(X_L − X_R)/2 of all four changes over X_L of Δγ alone", "1", 1.0, 0.01,
+        ROLL_DIGIT,
         separation=0.5, alternative="sums or differences without their half",
     ),
     Check(
@@ -78,19 +78,19 @@ CHECKS = (
         separation=0.00225, alternative="a reading without the factor cos²β",
     ),
     Check(
-        "001.table1.d_alpha", _COLUMN, "Joint Δα read per true Δα, all four changing", "1", 1.0, 0.01, _ANGLE,
+        "001.table1.d_alpha", _COLUMN, "Joint Δα read per true Δα, all four changing", "1", 1.0, 0.01, ANGLE_DIGIT,
         expected=CORRECTED,
         separation=0.03, alternative="the other focal length, f across the line",
     ),
     Check(
-        "001.table1.d_gamma", _COLUMN, "Joint Δγ read per true Δγ, all four changing", "1", 1.0, 0.01, _ROLL,
+        "001.table1.d_gamma", _COLUMN, "Joint Δγ read per true Δγ, all four changing", "1", 1.0, 0.01, ROLL_DIGIT,
         expected=CORRECTED,
         separation=1.0, alternative="twice as much: the doubling by the reflection",
     ),
     Check(
         "001.table1.d_f", _COLUMN, "Joint Δf read per true Δf, all four changing, Y_L signed as in (7)", "1", 1.0,
         0.01,
-        _FOCAL, expected=CORRECTED,
+        FOCAL_DIGIT, expected=CORRECTED,
         separation=0.5, alternative="half of it", also=("001.table1.sign",),
     ),
     Check(
@@ -108,7 +108,7 @@ CHECKS = (
     Check(
         "001.fig4.angle", "Fig. 4, section 3.2.3",
         "Both cameras' images by Table 1 give the change of their intersection angle: read / traced", "1", 1.0, 0.01,
-        _ANGLE, expected=CORRECTED,
+        ANGLE_DIGIT, expected=CORRECTED,
         separation=0.03, alternative="the other focal length, f across the line",
     ),
 )  # fmt: skip

@@ -13,11 +13,10 @@ from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget
-from twin.validation.paper_001.budget import BudgetImages
+from twin.validation.paper_001.budget import INPUTS, BudgetImages
 
 _PRINTED = load_printed("001")
-TABLE_4 = _PRINTED.number("table4.spot_arcsec") * ARCSEC
-_INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
+_TABLE_4 = budget.TABLE_4 * ARCSEC
 _DIGITS = "half of the last printed digit"
 _PARAMETERS = {
     "d_beta": ("d_beta_rad", "Δβ, 3σ", _PRINTED.number("table5.d_beta_arcsec"), "arcsec", 0.005, _DIGITS),
@@ -34,7 +33,7 @@ _SHOWN = ("paper_single", "paper_joint", "derived")
 CHECKS = (
     *(
         Check(f"001.table5.{name}", "Table 5", f"{text}, all causes at once through images", unit, value, 0.2 * value,
-              _INPUTS, separation=0.5 * value, alternative="half as much or half as much again", basis="chosen")
+              INPUTS, separation=0.5 * value, alternative="half as much or half as much again", basis="chosen")
         for name, (_, text, value, unit, *_) in _PARAMETERS.items()
     ),
     *(
@@ -48,7 +47,7 @@ CHECKS = (
           _PRINTED.number("table5.d_f_mm"), 0.005, _DIGITS, expected=CORRECTED,
           separation=0.02, alternative="half of it"),
     Check("001.table5.x_and_y", "section 3.2.3, abstract",
-          "The turns about X and Y are determined to better than 0.1″: the larger, 3σ", "arcsec", 0.1, 0.02, _INPUTS,
+          "The turns about X and Y are determined to better than 0.1″: the larger, 3σ", "arcsec", 0.1, 0.02, INPUTS,
           "at most",
           separation=0.045, alternative="the error of a single spot, 0.145 arcsec", basis="chosen"),
     Check("001.table5.d_gamma.positioning", "section 3.2.3",
@@ -78,7 +77,7 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         if f"001.table5.{name}.propagated" in context.selected:
             yield _propagated(context, images, name)
     if "001.table5.d_f.by_table1" in context.selected:
-        value = budget.propagated(TABLE_4, images.geometry, "paper_joint")["d_f"] / 1e-3
+        value = budget.propagated(_TABLE_4, images.geometry, "paper_joint")["d_f"] / 1e-3
         how = "Table 1's joint factors on the printed Table 4; the other three rows come out alike by both columns."
         reason = Explanation(0.02, CORRECTED, "Table 1's joint Δf is half of (7), and Table 5 was made with (7).")
         yield context.check("001.table5.d_f.by_table1").evaluate(value, None, how, None, [reason])
@@ -125,7 +124,7 @@ def all_causes(value: float) -> Chosen:
 
 def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResult:
     unit = _PARAMETERS[name][3]
-    value = budget.propagated(TABLE_4, images.geometry)[name] / _UNIT[unit]
+    value = budget.propagated(_TABLE_4, images.geometry)[name] / _UNIT[unit]
     g = images.geometry
     how = (
         f"The printed factors on the printed Table 4 of every coordinate of both spots, independent; f = "
@@ -137,7 +136,7 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
 
             def response(factor: float, field: str = field, size: float = size) -> float:
                 changed = replace(g, **{field: factor * size})
-                return budget.propagated(TABLE_4, changed)[name] / _UNIT[unit]
+                return budget.propagated(_TABLE_4, changed)[name] / _UNIT[unit]
 
             inputs.append(Chosen(what, size, "m", response))
     return context.check(f"001.table5.{name}.propagated").evaluate(value, None, how, inputs=inputs)

@@ -30,6 +30,10 @@ FIELDS, IMAGES, STRIP = "calibrate.yaml", "calibrate_images.yaml", "calibrate_st
 """Files of scenes/orbit: seven fields of drawn points; fields of rendered images; passes with tie points."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 
+CLASS = "a value of a class lies below √10 times its number"
+"""Why a tolerance is ROOT_TEN - 1 of a number."""
+ROOT_TEN = 10**0.5
+
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
     """A file of the library with some of its fields and with other values of its test's attributes."""

@@ -20,7 +20,17 @@ from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckR
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.paper_003 import exact, rendered
 from twin.validation.paper_003 import rendered as marks
-from twin.validation.paper_003.exact import FIELDS, IMAGES, Rank, Walk, all_errors, setup_of, without_light
+from twin.validation.paper_003.exact import (
+    CLASS,
+    FIELDS,
+    IMAGES,
+    ROOT_TEN,
+    Rank,
+    Walk,
+    all_errors,
+    setup_of,
+    without_light,
+)
 from twin.validation.paper_003.exact import exact as exact_setup
 from twin.validation.paper_003.rendered import FREE_INTERIOR, ROLL_PITCH, YAW, FromImages
 
@@ -69,8 +79,6 @@ FORM = (
     "The equations are lost in the text. Rebuilt from its words: ground = station + scale · R(measured attitude) "
     "R(bias) (position + R(camera) [−(x − x₀)(1 + d), −(y − y₀)(1 + d), f]ᵀ)."
 )
-_CLASS = "a value of a class lies below √10 times its number"
-_SECOND = 10**0.5 - 1.0
 _SECTION = "section 2, rigorous model (lost)"
 
 CHECKS = (
@@ -121,7 +129,7 @@ CHECKS = (
     Check(
         "003.model.bias", "section 4.3, Table 3",
         "Rendered field by the stepwise solution: roll and pitch are known to the class of 1″, RMS error", "arcsec",
-        1.0, _SECOND, _CLASS, "at most",
+        1.0, ROOT_TEN - 1.0, CLASS, "at most",
         separation=9.0, alternative="the class of 10″", basis="chosen",
     ),
     Check(
@@ -134,7 +142,7 @@ CHECKS = (
     Check(
         "003.model.interior", "section 4.3, Tables 4 and 5",
         "Rendered field by the stepwise solution: the interior is known to the class of 0.01 mm, RMS error", "µm",
-        10.0, 10.0 * _SECOND, _CLASS, "at most",
+        10.0, 10.0 * (ROOT_TEN - 1.0), CLASS, "at most",
         separation=90.0, alternative="the class of 0.1 mm", basis="chosen",
     ),
     Check(

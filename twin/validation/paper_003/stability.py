@@ -16,7 +16,7 @@ from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
 from twin.validation.checks.check import CONSISTENT, CORRECTED, UNDECIDED, Check, CheckResult, Explanation, mean_of
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import Context
-from twin.validation.paper_003.exact import all_errors, changed
+from twin.validation.paper_003.exact import CLASS, ROOT_TEN, all_errors, changed
 from twin.validation.paper_003.flights import MEDIAN, Flights, lines_of, median
 
 _EDGE = 1e-9
@@ -72,10 +72,8 @@ def _readings(first: float, last: float, interval: float) -> np.ndarray:
     return interval * np.arange(np.ceil(first / interval - _EDGE), np.floor(last / interval + _EDGE) + 1.0)
 
 
-ROOT_TEN = 10**0.5
 SLOW = 1.5 * ARCSEC, 10.0
 """Slow errors of the attitude that third differences are tried on: sigma of a value, seconds between values."""
-_CLASS = "a value of a class lies below √10 times its number"
 _TOLD = 3.0
 _QUARTILE = 0.6745
 """Sigmas from the median of normal noise."""
@@ -111,7 +109,7 @@ CHECKS = (
         Check(
             f"003.table3.{axis}", "Table 3, section 4.3",
             f"{axis} of the seven fields, each calibrated by itself, agrees to the class of 1″: scatter over the "
-            "fields", "arcsec", 1.0, ROOT_TEN - 1.0, _CLASS, "at most",
+            "fields", "arcsec", 1.0, ROOT_TEN - 1.0, CLASS, "at most",
             separation=9.0, alternative="the class of 10″", basis="chosen",
         )
         for axis in BIAS
@@ -119,7 +117,7 @@ CHECKS = (
     Check(
         "003.table3.truth", "Table 3, section 4.3",
         "The biases of Table 3 are true to the class of 1″: RMS error of roll and pitch", "arcsec", 1.0,
-        ROOT_TEN - 1.0, _CLASS, "at most",
+        ROOT_TEN - 1.0, CLASS, "at most",
         separation=9.0, alternative="the class of 10″", basis="chosen",
     ),
     Check(
@@ -142,13 +140,13 @@ CHECKS = (
     Check(
         "003.table4", "Table 4, section 4.3",
         "Interior orientation repeats to the class of 0.01 mm, taken for the principal points: scatter of x and y over "
-        "the fields", "µm", 10.0, 10.0 * (ROOT_TEN - 1.0), _CLASS, "at most",
+        "the fields", "µm", 10.0, 10.0 * (ROOT_TEN - 1.0), CLASS, "at most",
         separation=90.0, alternative="the class of 0.1 mm", basis="chosen",
     ),
     Check(
         "003.table5", "Table 5, section 4.3",
         "Interior orientation repeats to the class of 0.01 mm, taken for the principal distances: scatter of f over "
-        "the fields", "µm", 10.0, 10.0 * (ROOT_TEN - 1.0), _CLASS, "at most",
+        "the fields", "µm", 10.0, 10.0 * (ROOT_TEN - 1.0), CLASS, "at most",
         separation=90.0, alternative="the class of 0.1 mm", basis="chosen",
     ),
 )  # fmt: skip

@@ -20,6 +20,7 @@ from scenes.specs.channel import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
+from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001.ranges.curves import CORRECTED, FORMS, Bench, Curves, sampled
 from twin.validation.paper_001.ranges.turns import CLAIMED, FINE, NAMES, motion_of
 
@@ -170,7 +171,7 @@ def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Resp
     return out
 
 
-CONFOCAL = 40e-6
+CONFOCAL = load_printed("004").number("alignment.confocal_um") / 1e6
 """How well paper 004 sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
 """Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""

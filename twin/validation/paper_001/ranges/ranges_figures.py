@@ -16,7 +16,7 @@ from twin.validation.paper_001.ranges.turns import CLAIMED, EQUATIONS, FINE, NAM
 
 _COLOURS = {PRINTED: VERMILION, JOINT: ORANGE, CORRECTED: BLUE, CALIBRATED: GREEN}
 _MARKS = {PRINTED: "o", JOINT: "D", CORRECTED: "s", CALIBRATED: "^"}
-_SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
+SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
 _OF_PARAMETER = {"d_alpha": VERMILION, "d_beta": BLUE, "d_gamma": GREEN, "d_f": PURPLE}
 _ORDER = ("d_beta", "d_alpha", "d_gamma", "d_f")
 
@@ -66,7 +66,7 @@ def singles_svg(ranges: Mapping[str, Sequence[Range]]) -> str:
             axes.plot([], [], ":", color=INK, lw=1.0, label="0.04 mm" if name == "d_f" else "0.1 arcsec")
             if CLAIMED[name] != FINE[name]:
                 axes.plot([], [], "-.", color=INK, lw=1.0, label="2.15 arcsec")
-            axes.set_xlabel(f"true {_SYMBOLS[name]} [{unit}]")
+            axes.set_xlabel(f"true {SYMBOLS[name]} [{unit}]")
             axes.set_ylabel(f"|error| [{unit}]")
             axes.legend(loc="upper left", ncols=2)
         return to_svg(figure)
@@ -90,7 +90,7 @@ def joint_svg(corners: Corners, forms: Sequence[str]) -> str:
             _log(axes)
             axes.set_xlim(float(corners.images.size[0]), corners.lost * 1.02)
             limit = f"{CLAIMED[name] * _scale(name)[0]:g} {_scale(name)[1]}"
-            axes.set_ylabel(f"worst error of {_SYMBOLS[name]} / {limit}")
+            axes.set_ylabel(f"worst error of {SYMBOLS[name]} / {limit}")
         for axes in panels[2:]:
             axes.set_xlabel("size of the box, times ±(4″, 4″, 24″, 0.95 mm)")
         panels[0].legend(loc="lower right")
@@ -111,7 +111,7 @@ def defocus_svg(pupil: PupilStudy, curves: Curves, focal: tuple[float, float]) -
             left.plot(1e3 * grid, sign * 1e-6 * grid / length**2 / ARCSEC, "-", color=colour, lw=1.0)
             letter = "XY"[axis]
             left.plot(1e3 * pupil.offset[own, axis], slope, "o" if axis == 0 else "s", color=colour, ms=5.0,
-                      label=f"{_SYMBOLS[name]}, sub-aperture along {letter}")  # fmt: skip
+                      label=f"{SYMBOLS[name]}, sub-aperture along {letter}")  # fmt: skip
         left.plot([], [], "-", color=GREY, lw=1.0, label="theory, ±h/f²")
         left.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
         left.set_xlabel("sub-aperture off the pupil's middle, h [mm]")
@@ -127,7 +127,7 @@ def defocus_svg(pupil: PupilStudy, curves: Curves, focal: tuple[float, float]) -
         _log(right)
         for name, end in ends.items():
             place = 1e6 * float(curves.size[-1]), end
-            right.annotate(_SYMBOLS[name], place, xytext=(6, 0), textcoords="offset points",
+            right.annotate(SYMBOLS[name], place, xytext=(6, 0), textcoords="offset points",
                            color=_OF_PARAMETER[name], va="center")  # fmt: skip
         right.set_xlabel("motion of the line CCD along Z [µm]")
         right.set_ylabel("false reading / (0.1″, 2.15″, 0.04 mm)")
@@ -152,7 +152,7 @@ def field_svg(points: Sequence[FieldPoint]) -> str:
         )
         for name, mark in (("d_beta", "s"), ("d_alpha", "^"), ("d_gamma", "D"), ("d_f", "v")):
             axes.plot(np.degrees(field), 100 * (gain(CORRECTED, name) - 1.0), f"{mark}-", color=_OF_PARAMETER[name],
-                      ms=4.5, lw=0.8, label=f"{_SYMBOLS[name]} corrected")  # fmt: skip
+                      ms=4.5, lw=0.8, label=f"{SYMBOLS[name]} corrected")  # fmt: skip
         axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
         axes.set_xlim(0.0, None)
         axes.set_xlabel("field of the area CCDs [deg]")

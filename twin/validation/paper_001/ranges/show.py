@@ -14,9 +14,9 @@ from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges import ranges_figures
 from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, FORMS, JOINT, PRINTED, Curves
 from twin.validation.paper_001.ranges.defocus import CONFOCAL, SMALL, FieldPoint, PupilStudy, Response
+from twin.validation.paper_001.ranges.ranges_figures import SYMBOLS
 from twin.validation.paper_001.ranges.turns import CUT, KINDS, NAMES, UNITS, Corners, Range, Separation, criterion, key
 
-SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
 _GAIN_TEXT = "reading over truth"
 _SHOWN = {"d_alpha": "arcsec", "d_beta": "arcsec", "d_gamma": "arcsec", "d_f": "mm"}
 _PER = {"d_alpha": 1.0, "d_beta": 1.0, "d_gamma": 1.0, "d_f": 1e3}
