@@ -23,6 +23,33 @@ from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, 
 from twin.validation.paper_000.sentences import ALIKE, AXES, GREEK, SENTENCES, Rises, Sentence
 
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
+Array = NDArray[np.float64]
+REACH = 10.0
+"""Metres."""
+ELSEWHERE = (45.0, 120.0)
+"""Latitude and longitude, degrees, of a pass on which what the paper says of place-dependent sizes holds."""
+PANELS = {
+    "fig3": (("station", "alpha"), ("station", "beta")),
+    "fig4": (("forward", "alpha"), ("nadir", "alpha")),
+    "fig5": (("nadir", "beta"), ("aft", "beta")),
+}
+TITLES = {
+    "fig3": "Fig. 3 again: errors of the station",
+    "fig4": "Fig. 4 again: errors of the forward and nadir points in α",
+    "fig5": "Fig. 5 again: errors of the nadir and aft points in β",
+}
+
+CHECKS = (
+    *(sentence.check() for sentence in SENTENCES),
+    Check("000.fig3.ordinate", "Fig. 3, section 2.3.1", "The sentences speak of the angles, though the figures show "
+          "resection minus planes: share of the signs that come out so", "1", None, 0.0, "signs counted", "at least",
+          separation=1 / 6, alternative="one sentence of six that comes out the other way", basis="chosen"),
+    Check("000.fig3.values", "Figs. 3, 4, 5", "Sizes of the changes", "arcsec", None, 0.0, "nothing to compare",
+          expected=NOT_CHECKABLE),
+    Check("000.fig4.single", "section 2.3.2", "Single control points do not change the result much: change of α by one "
+          "forward point over that by all, the point that does most", "1", None, 0.1, "a tenth is not much", "at most",
+          separation=0.33, alternative="a third, the share of one point of three", basis="chosen"),
+)  # fmt: skip
 
 
 def sensitivity_svg(
@@ -86,35 +113,6 @@ def places_svg(held: Mapping[tuple[float, float], int], total: int, marked: Mapp
         figure.colorbar(mesh, ax=axes, label=f"sentences that hold, of {total}")
         plain_axes(axes)
         return to_svg(figure)
-
-
-Array = NDArray[np.float64]
-REACH = 10.0
-"""Metres."""
-ELSEWHERE = (45.0, 120.0)
-"""Latitude and longitude, degrees, of a pass on which what the paper says of place-dependent sizes holds."""
-PANELS = {
-    "fig3": (("station", "alpha"), ("station", "beta")),
-    "fig4": (("forward", "alpha"), ("nadir", "alpha")),
-    "fig5": (("nadir", "beta"), ("aft", "beta")),
-}
-TITLES = {
-    "fig3": "Fig. 3 again: errors of the station",
-    "fig4": "Fig. 4 again: errors of the forward and nadir points in α",
-    "fig5": "Fig. 5 again: errors of the nadir and aft points in β",
-}
-
-CHECKS = (
-    *(sentence.check() for sentence in SENTENCES),
-    Check("000.fig3.ordinate", "Fig. 3, section 2.3.1", "The sentences speak of the angles, though the figures show "
-          "resection minus planes: share of the signs that come out so", "1", None, 0.0, "signs counted", "at least",
-          separation=1 / 6, alternative="one sentence of six that comes out the other way", basis="chosen"),
-    Check("000.fig3.values", "Figs. 3, 4, 5", "Sizes of the changes", "arcsec", None, 0.0, "nothing to compare",
-          expected=NOT_CHECKABLE),
-    Check("000.fig4.single", "section 2.3.2", "Single control points do not change the result much: change of α by one "
-          "forward point over that by all, the point that does most", "1", None, 0.1, "a tenth is not much", "at most",
-          separation=0.33, alternative="a third, the share of one point of three", basis="chosen"),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ Rises = Mapping[tuple[str, Angle, str], float]
 
 AXES = ("x", "y", "z")
 FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
-GREEK: Mapping[Angle, str] = {"alpha": "α", "beta": "β"}
+GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How errors of spots become errors of parameters, and the budget's states as images."""
+"""Paper 001's (12), what errors of spots do to the parameters, and all that is simulated for the budget's checks."""
 
 from __future__ import annotations
 
@@ -26,6 +26,24 @@ from twin.validation.checks.printed import load_printed
 
 FRAMES = 9
 """Averaged in one measurement, (12)."""
+BUDGET = "monitor_pair"
+TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
+TABLE_4 = load_printed("001").number("table4.spot_arcsec")
+INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
+"""Why a tolerance is a fifth."""
+FEW_DRAWS = ("coordinate_thermal", "central_prism_thermal")
+"""Lines of two or three random numbers a state, which need more states than those of a prism in every channel."""
+ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
+"""Table 5's error of d_gamma."""
+FROM_ALL_CAUSES = frozenset(
+    f"001.{name}"
+    for name in (
+        *("eq12", "table4.together", "table5.d_f.field", "table5.x_and_y"),
+        *(f"table5.{parameter}" for parameter in ("d_beta", "d_alpha", "d_gamma", "d_f")),
+    )
+)
+"""Checks that need all causes at once."""
+_CHUNK = 40
 
 
 def frame_mean(error: float, frames: int = FRAMES) -> float:
@@ -60,26 +78,6 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
     pixels = spot * geometry.focal_length_m / geometry.pixel_m
     factors = np.sqrt(np.sum(monitoring.coefficients(estimator, geometry) ** 2, axis=1))
     return dict(zip(("d_alpha", "d_beta", "d_gamma", "d_f"), (float(v) for v in factors * pixels), strict=True))
-
-
-BUDGET = "monitor_pair"
-TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
-TABLE_4 = load_printed("001").number("table4.spot_arcsec")
-INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
-"""Why a tolerance is a fifth."""
-FEW_DRAWS = ("coordinate_thermal", "central_prism_thermal")
-"""Lines of two or three random numbers a state, which need more states than those of a prism in every channel."""
-ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
-"""Table 5's error of d_gamma."""
-FROM_ALL_CAUSES = frozenset(
-    f"001.{name}"
-    for name in (
-        *("eq12", "table4.together", "table5.d_f.field", "table5.x_and_y"),
-        *(f"table5.{parameter}" for parameter in ("d_beta", "d_alpha", "d_gamma", "d_f")),
-    )
-)
-"""Checks that need all causes at once."""
-_CHUNK = 40
 
 
 @dataclass(frozen=True, eq=False)

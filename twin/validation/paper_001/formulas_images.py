@@ -23,6 +23,10 @@ from twin.monitor.truth import Truth, trace_truth
 from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg
 
 Value = TypeVar("Value", float, np.ndarray)
+FRAMES = 9
+PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
+SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
+"""Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
 
 
 def roll_displacement(x_left: Value, x_right: Value) -> Value:
@@ -58,10 +62,6 @@ def parts_along(left: Value, right: Value) -> tuple[Value, Value]:
 def parts_across(left: Value, right: Value) -> tuple[Value, Value]:
     """Eq. (11): the shares of the turn about Y and of the roll in X."""
     return (left + right) / 2.0, (left - right) / 2.0
-
-
-FRAMES = 9
-PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
 
 
 @dataclass(frozen=True)
@@ -187,10 +187,6 @@ class MonitorImages:
         for camera in self.cameras:
             out[camera] = quotient(self.reading(camera, motion, estimator, parameter), (should(camera), 0.0))
         return Ratio.mean(out)
-
-
-SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
-"""Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
 
 
 def states_of(experiment: MonitorExperiment) -> dict[str, State]:

@@ -33,6 +33,12 @@ _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 CLASS = "a value of a class lies below √10 times its number"
 """Why a tolerance is ROOT_TEN - 1 of a number."""
 ROOT_TEN = 10**0.5
+TOLERANCE = 1e-3
+"""Of the conditional sigmas; the last step of a round of the stepwise solution."""
+_STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
+"""Metres: how far an element is changed to either side, 1.5 px; what is left of third order is 1e-9 of it."""
+_TURN = 1.5e-5
+"""Radians, likewise."""
 
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
@@ -102,14 +108,6 @@ class Turned:
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
         """Turned."""
         return np.asarray(self.base.body_to_itrs(seconds) @ Rotation.from_euler("XYZ", self.angles).as_matrix())
-
-
-TOLERANCE = 1e-3
-"""Of the conditional sigmas; the last step of a round of the stepwise solution."""
-_STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
-"""Metres: how far an element is changed to either side, 1.5 px; what is left of third order is 1e-9 of it."""
-_TURN = 1.5e-5
-"""Radians, likewise."""
 
 
 def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, pixel: np.ndarray) -> Rays:

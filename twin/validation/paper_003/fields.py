@@ -1,4 +1,4 @@
-"""Checks of paper 003 over test fields: schemes, repeatability, accuracy."""
+"""The group of paper 003's checks over test fields: schemes, repeatability, accuracy, with figures and tables."""
 
 from __future__ import annotations
 
@@ -22,6 +22,15 @@ from twin.validation.paper_003.flights import Flights
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, INK)
 _MARKERS = "osD^vPX"
 _CURVES = 40
+FULL, FAST = 150, 24
+"""Campaigns."""
+LOST = {
+    "003.table1": "The table is not in the text. Names of the fields and the schemes are; latitudes, longitudes, "
+    "dates, heights and relief in scenes/orbit/calibrate.yaml are chosen after the names, from 28° to 46° of latitude.",
+    "003.fig3": "The map is not in the text; the fields lie where scenes/orbit/calibrate.yaml puts them.",
+    "003.table6": "The numbers are not in the text. What section 4.5 says of them is 003.scheme1 to 003.scheme5.",
+    "003.table7": "The numbers are not in the text. What section 4.5 says of them is 003.scheme1 to 003.scheme5.",
+}
 
 
 def schemes_svg(found: Flights, plan: float, height: float) -> str:
@@ -77,21 +86,10 @@ def latitude_svg(found: Flights) -> str:
         return to_svg(figure)
 
 
-FULL, FAST = 150, 24
-"""Campaigns."""
-
-
 def _lost(identifier: str, equation: str, statement: str) -> Check:
     return Check(identifier, equation, statement, "1", None, 0.0, "the numbers are lost", expected=NOT_CHECKABLE)
 
 
-LOST = {
-    "003.table1": "The table is not in the text. Names of the fields and the schemes are; latitudes, longitudes, "
-    "dates, heights and relief in scenes/orbit/calibrate.yaml are chosen after the names, from 28° to 46° of latitude.",
-    "003.fig3": "The map is not in the text; the fields lie where scenes/orbit/calibrate.yaml puts them.",
-    "003.table6": "The numbers are not in the text. What section 4.5 says of them is 003.scheme1 to 003.scheme5.",
-    "003.table7": "The numbers are not in the text. What section 4.5 says of them is 003.scheme1 to 003.scheme5.",
-}
 CHECKS = (
     _lost("003.table1", "Table 1", "Extent, terrain and images of the seven fields"),
     _lost("003.fig3", "Fig. 3", "Where the seven fields lie"),

@@ -1,4 +1,4 @@
-"""Checks of paper 003's rigorous model."""
+"""Checks of paper 003's rigorous model, with the figure of what the points cannot tell."""
 
 from __future__ import annotations
 
@@ -36,42 +36,6 @@ from twin.validation.paper_003.rendered import FREE_INTERIOR, ROLL_PITCH, YAW, F
 
 _FOCAL = 0.65
 """Metres; angles are drawn as image motion."""
-
-
-def open_svg(rank: Rank, walk: Walk) -> str:
-    """Bars of the open combination, and sigmas over rounds."""
-    with look("paper-003-open"):
-        figure = new_figure(3.4)
-        left, right = figure.subplots(1, 2)
-        one = rank.open[0]
-        names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in one.names]
-        angle = [n.split()[-1] not in "fxy" for n in one.names]
-        size = [float(c) * (_FOCAL if a else 1.0) * 1e3 for c, a in zip(one.change, angle, strict=True)]
-        place = np.arange(len(names))
-        left.barh(place, size, color=[VERMILION if a else BLUE for a in angle], height=0.6)
-        labels = [f"{c / ARCSEC:+.0f}″" if a else f"{c * 1e3:+.2f} mm" for c, a in zip(one.change, angle, strict=True)]
-        for k, label in enumerate(labels):
-            left.text(0.5 * size[k], k, label, ha="center", va="center", color="white", fontsize=9.0)
-        left.set_yticks(place, names)
-        left.set_ylim(len(names) - 0.5, -0.5)
-        left.axvline(0.0, color=GREY, lw=0.8)
-        left.set_xlabel("image motion of each alone [mm]")
-        left.set_title(f"Together: {rank.moved:.4f} px instead of {rank.alone:.0f} px, x of 0.1 mm")
-        rounds, away = list(walk.after), list(walk.after.values())
-        right.loglog(rounds, away, "o-", color=BLUE, ms=5)
-        right.axhline(0.1, color=GREY, lw=0.9, ls="--")
-        right.text(rounds[0], 0.105, "a tenth of a sigma", color=GREY, va="bottom")
-        right.set_xticks((1, 10, 100, 1000), ("1", "10", "100", "1000"))
-        right.set_yticks((0.01, 0.1, 1, 10), ("0.01", "0.1", "1", "10"))
-        right.minorticks_off()
-        right.set_xlabel("rounds of biases, then interior")
-        right.set_ylabel("farthest unknown [sigmas]")
-        right.set_title("Stepwise against simultaneous solution")
-        for axes in (left, right):
-            plain_axes(axes)
-        return to_svg(figure)
-
-
 FIELD = "Beijing"
 FAST_SIDE = 380
 """Lines and pixels of a rendered patch in the fast run."""
@@ -172,6 +136,46 @@ LOST = {
     "schemes: calibrate on control points, intersect check points. Between the two the paper adjusts each strip, by a "
     "method that it does not describe; no check point here has been adjusted.",
 }
+_IMAGES = {
+    "003.model.points", "003.model.bias", "003.model.bias.yaw", "003.model.interior", "003.model.plan",
+    "003.model.height",
+}  # fmt: skip
+UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
+ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)
+
+
+def open_svg(rank: Rank, walk: Walk) -> str:
+    """Bars of the open combination, and sigmas over rounds."""
+    with look("paper-003-open"):
+        figure = new_figure(3.4)
+        left, right = figure.subplots(1, 2)
+        one = rank.open[0]
+        names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in one.names]
+        angle = [n.split()[-1] not in "fxy" for n in one.names]
+        size = [float(c) * (_FOCAL if a else 1.0) * 1e3 for c, a in zip(one.change, angle, strict=True)]
+        place = np.arange(len(names))
+        left.barh(place, size, color=[VERMILION if a else BLUE for a in angle], height=0.6)
+        labels = [f"{c / ARCSEC:+.0f}″" if a else f"{c * 1e3:+.2f} mm" for c, a in zip(one.change, angle, strict=True)]
+        for k, label in enumerate(labels):
+            left.text(0.5 * size[k], k, label, ha="center", va="center", color="white", fontsize=9.0)
+        left.set_yticks(place, names)
+        left.set_ylim(len(names) - 0.5, -0.5)
+        left.axvline(0.0, color=GREY, lw=0.8)
+        left.set_xlabel("image motion of each alone [mm]")
+        left.set_title(f"Together: {rank.moved:.4f} px instead of {rank.alone:.0f} px, x of 0.1 mm")
+        rounds, away = list(walk.after), list(walk.after.values())
+        right.loglog(rounds, away, "o-", color=BLUE, ms=5)
+        right.axhline(0.1, color=GREY, lw=0.9, ls="--")
+        right.text(rounds[0], 0.105, "a tenth of a sigma", color=GREY, va="bottom")
+        right.set_xticks((1, 10, 100, 1000), ("1", "10", "100", "1000"))
+        right.set_yticks((0.01, 0.1, 1, 10), ("0.01", "0.1", "1", "10"))
+        right.minorticks_off()
+        right.set_xlabel("rounds of biases, then interior")
+        right.set_ylabel("farthest unknown [sigmas]")
+        right.set_title("Stepwise against simultaneous solution")
+        for axes in (left, right):
+            plain_axes(axes)
+        return to_svg(figure)
 
 
 @one_blas_thread()
@@ -188,12 +192,6 @@ def run(context: Context) -> Iterator[CheckResult]:
     images = [i for i in context.selected if i in _IMAGES]
     if images:
         yield from _rendered(context, stream(seed, 3))
-
-
-_IMAGES = {
-    "003.model.points", "003.model.bias", "003.model.bias.yaw", "003.model.interior", "003.model.plan",
-    "003.model.height",
-}  # fmt: skip
 
 
 def exact_and_images() -> CalibrationSetup:
@@ -282,10 +280,6 @@ def _drawn(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
             f"{way.together.iterations} steps. A few rounds are not enough, and small steps are no sign of an end."
         )
         yield context.check("003.model.stepwise").evaluate(way.distance, None, how, 0.0)
-
-
-UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
-ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)
 
 
 def image_setup(fast: bool) -> CalibrationSetup:

@@ -36,6 +36,10 @@ _SIGMA = 2.5
 _APART = 300.0
 _REACH = MARGIN + 4
 _TERRAIN: dict[str, object] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
+Advance = Callable[[float], None]
+ROLL_PITCH = BIAS[:2]
+YAW = BIAS[2:]
+FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTERIOR) if n not in GAUGE.held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +145,6 @@ def _matched(predicted: tuple[np.ndarray, np.ndarray], at: np.ndarray, ground: n
     return ground[order]
 
 
-Advance = Callable[[float], None]
-
-
 @dataclass(frozen=True, eq=False)
 class FromImages:
     """One field.
@@ -176,11 +177,6 @@ class FromImages:
         spread = float(np.sqrt(2.0 * np.trace(part @ part))) / len(where)
         found = float(np.sqrt(np.mean([self.error[n] ** 2 for n in names])))
         return found, spread / (2.0 * float(np.sqrt(mean)))
-
-
-ROLL_PITCH = BIAS[:2]
-YAW = BIAS[2:]
-FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTERIOR) if n not in GAUGE.held)
 
 
 def measured(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Campaign:

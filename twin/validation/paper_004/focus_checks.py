@@ -39,6 +39,58 @@ ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "
 """Tilts and lift by shims, the others by hand."""
 LIMITS = np.array([10.0 * ARCSEC, 10.0 * ARCSEC, 10.0 * ARCSEC, 7e-6, 7e-6, 5e-6])
 """What counts as a change: the theodolite's 10 arcsec, a panchromatic pixel, a step of the shims."""
+TEST = "focus"
+ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
+"""Alignments from random mis-settings."""
+
+_MTF = "10 %: two digits are printed, and neither wavefront error nor detector: "
+_REASONS = {
+    "P": _MTF + "0.01 waves more or less of 0.06 are 5 % (Maréchal), 0.2 µm of charge diffusion of 1.4 µm as much",
+    "B": _MTF + "a tenth of the line period more or less of exposure is 8 %",
+}
+
+CHECKS = (
+    *(
+        Check(f"004.table1.{band}", "Table 1", f"MTF of the camera at the Nyquist frequency of {band}", "1", value,
+              0.1 * value, _REASONS[band[0]],
+              separation=0.3 * value, alternative="a third more or less", basis="chosen")
+        for band, value in MTF_NYQUIST.items()
+    ),
+    Check("004.table1.frequency", "Table 1", "The values are those at the Nyquist frequency, which the table does not "
+          "print: frequency at which the rendered edges have them, over Nyquist", "1", None, 0.1,
+          "10 % of an MTF, the tolerance of the values, is 5 to 10 % of the frequency",
+          separation=0.5, alternative="half the Nyquist frequency", basis="chosen"),
+    Check("004.table1.average", "Table 1", "The values are averages", "1", None, 0.0, "nothing is compared",
+          expected=NOT_CHECKABLE),
+    Check("004.alignment.coupling", "section 1.2", "All six parameters of the assembly are coupled when it is "
+          "adjusted: number of those that an adjustment changes together with another one", "1", 6.0, 0.0,
+          "they are counted",
+          separation=1.0, alternative="five, one that is adjusted by itself", basis="chosen"),
+    Check("004.alignment.defocus", "section 2.1", "MTF through focus gives the defocus of every CCD in every field and "
+          "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached",
+          separation=40.0, alternative="a defocus as large as what is to be reached"),
+    Check("004.alignment.plane", "section 2.2", "A turn about X' and Y' and a shift along Z' make up for the defocus: "
+          "largest true distance from best focus after exactly the motion found", "mm", 1e-3 * CONFOCAL_UM, 0.0,
+          "the bound itself", "at most",
+          separation=0.04, alternative="twice the bound", basis="chosen"),
+    Check("004.alignment.constraint", "section 2.2", "The motion found keeps the line level: true turn of the line "
+          "after it", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
+          separation=1.0, alternative="twice the bound", basis="chosen"),
+    Check("004.alignment.shims", "section 2.2", "The motion gives the shims' changes at the holes: RMS difference from "
+          "those that the traced defocus asks for", "µm", None, 5.0, "the steps to which the shims are ground",
+          separation=50.0, alternative="a shim that is turned or swapped with another"),
+    Check("004.alignment.confocal", "section 2.3", "One round of shims brings every CCD to within 0.04 mm of best "
+          "focus: largest true distance of any alignment", "mm", 1e-3 * CONFOCAL_UM, 0.0, "the bound itself",
+          "at most",
+          separation=0.04, alternative="twice the bound", basis="chosen"),
+    Check("004.alignment.level", "section 2.3", "One round of shims leaves the line level to 1 arcmin: largest true "
+          "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
+          separation=1.0, alternative="twice the bound", basis="chosen"),
+    Check("004.alignment.rounds", "section 2.3", "One round of shims is enough: rounds until both bounds are kept, "
+          "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most",
+          separation=1.0, alternative="two rounds", basis="chosen"),
+)  # fmt: skip
+_ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or line periods, times"
 
 
 def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
@@ -106,59 +158,6 @@ def _coupled(change: Array) -> float:
     """How many parameters change together with another one."""
     seen = np.abs(change) > LIMITS
     return float(np.sum(np.any(seen & (seen.sum(axis=1) > 1)[:, None], axis=0)))
-
-
-TEST = "focus"
-ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
-"""Alignments from random mis-settings."""
-
-_MTF = "10 %: two digits are printed, and neither wavefront error nor detector: "
-_REASONS = {
-    "P": _MTF + "0.01 waves more or less of 0.06 are 5 % (Maréchal), 0.2 µm of charge diffusion of 1.4 µm as much",
-    "B": _MTF + "a tenth of the line period more or less of exposure is 8 %",
-}
-
-CHECKS = (
-    *(
-        Check(f"004.table1.{band}", "Table 1", f"MTF of the camera at the Nyquist frequency of {band}", "1", value,
-              0.1 * value, _REASONS[band[0]],
-              separation=0.3 * value, alternative="a third more or less", basis="chosen")
-        for band, value in MTF_NYQUIST.items()
-    ),
-    Check("004.table1.frequency", "Table 1", "The values are those at the Nyquist frequency, which the table does not "
-          "print: frequency at which the rendered edges have them, over Nyquist", "1", None, 0.1,
-          "10 % of an MTF, the tolerance of the values, is 5 to 10 % of the frequency",
-          separation=0.5, alternative="half the Nyquist frequency", basis="chosen"),
-    Check("004.table1.average", "Table 1", "The values are averages", "1", None, 0.0, "nothing is compared",
-          expected=NOT_CHECKABLE),
-    Check("004.alignment.coupling", "section 1.2", "All six parameters of the assembly are coupled when it is "
-          "adjusted: number of those that an adjustment changes together with another one", "1", 6.0, 0.0,
-          "they are counted",
-          separation=1.0, alternative="five, one that is adjusted by itself", basis="chosen"),
-    Check("004.alignment.defocus", "section 2.1", "MTF through focus gives the defocus of every CCD in every field and "
-          "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached",
-          separation=40.0, alternative="a defocus as large as what is to be reached"),
-    Check("004.alignment.plane", "section 2.2", "A turn about X' and Y' and a shift along Z' make up for the defocus: "
-          "largest true distance from best focus after exactly the motion found", "mm", 1e-3 * CONFOCAL_UM, 0.0,
-          "the bound itself", "at most",
-          separation=0.04, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.constraint", "section 2.2", "The motion found keeps the line level: true turn of the line "
-          "after it", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
-          separation=1.0, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.shims", "section 2.2", "The motion gives the shims' changes at the holes: RMS difference from "
-          "those that the traced defocus asks for", "µm", None, 5.0, "the steps to which the shims are ground",
-          separation=50.0, alternative="a shim that is turned or swapped with another"),
-    Check("004.alignment.confocal", "section 2.3", "One round of shims brings every CCD to within 0.04 mm of best "
-          "focus: largest true distance of any alignment", "mm", 1e-3 * CONFOCAL_UM, 0.0, "the bound itself",
-          "at most",
-          separation=0.04, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.level", "section 2.3", "One round of shims leaves the line level to 1 arcmin: largest true "
-          "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
-          separation=1.0, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.rounds", "section 2.3", "One round of shims is enough: rounds until both bounds are kept, "
-          "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most",
-          separation=1.0, alternative="two rounds", basis="chosen"),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,9 +277,6 @@ def _true_mtf(alignment: Alignment, band: str) -> float:
             ]
         )
     )
-
-
-_ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or line periods, times"
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:

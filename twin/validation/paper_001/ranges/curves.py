@@ -24,6 +24,11 @@ FORMS = (PRINTED, JOINT, CORRECTED, CALIBRATED)
 f/f_x, no cos^2, and (7); those with the two calibrated gradients over the field as well."""
 SHARE = 24
 """Images of 96 x 96 pixels that are rendered at once: bounds the memory."""
+ROUNDS, NEAR = 3, 1e-3
+"""Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
+
+Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
+"""Sizes (N,) -> name -> values (N,), not negative; 1 is the limit."""
 
 
 class Bench:
@@ -134,13 +139,6 @@ def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np
     corner = np.clip(brightest - np.array(shape) // 2, 0, spare)
     out = np.stack([image[r : r + shape[0], c : c + shape[1]] for image, (r, c) in zip(images, corner, strict=True)])
     return out, corner - spare / 2
-
-
-ROUNDS, NEAR = 3, 1e-3
-"""Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
-
-Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
-"""Sizes (N,) -> name -> values (N,), not negative; 1 is the limit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,24 @@ from twin.validation.paper_001.ranges.turns import CLAIMED, FINE, NAMES, motion_
 
 RETURNS = ("plane", "roof", "roof along", "corner")
 """Kinds of return: a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube."""
+SHIFT = 60e-6
+"""Of the line CCD, metres."""
+_OFFSETS: dict[str, tuple[float, float] | None] = {
+    "plane": None,
+    "roof": None,
+    "roof along": (0.0, 3e-3),
+    "corner": (0.0, 0.0),
+}
+_NOTES = {
+    "plane": "as built",
+    "roof": "as built; the ridge lies across the line",
+    "roof along": "the ridge lies along the line; the area CCD stands beside its pinhole along the line",
+    "corner": "the spot falls on its own pinhole: the area CCD must see it through a beam splitter",
+}
+CONFOCAL = load_printed("004").number("alignment.confocal_um") / 1e6
+"""How well paper 004 sets the line CCD to the focus, metres."""
+SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
+"""Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""
 
 
 def variant(
@@ -120,10 +138,6 @@ def _mirrors(kind: str) -> list[Pose]:
     return [Pose(about_axis(2, 2.0 * math.pi * k / 3.0) @ about_axis(0, lean)) for k in range(3)]
 
 
-SHIFT = 60e-6
-"""Of the line CCD, metres."""
-
-
 @dataclass(frozen=True, eq=False)
 class Response:
     """What a kind of return does.
@@ -142,20 +156,6 @@ class Response:
     note: str
 
 
-_OFFSETS: dict[str, tuple[float, float] | None] = {
-    "plane": None,
-    "roof": None,
-    "roof along": (0.0, 3e-3),
-    "corner": (0.0, 0.0),
-}
-_NOTES = {
-    "plane": "as built",
-    "roof": "as built; the ridge lies across the line",
-    "roof along": "the ridge lies along the line; the area CCD stands beside its pinhole along the line",
-    "corner": "the spot falls on its own pinhole: the area CCD must see it through a beam splitter",
-}
-
-
 def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Response]:
     """All kinds of return, by rendered images."""
     camera, pitch = like.cameras[0], resolved.instrument.monitor.area_ccd.pitch
@@ -169,12 +169,6 @@ def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Resp
         # columns run along -X, rows along +Y
         out.append(Response(kind, -moved[0, :, 1], moved[1, :, 0], gains(bench)[CORRECTED], _NOTES[kind]))
     return out
-
-
-CONFOCAL = load_printed("004").number("alignment.confocal_um") / 1e6
-"""How well paper 004 sets the line CCD to the focus, metres."""
-SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
-"""Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""
 
 
 def depth_of_focus(resolved: ResolvedJob, camera: str) -> float:

@@ -45,6 +45,11 @@ _FAR = {"d_alpha": 3600.0, "d_beta": 3600.0, "d_gamma": 36000.0, "d_f": 600e3}
 """Table units: where the curves begin, and where the trace ends at the latest."""
 _WIDE_SHARE = 0.76
 _Raw = dict[str, list[np.ndarray]]
+KINDS = ("1 %", "fine", "claimed")
+BOX = np.array([4.0, 4.0, 24.0, 950.0])
+"""Half widths in d_alpha, d_beta, d_gamma (arcsec) and d_f (um): all at once, the spots just stay on the area CCD."""
+CORNERS = np.array(list(product((-1.0, 1.0), repeat=4)))
+_joint_FAR = 200.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +81,6 @@ class Range(Domain):
 def criterion(form: str, kind: str) -> str:
     """Name of a form's error as a share of "1 %", "0.1" or "claimed"."""
     return f"{form} {kind}"
-
-
-KINDS = ("1 %", "fine", "claimed")
 
 
 def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
@@ -187,12 +189,6 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
         found = fault(middle)
         good, bad, why = (good, middle, found) if found else (middle, bad, why)
     return good, why
-
-
-BOX = np.array([4.0, 4.0, 24.0, 950.0])
-"""Half widths in d_alpha, d_beta, d_gamma (arcsec) and d_f (um): all at once, the spots just stay on the area CCD."""
-CORNERS = np.array(list(product((-1.0, 1.0), repeat=4)))
-_joint_FAR = 200.0
 
 
 def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
