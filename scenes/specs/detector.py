@@ -52,9 +52,8 @@ class DetectorSpec(Spec):
 
     @model_validator(mode="after")
     def _leaves_grey_values(self) -> "DetectorSpec":
-        most = 2**self.bit_depth - 1
-        if self.offset_dn >= most:
-            found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {most}"
+        if self.offset_dn >= self.max_dn:
+            found, allowed = f"{self.offset_dn:g} with {self.bit_depth} bits", f"less than {self.max_dn}"
             raise Problem("no grey values are left above the offset", found, allowed, within=("offset_dn",))
         steps = self.system_gain_dn_per_e * self.full_well_e
         if steps < LEAST_STEPS:
@@ -66,6 +65,23 @@ class DetectorSpec(Spec):
             )
         return self
 
+    @property
+    def max_dn(self) -> int:
+        """Largest grey value of the converter."""
+        return 2**self.bit_depth - 1
+
+    @property
+    def saturation_dn(self) -> float:
+        """Grey value where the response stops being linear: the converter's end or the full well, whichever comes
+        first.
+        """
+        return float(min(self.max_dn, self.offset_dn + self.system_gain_dn_per_e * self.full_well_e))
+
+    @property
+    def saturation_e(self) -> float:
+        """Electrons of a pixel there."""
+        return min(self.full_well_e, (self.max_dn - self.offset_dn) / self.system_gain_dn_per_e)
+
     def check_exposure(self, exposure: float) -> None:
         """See whether the dark signal leaves room for light.
 
@@ -75,7 +91,7 @@ class DetectorSpec(Spec):
         Raises:
             InputError: the dark current alone saturates the pixels.
         """
-        limit = min(self.full_well_e, (2**self.bit_depth - 1 - self.offset_dn) / self.system_gain_dn_per_e)
+        limit = self.saturation_e
         if self.dark_current_e_per_s * exposure >= limit:
             raise self.error(
                 "the dark current alone saturates the pixels",

@@ -4,6 +4,7 @@ Every statistical limit is a two-sided chi-square (or normal) quantile with a fa
 """
 
 import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -180,6 +181,24 @@ def test_expected_dn_by_hand():
 def test_impossible_data_sheets_name_the_field(field, value):
     with pytest.raises(ValueError, match=field):
         detector(**{field: value})
+
+
+@pytest.mark.parametrize(("full_well", "first"), [(50000.0, "well"), (90000.0, "converter")])
+def test_detector_and_data_sheet_saturate_at_one_level(full_well, first):
+    one = detector(full_well_e=full_well)
+    sheet = one._sheet
+    assert one.saturation_dn == sheet.saturation_dn
+    assert one.max_dn == sheet.max_dn == 4095
+    assert (one.saturation_dn == one.max_dn) is (first == "converter")
+    # in grey values and in electrons, to rounding
+    assert one.offset_dn + one.system_gain_dn_per_e * sheet.saturation_e == pytest.approx(one.saturation_dn, rel=1e-15)
+    # a dark current just above fills the pixels, and one just below does not
+    for factor, fills in ((1.001, True), (0.999, False)):
+        dark = sheet.model_copy(update={"dark_current_e_per_s": factor * sheet.saturation_e / 0.1})
+        level = detector(full_well_e=full_well, dark_current_e_per_s=dark.dark_current_e_per_s)
+        assert (level.expected_dn(np.zeros((1, 1)), 0.1)[0, 0] >= one.saturation_dn) == fills
+        with pytest.raises(InputError, match="saturates") if fills else nullcontext():
+            dark.check_exposure(0.1)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ class EmvaDetector:
 
     def __post_init__(self) -> None:
         try:
-            DetectorSpec.model_validate({"name": "detector", **self._numbers()})
+            _ = self._sheet
         except ValidationError as error:
             first = error.errors()[0]
             problem = first.get("ctx", {}).get("error")
@@ -126,6 +127,11 @@ class EmvaDetector:
         sheet.check_exposure(exposure)
         return cls(**{field.name: getattr(sheet, field.name) for field in fields(cls)})
 
+    @cached_property
+    def _sheet(self) -> DetectorSpec:
+        """The same numbers as a data sheet, which knows their limits and what follows from them."""
+        return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
+
     def _numbers(self) -> dict[str, Any]:
         """As plain numbers, not numpy's."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -134,14 +140,12 @@ class EmvaDetector:
     @property
     def max_dn(self) -> int:
         """Largest grey value of the converter."""
-        return (1 << int(self.bit_depth)) - 1
+        return self._sheet.max_dn
 
     @property
     def saturation_dn(self) -> float:
-        """Grey value where the response stops being linear: the converter's end or the full well, whichever comes
-        first.
-        """
-        return float(min(self.max_dn, self.offset_dn + self.system_gain_dn_per_e * self.full_well_e))
+        """Grey value where the response stops being linear, as the data sheet has it."""
+        return self._sheet.saturation_dn
 
     def noise_model(self, exposure_s: float) -> NoiseModel:
         """The noise description that the analysis needs, for frames of exposure_s seconds."""
