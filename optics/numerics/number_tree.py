@@ -7,7 +7,8 @@ None stands for what is not there, and has no leaves.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
+from functools import cache
 from typing import Any, TypeVar
 
 Path = tuple[str | int, ...]
@@ -16,12 +17,24 @@ Tree = TypeVar("Tree")
 
 def leaves(tree: Any) -> dict[Path, Any]:
     """Path -> leaf of every number in a tree, in the order of its fields."""
+    found: dict[Path, Any] = {}
+    _collect(tree, (), found)
+    return found
+
+
+def _collect(tree: Any, path: Path, found: dict[Path, Any]) -> None:
     if tree is None:
-        return {}
-    branches = _branches(tree)
-    if branches is None:
-        return {(): tree}
-    return {(name, *path): leaf for name, branch in branches.items() for path, leaf in leaves(branch).items()}
+        return
+    if isinstance(tree, tuple):
+        for place, branch in enumerate(tree):
+            _collect(branch, (*path, place), found)
+        return
+    names = _names(tree.__class__)
+    if names is None:
+        found[path] = tree
+        return
+    for name in names:
+        _collect(getattr(tree, name), (*path, name), found)
 
 
 def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
@@ -29,19 +42,32 @@ def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
 
     The others are of the form of ``tree``, but may have None where it has leaves; the result may, too.
     """
-    whole: Any = tree
-    if whole is None:
-        return tree
-    branches = _branches(whole)
-    if branches is None:
-        result: Any = function(whole, *others)
-        return result
-    along = [{} if other is None else _branches(other) or {} for other in others]
-    mapped = {
-        name: map_leaves(function, branch, *(other.get(name) for other in along)) for name, branch in branches.items()
-    }
-    made: Any = tuple(mapped.values()) if isinstance(whole, tuple) else type(whole)(**mapped)
-    return made
+    mapped: Tree = _mapped(function, tree, others)
+    return mapped
+
+
+def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) -> Any:
+    if tree is None:
+        return None
+    if isinstance(tree, tuple):
+        if not others:
+            return tuple([_mapped(function, branch, ()) for branch in tree])
+        along = [_all(other, len(tree)) for other in others]
+        return tuple([_mapped(function, branch, tuple(parts)) for branch, *parts in zip(tree, *along, strict=True)])
+    names = _names(tree.__class__)
+    if names is None:
+        return function(tree, *others)
+    if not others:
+        return type(tree)(*[_mapped(function, getattr(tree, name), ()) for name in names])
+    branches = [
+        _mapped(function, getattr(tree, name), tuple([getattr(other, name, None) for other in others]))
+        for name in names
+    ]
+    return type(tree)(*branches)
+
+
+def _all(branches: tuple[Any, ...] | None, count: int) -> tuple[Any, ...]:
+    return (None,) * count if branches is None else branches
 
 
 def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
@@ -59,15 +85,13 @@ def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
 def _rebuilt(tree: Any, path: Path, value: Any) -> Any:
     if not path:
         return value
-    branches = _branches(tree) or {}
-    changed = {**branches, path[0]: _rebuilt(branches[path[0]], path[1:], value)}
-    return tuple(changed.values()) if isinstance(tree, tuple) else type(tree)(**changed)
-
-
-def _branches(tree: Any) -> dict[Any, Any] | None:
-    """What a dataclass or a tuple holds, by name; None for a leaf."""
+    first, rest = path[0], path[1:]
     if isinstance(tree, tuple):
-        return dict(enumerate(tree))
-    if is_dataclass(tree) and not isinstance(tree, type):
-        return {field.name: getattr(tree, field.name) for field in fields(tree)}
-    return None
+        return tuple(_rebuilt(branch, rest, value) if k == first else branch for k, branch in enumerate(tree))
+    return replace(tree, **{str(first): _rebuilt(getattr(tree, str(first)), rest, value)})
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...] | None:
+    """Fields of a dataclass in the order of its arguments; None for the type of a leaf."""
+    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None

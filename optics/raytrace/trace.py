@@ -142,7 +142,7 @@ def trace(
     hits: dict[int, Any] = {}
     differentiable = uploaded.differentiable or dr.grad_enabled(p) or dr.grad_enabled(d)
     for i, structure in enumerate(uploaded.structure):
-        element, table = map_leaves(lookup, uploaded.values[i]), uploaded.grids[i]
+        element, table = lookup(uploaded.values[i]), uploaded.grids[i]
         surface = element.surface
         p, d = _into_frame(backend, p, d, element.frame)
         t, ok = _distance(p, d, surface, table, differentiable)
@@ -166,7 +166,7 @@ def trace(
     local = Rays(p, d, path, valid, uploaded.count)
     outside = None
     if world:
-        to_world = map_leaves(lookup, uploaded.world).coordinates
+        to_world = lookup(uploaded.world).coordinates
         outside = Rays(
             backend.Vector3(*(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)),
             backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
@@ -192,11 +192,11 @@ def require_some(valid: np.ndarray, what: str) -> None:
 
 
 def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
-    """Bring rays to full width and make the function that looks a system's number up for each ray."""
+    """Bring rays to full width and make the function that looks a system's numbers up for each ray."""
     import drjit as dr
 
     if count == 1:
-        return rays, lambda array: array
+        return rays, lambda numbers: numbers
     width = dr.width(rays.position)
     if rays.systems not in (1, count):
         raise ValueError(f"rays for {rays.systems} systems cannot go through {count}")
@@ -214,7 +214,7 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
         shared = width // count
         index = dr.arange(backend.UInt, width)
     system = index // dr.opaque(backend.UInt, shared)
-    return rays, lambda array: dr.gather(backend.Float, array, system)
+    return rays, lambda numbers: map_leaves(lambda array: dr.gather(backend.Float, array, system), numbers)
 
 
 def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
