@@ -63,7 +63,9 @@ def scene(assembly: Assembly, state: State) -> Scenery:
 
 
 @pytest.mark.parametrize(
-    "aperture", [Circle(0.2), Circle(0.2, (0.01, 0.0), 0.05), Rectangle(0.2, 0.1), Ellipse(0.2, 0.1)]
+    "aperture",
+    [Circle(0.2), Circle(0.2, (0.01, 0.0), 0.05), Rectangle(0.2, 0.1), Ellipse(0.2, 0.1)],
+    ids=["disk", "ring", "rectangle", "ellipse"],
 )
 @pytest.mark.parametrize("case", CASES)
 def test_a_figured_mirror_as_the_sequential_trace_has_it(backend, case: str, aperture: Aperture) -> None:
