@@ -5,33 +5,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from scenes.specs.study_design import GRID, SAMPLERS, DesignSpec
 from scenes.specs.study_factor import MOST_RUNS, FactorSpec, Key
 from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, nearest, shown
-from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Seed, Spec, Text, Whole
-
-
-class DesignSpec(Spec):
-    """Which combinations of the factors' values are run.
-
-    Attributes:
-        kind: grid, every combination; latin_hypercube and sobol, evenly spread over all factors; monte_carlo, drawn
-            independently.
-        runs: number of runs; a grid has as many as there are combinations.
-        seed: of what is drawn, and of the noise of every run.
-    """
-
-    kind: Literal["grid", "latin_hypercube", "sobol", "monte_carlo"] = "grid"
-    runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] | None = None
-    seed: Seed = 0
-
-    @model_validator(mode="after")
-    def _has_runs(self) -> "DesignSpec":
-        if self.kind == "grid" and self.runs is not None:
-            found = f"runs: {self.runs}"
-            raise Problem("a grid has as many runs as combinations", found, "no runs", within=("runs",))
-        if self.kind != "grid" and self.runs is None:
-            raise Problem(f"a design of kind {self.kind} needs its number of runs", None, "runs: 1000")
-        return self
+from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, Whole
 
 
 _MEMORY = re.compile(r"[0-9]{1,6}(\.[0-9]{1,3})? ?(MB|GB)")
@@ -238,12 +215,14 @@ class StudySpec(Spec):
         return self
 
     def _check_design(self, name: str, factor: FactorSpec) -> None:
-        if self.design.kind != "grid":
+        if self.design.kind != GRID:
             if factor.count is not None:
                 text = f"a design of kind {self.design.kind} draws the values of a range"
                 raise Problem(text, f"count: {factor.count}", "no count", within=("factors", name, "count"))
         elif factor.kind in ("uniform", "normal", "truncated"):
-            allowed = "values, or range with count; or a design of kind latin_hypercube, sobol or monte_carlo"
+            *others, last = SAMPLERS
+            kinds = f"{', '.join(others)} or {last}" if others else last
+            allowed = f"values, or range with count; or a design of kind {kinds}"
             text = "a grid needs values that can be counted"
             raise Problem(text, factor.kind, allowed, within=("factors", name, factor.kind))
         elif factor.kind == "range" and factor.count is None:

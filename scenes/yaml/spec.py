@@ -5,12 +5,23 @@ A specification is what a YAML file says, checked. Quantities are text with a un
 model.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from dataclasses import field as data_field
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, StringConstraints
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    PrivateAttr,
+    StringConstraints,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
@@ -43,6 +54,32 @@ def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], An
             raise Problem(f"no such {what}", shown(name), names_text(catalogue), nearest(name, catalogue)) from None
 
     return AfterValidator(check)
+
+
+@dataclass(frozen=True, eq=False)
+class OneOf:
+    """Annotation of a text that must be one of the names that are registered somewhere when the file is read; errors
+    and JSON Schema are those of a ``Literal`` of these names.
+
+    Attributes:
+        names: gives them in the order in which a message lists them.
+    """
+
+    names: Callable[[], Iterable[str]]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        """Checked by ``_known``."""
+        return core_schema.no_info_plain_validator_function(self._known)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """The names at this moment."""
+        return {"enum": list(self.names()), "type": "string"}
+
+    def _known(self, value: Any) -> str:
+        names = tuple(self.names())
+        if not isinstance(value, str) or value not in names:
+            raise Problem("not one of the choices", shown(value), names_text(names), nearest(str(value), names))
+        return value
 
 
 def _nothing_is_empty(value: Any) -> Any:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-import numpy as np
-from scipy.special import ndtr, ndtri
-from scenes.specs.study import StudySpec
-from scenes.specs.study_factor import FactorSpec
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from scenes.specs.study import StudySpec
+from scenes.specs.study_design import GRID, unit_cube
+from scenes.specs.study_factor import FactorSpec
 from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio
 from twin.study.runs.config_tree import Tree, leaf
-
-
-SMALLEST = 2.0**-53
-"""Draws lie in [SMALLEST, 1 - SMALLEST], where normal quantiles are finite (8.2 sigma)."""
 
 
 def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
@@ -54,7 +51,7 @@ def draw(study: StudySpec) -> dict[str, np.ndarray]:
     that evenly spread designs stay so.
     """
     axes = axes_of(study)
-    if study.design.kind == "grid":
+    if study.design.kind == GRID:
         sizes = [levels(study.factors[axis[0]]) for axis in axes]
         places = np.unravel_index(np.arange(run_count(study)), sizes)
         return {
@@ -62,26 +59,6 @@ def draw(study: StudySpec) -> dict[str, np.ndarray]:
         }
     cube = unit_cube(study.design.kind, run_count(study), len(axes), study.design.seed)
     return {name: _quantile(study.factors[name], cube[:, k]) for k, axis in enumerate(axes) for name in axis}
-
-
-def unit_cube(kind: str, runs: int, dimensions: int, seed: int) -> np.ndarray:
-    """Points of a design in the unit cube, (runs, dimensions)."""
-    # takes a second to import, and a worker does not need it
-    from scipy.stats import qmc
-
-    generator = np.random.default_rng(np.random.SeedSequence(seed))
-    if kind == "latin_hypercube":
-        cube = qmc.LatinHypercube(dimensions, rng=generator).random(runs)
-    elif kind == "sobol":
-        with warnings.catch_warnings():
-            # the user chose the number of runs; the points are those of the sequence all the same
-            warnings.filterwarnings("ignore", message="The balance properties")
-            cube = qmc.Sobol(dimensions, scramble=True, rng=generator).random(runs)
-    elif kind == "monte_carlo":
-        cube = generator.random((runs, dimensions))
-    else:
-        raise ValueError(f"no design of kind {kind!r} draws points: latin_hypercube, sobol and monte_carlo do")
-    return np.clip(np.asarray(cube, np.float64), SMALLEST, 1.0 - SMALLEST)
 
 
 def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
