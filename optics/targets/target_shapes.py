@@ -1,4 +1,4 @@
-"""Test targets of optical benches as vector shapes: knife edge, bar group, star, pinhole.
+"""Test targets of optical benches as vector shapes: knife edge, bar group, star, pinhole; those of a camera's windows.
 
 A target lies in its own plane, metres, about the origin. ``Target.mapped`` takes it into an image plane, where columns
 count along x and rows along y. Levels are transmittances, 0 to 1.
@@ -6,6 +6,7 @@ count along x and rows along y. Levels are transmittances, 0 to 1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -116,6 +117,31 @@ def pinhole(diameter: float) -> Target:
     if not (np.isfinite(diameter) and diameter > 0.0):
         raise ValueError(f"a pinhole needs a positive diameter, found {diameter}")
     return Target(0.0, ((1.0, Disk(np.zeros(2), 0.5 * diameter)),))
+
+
+SPOKES = 36
+STAR_SHARE = 0.9
+"""The star's radius, as a share of half the window. The Nyquist frequency lies 11.5 pixels from its middle."""
+
+PINHOLE = 1.0
+"""Diameter of the pinhole's image, pixels."""
+
+
+def star_target(pitch: float, region: int) -> Target:
+    """The Siemens star of a window of ``region`` pixels of ``pitch`` metres."""
+    return siemens_star(SPOKES, 0.5 * STAR_SHARE * region * pitch)
+
+
+def pinhole_target(pitch: float, region: int) -> Target:
+    """The pinhole of a window of ``region`` pixels of ``pitch`` metres."""
+    return pinhole(PINHOLE * pitch)
+
+
+TARGETS: dict[str, Callable[[float, int], Target]] = {"star": star_target, "pinhole": pinhole_target}
+"""Name -> target of finite shapes about the middle of a window, of a pixel pitch, metres on the nominal image, and the
+window's side, pixels. Each can be imaged by the cameras of a job beside the edges and bars, whose MTF the job measures
+itself. A new one is added here.
+"""
 
 
 def _is_y(direction: str) -> bool:

@@ -10,16 +10,20 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, mod
 
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
+from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
 from scenes.specs.course import CourseSpec, TemperatureChange, TemperatureGradient
 from scenes.specs.instrument import Frames
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, NothingIsEmpty, Paths, Reference, Seed, Spec, Whole
+from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
-TARGET_IMAGES = ("knife_edge", "bars", "star", "pinhole")
-"""What ``render.images`` may name beside the monitor's spots."""
+
+def target_names() -> tuple[str, ...]:
+    """What ``render.images`` may name beside the monitor's spots: the targets whose MTF is measured, then the others."""
+    return ("knife_edge", "bars", *TARGETS)
+
 
 EdgeAngle = Annotated[float, Quantity(ANGLE, smallest="2 deg", largest="10 deg")]
 White = Annotated[float, Quantity(SCALE, smallest="0.1 percent", largest="100 percent")]
@@ -162,9 +166,9 @@ class RenderSpec(Spec):
         seed: of every random number in the job.
     """
 
-    images: Annotated[tuple[Literal["spots", "knife_edge", "bars", "star", "pinhole"], ...], AfterValidator(_some)] = (
-        "spots",
-    )
+    images: Annotated[
+        tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_some)
+    ] = ("spots",)
     targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     quality: Annotated[bool, Field(strict=True)] = False
@@ -175,7 +179,7 @@ class RenderSpec(Spec):
     @model_validator(mode="after")
     def _targets_are_rendered(self) -> "RenderSpec":
         if self.targets is not None and not self.target_images:
-            known = ", ".join(TARGET_IMAGES)
+            known = ", ".join(target_names())
             raise Problem(
                 "targets are described, but none is rendered", "no target among images", known, within=("images",)
             )
@@ -188,8 +192,8 @@ class RenderSpec(Spec):
 
     @property
     def target_images(self) -> tuple[str, ...]:
-        """The test targets among the images, in the order of TARGET_IMAGES."""
-        return tuple(name for name in TARGET_IMAGES if name in self.images)
+        """The test targets among the images, in the order of `target_names`."""
+        return tuple(name for name in target_names() if name in self.images)
 
 
 class AnalysisSpec(Spec):

@@ -17,6 +17,7 @@ from optics.numerics import quadrature
 from optics.raytrace.system import assemble
 from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_field
+from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.pupil_function import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import LAUNCH_DISTANCE
@@ -24,15 +25,7 @@ from scenes.specs.band import BandSpec
 from scenes.specs.load import load_detector
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.edge_images import ALONG, DIRECTIONS, TRACK
-from twin.targets.target_images import (
-    PLACES,
-    BarDesign,
-    TargetCamera,
-    TargetLostError,
-    View,
-    pinhole_target,
-    star_target,
-)
+from twin.targets.target_images import PLACES, BarDesign, TargetCamera, TargetLostError, View
 from twin.targets.target_measurement import CURVE, read_bars, read_edge
 from twin.targets.target_path import LocalMap, TargetPath
 
@@ -319,7 +312,7 @@ def test_pinhole_and_star_lie_in_the_middle(perfect):
     windows cut unevenly; of a pinhole 2% of the light lies beyond 8 pixels, times the offset of a third of a pixel."""
     place = np.arange(REGION) - 0.5 * (REGION - 1)
     want = perfect.offset / PITCH
-    for target, within in ((pinhole_target(PITCH), 8.0), (star_target(PITCH, REGION), np.inf)):
+    for target, within in ((pinhole_target(PITCH, REGION), 8.0), (star_target(PITCH, REGION), np.inf)):
         seen = perfect.image(target)
         near = np.abs(place) < within
         part = seen[np.ix_(near, near)]

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import AsinhNorm, Normalize
 from matplotlib.patches import Polygon
 
+from optics.targets.target_shapes import TARGETS
 from twin.monitor.image_quality import PLACES, ImageQuality, PupilOutline
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
@@ -28,7 +29,9 @@ IMAGE_NAMES = {
     "star": "star",
     "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
 }
-"""Of the images that are shown, with the direction of their MTF; even fields are not."""
+"""Of the images that are shown, with the direction of their MTF; other targets are shown by their names, even fields
+are not.
+"""
 CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
 """Side of what is shown, pixels; the others are shown whole."""
 STRETCH = 100.0
@@ -117,7 +120,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 def images_svg(name: str, camera: CameraTargets) -> str:
     """Mean images, a row for each target, and before and after side by side for each place."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
-    names = [name for name in next(iter(camera.places.values())).before.frames if name in IMAGE_NAMES]
+    names = [name for name in next(iter(camera.places.values())).before.frames if name in IMAGE_NAMES or name in TARGETS]
     with look(f"targets-{name}"):
         figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
         grid = figure.subplots(len(names), len(columns), squeeze=False)
@@ -134,7 +137,7 @@ def images_svg(name: str, camera: CameraTargets) -> str:
                 if row == 0:
                     axes.set_title(f"{place}, {when}")
                 if column == 0:
-                    axes.set_ylabel(IMAGE_NAMES[target])
+                    axes.set_ylabel(IMAGE_NAMES.get(target, target.replace("_", " ")))
         return to_svg(figure)
 
 

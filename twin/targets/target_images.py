@@ -16,7 +16,7 @@ from optics.geometry.tree import State
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_image import target_image
-from optics.targets.target_shapes import Target, bar_group, pinhole, siemens_star
+from optics.targets.target_shapes import Target, bar_group
 from optics.waves.diffraction import Grid
 from optics.waves.pupil_function import PupilFunction
 from optics.waves.transfer import TransferTable, polychromatic_transfer
@@ -39,13 +39,6 @@ BAR_SHARE = 0.45
 
 CLEARANCE = 6.0
 """Pixels of the group about the part that is measured."""
-
-SPOKES = 36
-STAR_SHARE = 0.9
-"""The star's radius, as a share of half the region. The Nyquist frequency lies 11.5 pixels from its middle."""
-
-PINHOLE = 1.0
-"""Diameter of the pinhole's image, pixels."""
 
 _FOCUS = 1e-6
 """Defocus to which the tables of the edges reach, metres; they are used at 0 only."""
@@ -164,16 +157,6 @@ class BarDesign:
         """Nominal frequency over the Nyquist frequency's 0.5 cycles/pixel: (down the column, along the row)."""
         along, across = 0.5 * self.nominal / float(np.hypot(*self.nominal))
         return float(across), float(along)
-
-
-def star_target(pitch: float, region: int) -> Target:
-    """The Siemens star of a region."""
-    return siemens_star(SPOKES, 0.5 * STAR_SHARE * region * pitch)
-
-
-def pinhole_target(pitch: float) -> Target:
-    """The pinhole."""
-    return pinhole(PINHOLE * pitch)
 
 
 def usable_pixels(pixels: int, region: int) -> float:

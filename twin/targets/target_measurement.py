@@ -10,6 +10,7 @@ from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
 from analysis.mtf.slanted_edge import EdgeError, EdgeMtf, measure_edge
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
+from optics.targets.target_shapes import TARGETS
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import imaging_shadows
 from scenes.specs.channel import BASE
@@ -19,7 +20,7 @@ from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.edge_images import DIRECTIONS
-from twin.targets.target_images import PLACES, BarDesign, TargetCamera, View, pinhole_target, star_target, usable_pixels
+from twin.targets.target_images import PLACES, BarDesign, TargetCamera, View, usable_pixels
 from twin.targets.target_path import TargetPath
 from twin.targets.target_result import (
     NYQUIST,
@@ -160,10 +161,9 @@ class _Shooter:
             even = np.ones((view.region, view.region))
             dark, bright = (expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items())
             bars = {d: read_bars(view, design, means[d], dark, bright, self.count) for d, design in self.bars.items()}
-        if "star" in self.images:
-            expose("star", view.image(star_target(view.band.pitch, view.region)))
-        if "pinhole" in self.images:
-            expose("pinhole", view.image(pinhole_target(view.band.pitch)))
+        for name in self.images:
+            if name in TARGETS:
+                expose(name, view.image(TARGETS[name](view.band.pitch, view.region)))
         return TargetShots(frames, view.column, edges, bars, 1.0 - view.pupil.light)
 
 
