@@ -8,6 +8,9 @@ Two kinds are kept apart because they behave differently in a before/after compa
 - fixed-pattern noise (PRNU, DSNU) is the same in every frame, does not average down, and is common to all images that
   the same pixels take.
 
+What a detector has beyond that model is told as further terms of either kind, each by its variance; like the others
+they are independent from pixel to pixel.
+
 Grey values are in DN as recorded, with the black level and the dark signal still in.
 """
 
@@ -15,12 +18,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NoiseModel"]
+__all__ = ["FurtherNoise", "NoiseModel"]
+
+
+class FurtherNoise(Protocol):
+    """Noise beyond the linear model, by its variance in one pixel, electrons squared."""
+
+    @property
+    def fixed_variance_e2(self) -> float:
+        """Of a pattern that is added to every frame, whatever the signal."""
+        ...
+
+    def temporal_variance_e2(self, electrons: Any) -> Any:
+        """Of what is new in every frame, where a pixel holds that many electrons on the average, dark signal
+        included; a number, or an array of the shape of ``electrons``.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -34,6 +52,7 @@ class NoiseModel:
     prnu: photo-response non-uniformity, rms fraction of the light signal.
     dsnu_e: dark-signal non-uniformity, electrons rms.
     saturation_dn: grey value from which the response is not linear.
+    further: noise beyond the linear model.
     """
 
     gain_dn_per_e: float
@@ -43,10 +62,13 @@ class NoiseModel:
     prnu: float
     dsnu_e: float
     saturation_dn: float
+    further: tuple[FurtherNoise, ...] = ()
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "further":
+                continue
             if not math.isfinite(value) or value < 0:
                 raise ValueError(f"noise model: {field.name} must be finite and >= 0, found {value!r}")
         if self.gain_dn_per_e == 0:
@@ -73,8 +95,9 @@ class NoiseModel:
 
     @property
     def dsnu_variance_dn2(self) -> float:
-        """Variance of the fixed additive pattern, DN^2."""
-        return (self.gain_dn_per_e * self.dsnu_e) ** 2
+        """Variance of the fixed additive patterns, DN^2."""
+        further = sum(term.fixed_variance_e2 for term in self.further)
+        return (self.gain_dn_per_e * self.dsnu_e) ** 2 + self.gain_dn_per_e**2 * further
 
     def light_signal_dn(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
         """The part of a mean grey value that light made, DN, >= 0: what PRNU scales."""
@@ -92,10 +115,14 @@ class NoiseModel:
         variance = np.maximum(np.subtract(mean_signal_dn, self.offset_dn), 0.0)
         variance *= self.gain_dn_per_e / frames
         variance += self.dark_variance_dn2 / frames
+        if self.further:
+            electrons = np.maximum(np.subtract(mean_signal_dn, self.offset_dn), 0.0) / self.gain_dn_per_e
+            for term in self.further:
+                variance += self.gain_dn_per_e**2 / frames * term.temporal_variance_e2(electrons)
         return variance
 
     def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
-        """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal, DN^2.
+        """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 + further patterns, with s the light signal, DN^2.
 
         Does not fall with the number of frames, and is the same draw in every image of the same pixels.
         """

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from scenes.yaml.errors import KeyPath, Problem, names_text
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Number, Spec, Text, Whole
+from scenes.yaml.spec import Name, Named, Number, Spec, Text, Whole
 from scenes.yaml.units import LENGTH, TIME, format_quantity
 
 AreaSide = Annotated[Whole, Field(ge=24, le=8192)]
@@ -35,6 +35,7 @@ class DetectorSpec(Spec):
         dsnu_e: dark signal non-uniformity, rms.
         bit_depth: of the analogue-to-digital converter; frames are stored as 16 bits.
         offset_dn: grey value of no signal.
+        noise: beyond the model of EMVA 1288, name -> its number, electrons rms; None for nothing.
     """
 
     name: Name
@@ -49,6 +50,7 @@ class DetectorSpec(Spec):
     dsnu_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     bit_depth: Annotated[Whole, Field(ge=1, le=16)]
     offset_dn: Annotated[Number, Field(ge=0.0, le=65535.0)]
+    noise: Named[Annotated[Number, Field(ge=0.0, le=1e6)]] | None = None
 
     @model_validator(mode="after")
     def _leaves_grey_values(self) -> "DetectorSpec":

@@ -10,7 +10,6 @@ from scenes.specs.study_factor import MOST_RUNS, FactorSpec, Key
 from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, nearest, shown
 from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, Whole
 
-
 _MEMORY = re.compile(r"[0-9]{1,6}(\.[0-9]{1,3})? ?(MB|GB)")
 
 

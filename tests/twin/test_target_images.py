@@ -15,9 +15,9 @@ from analysis.mtf.slanted_edge import measure_edge
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.raytrace.system import assemble
+from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_field
-from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.pupil_function import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import LAUNCH_DISTANCE

@@ -4,10 +4,11 @@ The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, 
 
     n_e  = Poisson( QE * (1 + prnu) * photons + dark_current * exposure )         electrons, exact Poisson
     n_e  = min(n_e, full_well)                                                    the well fills before the read-out
-    y    = K * (n_e + dsnu_offset + dark_noise * normal) + offset                 grey value, not yet digitised
+    y    = K * (n_e + dsnu_offset + dark_noise * normal + further) + offset       grey value, not yet digitised
     y_DN = clip(rint(y), 0, 2**bit_depth - 1)                                     uint16
 
-PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. The
+PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. Further
+noise is what a data sheet lists beyond the model (``twin.sensors.noise_terms``). The
 Poisson numbers come from `numpy.random.Generator.poisson` (exact at every mean: multiplication below 10, Hoermann's
 PTRS rejection above); no normal approximation is made anywhere. Pixel coordinates are (row, column); arrays are (...,
 H, W).
@@ -29,8 +30,9 @@ from pydantic import ValidationError
 from analysis.spots.noise import NoiseModel
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import Problem, names_text, nearest
 from twin.run.random_streams import stream
+from twin.sensors.noise_terms import NOISE_TERMS, FixedOffsets, NoiseTerm, ReadNoise
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
@@ -48,7 +50,7 @@ class FixedPattern:
     """The pixel-to-pixel differences of one detector, the same in every frame it records.
 
     gain: (..., H, W) relative response to light, 1 + prnu * normal, dimensionless, >= 0.
-    offset_e: (..., H, W) additive offset in electrons, dsnu_e * normal.
+    offset_e: (..., H, W) additive offset in electrons, dsnu_e * normal and what further terms add.
     """
 
     gain: NDArray[np.float64]
@@ -95,6 +97,7 @@ class EmvaDetector:
     dsnu_e: dark-signal non-uniformity (DSNU_1288), electrons rms.
     bit_depth: of the converter.
     offset_dn: black level, grey values.
+    noise: further terms.
     """
 
     quantum_efficiency: float
@@ -106,6 +109,7 @@ class EmvaDetector:
     dsnu_e: float
     bit_depth: int
     offset_dn: float
+    noise: tuple[NoiseTerm, ...] = ()
 
     def __post_init__(self) -> None:
         try:
@@ -122,10 +126,22 @@ class EmvaDetector:
         """The detector of a data sheet's file, for frames of that exposure, seconds.
 
         Raises:
-            InputError: the dark current alone saturates the pixels.
+            InputError: the dark current alone saturates the pixels, or the sheet names a noise that is not known.
         """
         sheet.check_exposure(exposure)
-        return cls(**{field.name: getattr(sheet, field.name) for field in fields(cls)})
+        for name in sheet.noise or {}:
+            if name not in NOISE_TERMS:
+                key, known = ("noise", name), names_text(NOISE_TERMS)
+                raise sheet.error(
+                    "no such noise", key, found=name, allowed=known, suggestion=nearest(name, NOISE_TERMS)
+                )
+        terms = tuple(NOISE_TERMS[name](value) for name, value in (sheet.noise or {}).items())
+        return cls(**{name: getattr(sheet, name) for name in cls._sheet_names()}, noise=terms)
+
+    @classmethod
+    def _sheet_names(cls) -> list[str]:
+        """Of the numbers, as they are called in a data sheet."""
+        return [field.name for field in fields(cls) if field.name != "noise"]
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
@@ -134,7 +150,7 @@ class EmvaDetector:
 
     def _numbers(self) -> dict[str, Any]:
         """As plain numbers, not numpy's."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {name: getattr(self, name) for name in self._sheet_names()}
         return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
 
     @property
@@ -157,6 +173,7 @@ class EmvaDetector:
             prnu=self.prnu,
             dsnu_e=self.dsnu_e,
             saturation_dn=self.saturation_dn,
+            further=self.noise,
         )
 
     def fixed_pattern(self, shape: tuple[int, ...], seed: Seed) -> FixedPattern:
@@ -165,7 +182,12 @@ class EmvaDetector:
             raise ValueError(f"fixed pattern: shape must be (..., H, W) of positive integers, found {shape!r}")
         rng = np.random.Generator(np.random.SFC64(_sequence(seed)))
         gain = np.maximum(1.0 + self.prnu * rng.standard_normal(shape), 0.0)
-        return FixedPattern(gain=gain, offset_e=self.dsnu_e * rng.standard_normal(shape))
+        offset_e = FixedOffsets(self.dsnu_e).fixed_e(shape, rng)
+        for term in self.noise:
+            added = term.fixed_e(shape, rng)
+            if added is not None:
+                offset_e += added
+        return FixedPattern(gain=gain, offset_e=offset_e)
 
     def expected_dn(
         self, photons: ArrayLike, exposure_s: float, pattern: FixedPattern | None = None
@@ -229,10 +251,11 @@ class EmvaDetector:
             size = (int(frames), height, width)
             electrons = rng.poisson(mean_e, size=size)
             level = np.minimum(electrons, self.full_well_e, dtype=np.float64)
-            if self.dark_noise_e > 0:
-                noise = rng.standard_normal(size)
-                noise *= self.dark_noise_e
-                level += noise
+            collected = level.copy() if self.noise else level
+            for term in (ReadNoise(self.dark_noise_e), *self.noise):
+                added = term.temporal_e(collected, rng)
+                if added is not None:
+                    level += added
             level += offset_e[index]
             level *= scale
             level += self.offset_dn
@@ -246,13 +269,22 @@ class EmvaDetector:
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
         """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).
 
-        A pixel is saturated when it comes within 4 read-noise sigmas of the full well, or reaches the converter's end.
+        A pixel is saturated when it comes within 4 sigmas of the full well, by the read noise and further temporal noise
+        at a full well, or reaches the converter's end.
         """
         if frames.ndim < 3:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
-        well = self.offset_dn + self.system_gain_dn_per_e * (self.full_well_e - _SATURATION_SIGMAS * self.dark_noise_e)
+        well = self.offset_dn + self.system_gain_dn_per_e * (self.full_well_e - _SATURATION_SIGMAS * self._read_sigma_e)
         level = float(min(self.max_dn, well))
         return SaturationReport(level_dn=level, pixels=np.sum(np.any(frames >= level, axis=-3), axis=(-2, -1)))
+
+    @property
+    def _read_sigma_e(self) -> float:
+        """Temporal noise without shot noise at a full well, electrons rms."""
+        if not self.noise:
+            return self.dark_noise_e
+        further = sum(float(term.temporal_variance_e2(self.full_well_e)) for term in self.noise)
+        return math.sqrt(self.dark_noise_e**2 + further)
 
 
 def _run(work: Callable[[tuple[int, ...], int], None], indices: list[tuple[int, ...]], threads: int | None) -> None:

@@ -94,7 +94,9 @@ class LineCcd:
         # electrons e with e (1 + 5 prnu) + 5 sqrt(e + dark + read noise^2) = level, by iteration from above
         electrons = level
         for _ in range(20):
-            spread = np.sqrt(max(electrons, 0.0) + noise.dark_signal_e + sheet.dark_noise_e**2)
+            own = max(electrons, 0.0) + noise.dark_signal_e
+            further = sum(float(term.temporal_variance_e2(own)) + term.fixed_variance_e2 for term in noise.further)
+            spread = np.sqrt(own + sheet.dark_noise_e**2 + further)
             electrons = (level - _SIGMAS * spread) / (1.0 + _SIGMAS * sheet.prnu)
         return float(electrons / sheet.full_well_e)
 
