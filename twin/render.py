@@ -252,7 +252,8 @@ def _table(run: RenderRun) -> Table:
         title += f"\nat {moment(float(run.course.times[run.course.shown]))} of the course"
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("", no_wrap=True)
-    heads = ("true", "paper\nsingle", "paper\njoint", "derived", "model", "sigma", "model\n- true", "in\nsigma")
+    names = (name.replace("_", "\n") for name in ESTIMATORS)
+    heads = ("true", *names, "sigma", "model\n- true", "in\nsigma")
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
 

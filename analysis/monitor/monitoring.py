@@ -33,20 +33,21 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.units import ARCSEC, UM_PER_M
 
 __all__ = [
-    "ESTIMATORS",
+    "FORMULAS",
     "PARAMETERS",
     "PER_SI",
     "CameraParameters",
     "MonitorGeometry",
     "coefficients",
     "derived",
+    "linear",
     "paper_joint",
     "paper_single",
     "shift_covariance",
 ]
 
 Array = NDArray[np.float64]
-ESTIMATORS = ("paper_single", "paper_joint", "derived")
+FORMULAS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 """Keys of the parameters in results, which end in their unit."""
 PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, UM_PER_M])
@@ -148,13 +149,13 @@ def shift_covariance(left: ArrayLike, right: ArrayLike) -> Array:
 
 def coefficients(name: str, geometry: MonitorGeometry) -> Array:
     """(4, 4) matrix, parameter [d_alpha, d_beta, d_gamma, d_f] (rad, m) per pixel of shift [left row, left column,
-    right row, right column], after - before, of an estimator in ESTIMATORS. For `paper_single` it is the argument of
+    right row, right column], after - before, of an estimator in FORMULAS. For `paper_single` it is the argument of
     the arctangents.
 
     Multiplied with the Jacobian (4, M) of spot shifts per motion it gives a crosstalk table.
     """
-    if name not in ESTIMATORS:
-        raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
+    if name not in FORMULAS:
+        raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(FORMULAS)}")
     delta, f, length = geometry.pixel_m, geometry.focal_length_m, geometry.separation_m
     paper = name != "derived"
     f_x = f if paper or geometry.focal_length_x_m is None else geometry.focal_length_x_m
@@ -185,7 +186,7 @@ def paper_single(
         in order
     [left row, left column, right row, right column]; zeros where there is no noise.
     """
-    argument, spread = _linear("paper_single", before, after, covariance, geometry)
+    argument, spread = linear(coefficients("paper_single", geometry), before, after, covariance)
     values = argument.copy()
     values[..., :3] = np.arctan(argument[..., :3])
     slope = np.ones_like(argument)
@@ -197,18 +198,18 @@ def paper_joint(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
     """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module."""
-    return CameraParameters.from_vector(*_linear("paper_joint", before, after, covariance, geometry))
+    return CameraParameters.from_vector(*linear(coefficients("paper_joint", geometry), before, after, covariance))
 
 
 def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry) -> CameraParameters:
     """The corrected factors (see the module's text); arguments as `paper_single`."""
-    return CameraParameters.from_vector(*_linear("derived", before, after, covariance, geometry))
+    return CameraParameters.from_vector(*linear(coefficients("derived", geometry), before, after, covariance))
 
 
-def _linear(
-    name: str, before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
-) -> tuple[Array, Array]:
-    """Linear part of an estimator, (..., 4), and its covariance (..., 4, 4)."""
+def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
+    """What a matrix (4, 4) as of `coefficients` makes of the shifts, (..., 4), and its covariance (..., 4, 4); the
+    other arguments as `paper_single`.
+    """
     start, end = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     spread = np.asarray(covariance, dtype=np.float64)
     if start.shape[-2:] != (2, 2) or end.shape[-2:] != (2, 2) or spread.shape[-2:] != (4, 4):
@@ -220,5 +221,4 @@ def _linear(
     shift = shift.reshape(*shift.shape[:-2], 4)
     if not (np.all(np.isfinite(shift)) and np.all(np.isfinite(spread))):
         raise ValueError("monitoring: positions and covariance must be finite")
-    matrix = coefficients(name, geometry)
     return shift @ matrix.T, matrix @ spread @ matrix.T

@@ -2,25 +2,102 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from analysis.monitor import intersection_angle, model_fit, monitoring
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
 from analysis.monitor.intersection_angle import IntersectionAngleChange
-from analysis.monitor.monitoring import CameraParameters, shift_covariance
+from analysis.monitor.monitoring import CameraParameters, MonitorGeometry, shift_covariance
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import SpotPositions, difference_covariance
 
-__all__ = ["CENTROIDS", "ESTIMATORS", "Recovery", "angles", "estimates", "measure_spots", "recover"]
+__all__ = ["CENTROIDS", "ESTIMATORS", "Estimator", "Recovery", "angles", "estimates", "measure_spots", "recover"]
 
 Array = NDArray[np.float64]
-ESTIMATORS = ("paper_single", "paper_joint", "derived", "model")
 CENTROIDS = ("ml", "gaussian", "energy")
+
+Reading = Callable[[Array, Array, Array, CameraCalibration], CameraParameters]
+"""Spot positions before and after, (S, 2 sides, 2) px, covariance of after - before, (S, 4, 4) px^2 (zeros without
+noise), and what is calibrated of the camera -> the camera's changes, arrays (S,).
+"""
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """How shifts of a camera's two spots become changes of the camera.
+
+    title: for readers, a word or two. note: for readers, what it is. coefficients: of a calibrated camera, the (4, 4)
+        matrix of its readings to first order as `monitoring.coefficients` gives it.
+    reading: what it says; None where the matrix is all of it.
+    """
+
+    title: str
+    note: str
+    coefficients: Callable[[CameraCalibration], Array]
+    reading: Reading | None = None
+
+    def parameters(self, before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
+        """The camera's changes, see `Reading`."""
+        if self.reading is not None:
+            return self.reading(before, after, covariance, camera)
+        return CameraParameters.from_vector(*monitoring.linear(self.coefficients(camera), before, after, covariance))
+
+
+def _formula(
+    name: str,
+    title: str,
+    note: str,
+    formula: Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParameters] | None = None,
+) -> Estimator:
+    """A set of formulas of `monitoring`."""
+    reading: Reading | None = None
+    if formula is not None:
+        exact = formula
+
+        def reading(before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
+            return exact(before, after, covariance, camera.geometry)
+
+    return Estimator(title, note, lambda camera: monitoring.coefficients(name, camera.geometry), reading)
+
+
+def _model_coefficients(camera: CameraCalibration) -> Array:
+    gain: Array = camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian, rcond=1e-14)
+    return gain
+
+
+def _model(before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
+    shift = (after - before).reshape(-1, 4)
+    return model_fit.fit(shift, covariance, camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "paper_single": _formula(
+        "paper_single",
+        "printed, single",
+        "eqs. (2), (3), (5), (7) of the paper as printed",
+        monitoring.paper_single,
+    ),
+    "paper_joint": _formula("paper_joint", "printed, joint", "Table 1 of the paper, joint changes, as printed"),
+    "derived": _formula(
+        "derived",
+        "derived",
+        "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
+    ),
+    "model": Estimator(
+        "model",
+        "weighted least squares on all spot coordinates with the Jacobian of the traced instrument",
+        _model_coefficients,
+        _model,
+    ),
+}
+"""Name in the results -> estimator, in the order of tables. A new one is added here: it then stands in recovered.json,
+crosstalk.json, the tables and the figures.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +183,8 @@ def estimates(
     parameters: dict[str, dict[str, CameraParameters]] = {}
     for k, (name, camera) in enumerate(cameras.items()):
         pair = slice(2 * k, 2 * k + 2)
-        shift = (end[:, pair] - start[:, pair]).reshape(-1, 4)
-        formula = (start[:, pair], end[:, pair], joint[:, k], camera.geometry)
-        parameters[name] = {
-            "paper_single": monitoring.paper_single(*formula),
-            "paper_joint": monitoring.paper_joint(*formula),
-            "derived": monitoring.derived(*formula),
-            "model": model_fit.fit(shift, joint[:, k], camera.spot_jacobian, camera.parameter_jacobian, camera.motions),
-        }
+        seen = (start[:, pair], end[:, pair], joint[:, k], camera)
+        parameters[name] = {title: estimator.parameters(*seen) for title, estimator in ESTIMATORS.items()}
     return parameters
 
 

@@ -122,7 +122,8 @@ class NoiseModel:
         return variance
 
     def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
-        """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 + further patterns, with s the light signal, DN^2.
+        """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal, DN^2, and of
+        further patterns.
 
         Does not fall with the number of frames, and is the same draw in every image of the same pixels.
         """

@@ -21,7 +21,7 @@ from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
 
 def target_names() -> tuple[str, ...]:
-    """What ``render.images`` may name beside the monitor's spots: the targets whose MTF is measured, then the others."""
+    """What ``render.images`` may name beside the monitor's spots: targets whose MTF is measured, then the others."""
     return ("knife_edge", "bars", *TARGETS)
 
 
@@ -166,9 +166,9 @@ class RenderSpec(Spec):
         seed: of every random number in the job.
     """
 
-    images: Annotated[
-        tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_some)
-    ] = ("spots",)
+    images: Annotated[tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_some)] = (
+        "spots",
+    )
     targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
     quality: Annotated[bool, Field(strict=True)] = False

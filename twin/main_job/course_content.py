@@ -14,7 +14,7 @@ from scenes.specs.channel import BASE
 from scenes.specs.course import moment
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import PARAMETERS
-from twin.main_job.spot_figures import MARKS
+from twin.main_job.spot_figures import marks
 from twin.monitor.time_series import CourseRun
 from twin.run.artefact import FAR, MINUS, decimals_for, fixed
 from twin.run.svg import (
@@ -200,7 +200,7 @@ def _panel(
     names: dict[str, str],
 ) -> None:
     _frame(axes, course, time)
-    for estimator, (marker, colour) in MARKS.items():
+    for estimator, (marker, colour) in marks().items():
         value, sigma = values[estimator]
         axes.errorbar(
             time, value, sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,

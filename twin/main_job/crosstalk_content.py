@@ -12,7 +12,7 @@ import numpy as np
 from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import body_name
-from twin.main_job.report_labels import ESTIMATOR_NAMES, PARAMETERS
+from twin.main_job.report_labels import PARAMETERS
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
 from twin.run.artefact import SAME, fixed, plain, significant
 
@@ -55,7 +55,7 @@ def _columns(table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
     for estimator in ESTIMATORS:
         if estimator == "paper_joint" and same:
             continue
-        heading = ESTIMATOR_NAMES[estimator]
+        heading = ESTIMATORS[estimator].title
         if (estimator, parameter) in PRINTED:
             heading = "printed" if same else {"paper_single": "printed (7)", "paper_joint": "Table 1"}[estimator]
         columns.append((heading, estimator))

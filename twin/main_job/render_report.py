@@ -8,6 +8,7 @@ from pathlib import Path
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job import course_content, crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.course_content import parameters_svg, temperatures_svg
 from twin.main_job.light_path_figures import footprints_svg, side_view_svg
@@ -21,6 +22,7 @@ from twin.run.versions import versions
 __all__ = ["render_report", "write_report"]
 
 TEMPLATE = "report.html.j2"
+NUMBERS = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
 
 
 def write_report(run: RenderRun, place: Path) -> None:
@@ -39,15 +41,16 @@ def render_report(run: RenderRun) -> str:
     paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
     tables = report_content.results(run)
     names = list(experiment.instrument.cameras)
+    titles = {name: estimator.title for name, estimator in ESTIMATORS.items()}
     figures = {
         "spots": {name: Markup(spots_svg(run, name)) for name in names},
-        "residuals": Markup(residuals_svg(report_content.residual_panels(tables), report_labels.ESTIMATOR_NAMES)),
+        "residuals": Markup(residuals_svg(report_content.residual_panels(tables), titles)),
         "side": Markup(side_view_svg(experiment.instrument, paths)),
         "footprints": Markup(footprints_svg(experiment.instrument, paths)),
     }
     if run.course is not None:
         figures["temperatures"] = Markup(temperatures_svg(run.course))
-        figures["course"] = Markup(parameters_svg(run.course, report_labels.ESTIMATOR_NAMES))
+        figures["course"] = Markup(parameters_svg(run.course, titles))
     if run.targets is not None:
         cameras = run.targets.cameras
         figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}
@@ -73,6 +76,8 @@ def render_report(run: RenderRun) -> str:
         statements=crosstalk_content.statements(run),
         figures=figures,
         labels=report_labels,
+        estimators=ESTIMATORS,
+        number=NUMBERS.get(len(ESTIMATORS), str(len(ESTIMATORS))),
         far=f"{FAR:g}",
         run=run,
         pitch_um=f"{1e6 * experiment.path.pitch:g}",

@@ -24,18 +24,6 @@ PARAMETERS = (
     Parameter("d_f_um", "Δf", "µm", "change of the principal distance"),
 )
 
-ESTIMATOR_NAMES = {
-    "paper_single": "printed, single",
-    "paper_joint": "printed, joint",
-    "derived": "derived",
-    "model": "model",
-}
-ESTIMATOR_NOTES = {
-    "paper_single": "eqs. (2), (3), (5), (7) of the paper as printed",
-    "paper_joint": "Table 1 of the paper, joint changes, as printed",
-    "derived": "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
-    "model": "weighted least squares on all spot coordinates with the Jacobian of the traced instrument",
-}
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",
     "gaussian": "fit of a Gaussian",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from twin.run.svg import (
     INK,
     LIGHT,
     ORANGE,
+    PURPLE,
+    SKY,
     VERMILION,
     look,
     new_figure,
@@ -148,14 +151,15 @@ def _dn_ticks(norm: Normalize) -> list[float]:
     return [t for t in found if norm.vmin + 0.004 * span <= t <= norm.vmax]
 
 
-MARKS = dict(
-    zip(
-        ESTIMATORS,
-        (("s", ORANGE), ("^", VERMILION), ("D", GREEN), ("o", BLUE)),
-        strict=True,
-    )
+_MARKS = (
+    *(("s", ORANGE), ("^", VERMILION), ("D", GREEN), ("o", BLUE)),
+    *(("v", PURPLE), ("P", SKY), ("X", GREY), ("*", INK)),
 )
-"""Estimator -> marker and colour: told apart by shape as well as by colour."""
+
+
+def marks() -> dict[str, tuple[str, str]]:
+    """Estimator -> marker and colour: told apart by shape as well as by colour, while there are at most eight."""
+    return dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
 
 
 def residuals_svg(panels: dict[str, dict[str, dict[str, float | None]]], names: dict[str, str]) -> str:
@@ -195,10 +199,10 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
     axes.axvspan(-FAR, FAR, color="#eef3f8", lw=0)
     axes.axvline(0.0, color=GREY, lw=0.8)
     place = {label: k for k, label in enumerate(panel)}
-    for j, estimator in enumerate(MARKS):
-        marker, colour = MARKS[estimator]
+    found = marks()
+    for j, (estimator, (marker, colour)) in enumerate(found.items()):
         points = [(r, place[label]) for label, row in panel.items() if (r := row.get(estimator)) is not None]
-        offset = (j - 0.5 * (len(MARKS) - 1)) * 0.19
+        offset = (j - 0.5 * (len(found) - 1)) * min(0.19, 0.76 / len(found))
         x, y = [p[0] for p in points], [p[1] + offset for p in points]
         axes.plot(x, y, marker, color=colour, ms=5.5, mec="white", mew=0.5, ls="none", label=names[estimator])
     axes.set_yticks(list(place.values()), list(place))

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import results
-from twin.main_job.report_labels import ESTIMATOR_NAMES
 from twin.main_job.spot_figures import GRAY, airy_radius, core_window, cross, mean_images, stretch
 from twin.run.artefact import FAR
 from twin.run.svg import AFTER, BEFORE, BLUE, GREY, INK, LIGHT, VERMILION, look, to_png
@@ -81,8 +80,10 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
     axes.set_axis_off()
     count = 1 + sum(1 + len(table["rows"]) for table in tables)
     axes.set_ylim(count + 1.2, 0.0)
-    edges = [0.30, *(0.475 + 0.172 * k for k in range(len(ESTIMATORS)))]
-    heads = ["true", *ESTIMATOR_NAMES.values()]
+    # columns share the width that four of them take
+    step = 4 * 0.172 / len(ESTIMATORS)
+    edges = [0.30, *(0.303 + step + step * k for k in range(len(ESTIMATORS)))]
+    heads = ["true", *(estimator.title for estimator in ESTIMATORS.values())]
     y = 0.6
     axes.text(0.01, y, f"{run.resolved.instrument.name}, {run.frames} frames", fontsize=12.5, va="center", color=GREY)
     for x, head in zip(edges, heads, strict=True):

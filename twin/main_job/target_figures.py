@@ -120,7 +120,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 def images_svg(name: str, camera: CameraTargets) -> str:
     """Mean images, a row for each target, and before and after side by side for each place."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
-    names = [name for name in next(iter(camera.places.values())).before.frames if name in IMAGE_NAMES or name in TARGETS]
+    names = [name for name in next(iter(camera.places.values())).before.frames if name in {*IMAGE_NAMES, *TARGETS}]
     with look(f"targets-{name}"):
         figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
         grid = figure.subplots(len(names), len(columns), squeeze=False)

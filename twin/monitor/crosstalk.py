@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor import model_fit, monitoring
+from analysis.monitor import model_fit
 from analysis.monitor.model_fit import ObservabilityReport
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import ESTIMATORS
@@ -135,9 +135,8 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
         spots = all_spots[2 * k : 2 * k + 2, :, own].reshape(4, -1)
         truth = all_truth[name][:, own]
         geometry = experiment.geometry(name)
-        gains = {e: monitoring.coefficients(e, geometry) for e in ESTIMATORS if e != "model"}
         camera = experiment.calibration.cameras[name]
-        gains["model"] = camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian, rcond=1e-14)
+        gains = {e: estimator.coefficients(camera) for e, estimator in ESTIMATORS.items()}
         size = np.array([motion.unit_size for motion in motions])
         readings = {e: (PER_SI[:, None] * (gains[e] @ spots)) * size for e in ESTIMATORS}
         true = PER_SI[:, None] * truth * size

@@ -269,8 +269,8 @@ class EmvaDetector:
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
         """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).
 
-        A pixel is saturated when it comes within 4 sigmas of the full well, by the read noise and further temporal noise
-        at a full well, or reaches the converter's end.
+        A pixel is saturated when it comes within 4 sigmas of the full well, of the read noise and of further temporal
+        noise at a full well, or reaches the converter's end.
         """
         if frames.ndim < 3:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
