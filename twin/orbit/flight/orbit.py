@@ -1,4 +1,4 @@
-"""Orbits: two-body motion and the Earth's flattening (J2), integrated numerically.
+"""Orbits: two-body motion and the Earth's flattening (J2), and what else is among the FORCES, integrated numerically.
 
 The flattening's axis is the celestial pole of the epoch; within a day the pole moves by some 0.1 arcsec. Drag, other
 terms of the field, Sun and Moon are left out: over a pass they displace the orbit smoothly by metres, and change
@@ -8,6 +8,7 @@ nothing in the geometry of an image, because a precise orbit determination follo
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,23 @@ def acceleration(position: np.ndarray) -> np.ndarray:
     flattening = 1.5 * J2 * FIELD_RADIUS**2 / r2
     factor = 1.0 + flattening * (np.array([1.0, 1.0, 3.0]) - 5.0 * sine2)
     return np.asarray(-GM / (r2 * np.sqrt(r2)) * factor * position)
+
+
+Force = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
+"""Seconds from the epoch, position (3,), metres, and velocity (3,), m/s -> acceleration (3,), m/s^2, all in the frame
+of integration: z along the celestial pole of the epoch, x toward its intermediate origin, not turning (the air turns
+with the Earth in it).
+"""
+
+
+def _gravity(_: float, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    return acceleration(position)
+
+
+FORCES: dict[str, Force] = {"gravity": _gravity}
+"""Every force on every satellite, by its name; the accelerations add. A new one is added here. Orbits that are called
+sun-synchronous follow the mean Sun by J2 alone.
+"""
 
 
 def node_rate(semi_major_axis: float, eccentricity: float, inclination: float) -> float:
@@ -181,8 +199,13 @@ def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) 
 
 
 def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
-    def derivative(_: float, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([y[3:], acceleration(y[:3])])
+    forces = tuple(FORCES.values())
+
+    def derivative(t: float, y: np.ndarray) -> np.ndarray:
+        total = forces[0](t, y[:3], y[3:])
+        for force in forces[1:]:
+            total = total + force(t, y[:3], y[3:])
+        return np.concatenate([y[3:], total])
 
     def above_ground(_: float, y: np.ndarray) -> float:
         return float(np.linalg.norm(y[:3])) - _POLAR_RADIUS
