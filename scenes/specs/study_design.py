@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -14,10 +15,24 @@ from scenes.yaml.spec import OneOf, Seed, Spec, Whole
 GRID = "grid"
 """The kind that draws nothing: every combination."""
 
-Sampler = Callable[[int, int, np.random.Generator], np.ndarray]
-"""Number of runs, number of independent factors, generator of all that is drawn -> points of the unit cube, (runs,
-factors) in [0, 1]. A factor takes the value at which its distribution function is the point's coordinate.
-"""
+
+@dataclass(frozen=True)
+class Sampler:
+    """How a design spreads its runs.
+
+    Attributes:
+        title: for readers.
+        points: number of runs, number of independent factors, generator of all that is drawn -> points of the unit
+            cube, (runs, factors) in [0, 1]. A factor takes the value at which its distribution function is the point's
+            coordinate.
+        even: whether the points lie more evenly than independent ones, so that means are known better than by
+            sigma/sqrt(n).
+    """
+
+    title: str
+    points: Callable[[int, int, np.random.Generator], np.ndarray]
+    even: bool = False
+
 
 SMALLEST = 2.0**-53
 """Draws lie in [SMALLEST, 1 - SMALLEST], where normal quantiles are finite (8.2 sigma)."""
@@ -44,9 +59,9 @@ def _monte_carlo(runs: int, factors: int, generator: np.random.Generator) -> np.
 
 
 SAMPLERS: dict[str, Sampler] = {
-    "latin_hypercube": _latin_hypercube,
-    "sobol": _sobol,
-    "monte_carlo": _monte_carlo,
+    "latin_hypercube": Sampler("Latin hypercube", _latin_hypercube, even=True),
+    "sobol": Sampler("scrambled Sobol sequence", _sobol, even=True),
+    "monte_carlo": Sampler("Monte Carlo", _monte_carlo),
 }
 """Kind of a design that draws -> its sampler. A new one is added here, and its name can be written in a study."""
 
@@ -64,7 +79,8 @@ def unit_cube(kind: str, runs: int, factors: int, seed: int) -> np.ndarray:
         KeyError: no such kind.
         ValueError: the sampler gave no points of that cube.
     """
-    cube = np.asarray(SAMPLERS[kind](runs, factors, np.random.default_rng(np.random.SeedSequence(seed))), np.float64)
+    generator = np.random.default_rng(np.random.SeedSequence(seed))
+    cube = np.asarray(SAMPLERS[kind].points(runs, factors, generator), np.float64)
     if cube.shape != (runs, factors) or not np.all((cube >= 0.0) & (cube <= 1.0)):
         raise ValueError(f"the sampler {kind} must give points {(runs, factors)} in [0, 1], gave {cube.shape}")
     return np.clip(cube, SMALLEST, 1.0 - SMALLEST)

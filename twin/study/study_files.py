@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,6 +99,12 @@ def parquet(data: xr.Dataset) -> bytes | None:
     return out.getvalue()
 
 
+FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {"nc": netcdf, "csv": table, "parquet": parquet}
+"""Ending of a file of the data set, study.ENDING -> its contents, None where what it needs is not installed. A new one
+is added here.
+"""
+
+
 def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
     """Contents of study.json, but for the times: of each response mean, standard deviation and quantiles of the runs
     that did not fail; null where there are none.
@@ -167,7 +174,7 @@ class StudyFacts:
 
 
 def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: StudyFolder) -> dict[str, Any]:
-    """Write study.nc, study.csv, study.parquet, study.json, report.html and, last, the manifest.
+    """Write the data set in all FORMATS, study.json, report.html and, last, the manifest.
 
     Returns:
         Contents of study.json.
@@ -185,13 +192,14 @@ def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: Stud
     )
     (folder.path / MANIFEST).unlink(missing_ok=True)
     folder.write("config.yaml", plan.setup.to_yaml().encode())
-    folder.write("study.nc", netcdf(data))
-    folder.write("study.csv", table(data))
-    content = parquet(data)
-    if content is not None:
-        folder.write("study.parquet", content)
+    files = []
+    for ending, contents in FORMATS.items():
+        content = contents(data)
+        if content is not None:
+            files.append(f"study.{ending}")
+            folder.write(files[-1], content)
     folder.write_json("study.json", numbers)
-    write_report(data, plan, folder.path)
+    write_report(data, plan, folder.path, files)
     manifest = {
         "program": PROGRAM,
         "versions": versions(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from scenes.specs.study_design import GRID, SAMPLERS
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, Untold
 from twin.study.report.study_analysis import GOALS, Course, StudyAnalysis
 from twin.study.report.study_runs import Response, typeset
@@ -12,12 +13,11 @@ from twin.study.report.study_wording import listed, number, percent, plural, spa
 
 MANY_FAILED = 0.05
 BAD_MODEL = 0.8
-DESIGNS = {
-    "grid": "complete grid",
-    "latin_hypercube": "Latin hypercube",
-    "sobol": "scrambled Sobol sequence",
-    "monte_carlo": "Monte Carlo",
-}
+
+
+def design_title(kind: str) -> str:
+    """A kind of design, for readers."""
+    return "complete grid" if kind == GRID else SAMPLERS[kind].title
 
 
 def warnings(found: StudyAnalysis) -> list[str]:
@@ -49,7 +49,7 @@ def indices_texts(found: StudyAnalysis) -> list[str]:
     """How the indices were found, and how good that is."""
     if found.runs.drawn:
         out = [
-            f"From the given runs ({DESIGNS[found.runs.kind]}; not a design made for the indices): polynomial "
+            f"From the given runs ({design_title(found.runs.kind)}; not a design made for the indices): polynomial "
             f"chaos, whose squared coefficients are the parts of the variance; intervals from {RESAMPLES} resamples by "
             f"the wild bootstrap. RBD-FAST with {HARMONICS} harmonics beside it."
         ]
@@ -89,7 +89,7 @@ def convergence_texts(found: StudyAnalysis, names: list[str]) -> list[str]:
         f"deviation) or {GOALS['p95']:g}σ (quantiles)."
     )
     out = [goals]
-    if found.runs.kind == "latin_hypercube" or found.runs.kind == "sobol":
+    if found.runs.kind != GRID and SAMPLERS[found.runs.kind].even:
         out.append(
             "The intervals are those of independent runs; this design is spread more evenly, and knows the mean better."
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from scenes.specs.study import StudySpec
 from twin.run.artefact import Artefact
 from twin.run.page import artefact_content, environment, place
 from twin.run.versions import versions
-from twin.study.report.conclusions import DESIGNS, conclusions, warnings
+from twin.study.report.conclusions import conclusions, design_title, warnings
 from twin.study.report.study_analysis import StudyAnalysis, plain_data, summary
 from twin.study.report.study_runs import StudyRuns
 from twin.study.report.study_sections import factor_table, own_file, response_table, sections
@@ -26,18 +27,21 @@ STATISTICS = "statistics.json"
 ARTEFACTS = "artefacts"
 
 
-def write_report(data: xr.Dataset, plan: Plan, folder: Path) -> None:
+def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str]) -> None:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
     Args:
         data: as ``twin.study.study_files.make_dataset`` makes it.
         plan: the study; ``plan.setup.study.report`` says what is asked for.
         folder: of the study; it is complete but for the manifest, which is written afterwards.
+        files: of the data set, in that folder.
     """
-    write_study_report(data, plan.setup.study, folder)
+    write_study_report(data, plan.setup.study, folder, files)
 
 
-def write_study_report(data: xr.Dataset, study: StudySpec, folder: Path) -> None:
+def write_study_report(
+    data: xr.Dataset, study: StudySpec, folder: Path, files: Sequence[str] = ("study.nc", "study.csv")
+) -> None:
     """As ``write_report``, for a study whose base is not at hand."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
     responses, factors = response_table(found), factor_table(found.runs)
@@ -57,7 +61,7 @@ def write_study_report(data: xr.Dataset, study: StudySpec, folder: Path) -> None
             study=study,
             runs=found.runs,
             failed=int(found.runs.failed.sum()),
-            design=DESIGNS[found.runs.kind],
+            design=design_title(found.runs.kind),
             warnings=warnings(found),
             conclusions=conclusions(found),
             responses=_shown(responses),
@@ -70,7 +74,7 @@ def write_study_report(data: xr.Dataset, study: StudySpec, folder: Path) -> None
                 }
                 for section in parts
             ],
-            parquet=(folder / "study.parquet").exists(),
+            files=files,
             versions=versions(),
         )
     )

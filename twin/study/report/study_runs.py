@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import StudySpec
+from scenes.specs.study_design import GRID
 from scenes.specs.study_factor import FactorSpec
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
@@ -152,7 +153,7 @@ class StudyRuns:
     @property
     def drawn(self) -> bool:
         """Whether the runs are a sample of distributions; those of a grid are not."""
-        return self.kind != "grid"
+        return self.kind != GRID
 
     @property
     def everything(self) -> tuple[Response, ...]:
