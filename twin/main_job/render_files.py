@@ -13,7 +13,9 @@ from twin.main_job.render_results import RenderRun, quality_dict, stated
 from twin.main_job.summary_figure import write_summary
 from twin.monitor.time_series import CourseRun
 from twin.pictures.scene_file import write_scene
-from twin.run.data_files import SPOT_STRETCH, netcdf, preview_png, tiff
+from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, frame_files, netcdf
+from twin.run.further_sections import further_sections
+from twin.run.page import place
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import MANIFEST, RunFolder
 from twin.run.versions import versions
@@ -41,9 +43,8 @@ def write_run(
         _write_numbers(folder, kind, data)
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
-            stem = f"images/{channel.camera}_{channel.side}_{when}"
-            folder.write_bytes(f"{stem}.tiff", tiff(frames))
-            folder.write_bytes(f"{stem}.png", preview_png(frames))
+            for file, content in frame_files(f"{channel.camera}_{channel.side}_{when}", frames):
+                folder.write_bytes(file, content)
     folder.write_bytes("irradiance.nc", netcdf(_irradiance(run)))
     if run.stray is not None:
         _write_numbers(folder, "stray", run.stray.to_dict())
@@ -54,7 +55,10 @@ def write_run(
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
     folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
-    folder.write_with("report.html", lambda place: write_report(run, place))
+    sections = further_sections("render", run)
+    for artefact in (a for section in sections for a in section.artefacts):
+        folder.write_bytes(place(artefact), artefact.content())
+    folder.write_with("report.html", lambda file: write_report(run, file, sections))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
     also()
     manifest = {
@@ -80,7 +84,9 @@ def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
     """Numbers, expected images, and of each channel the first frame of every time as one page."""
     _write_numbers(folder, "course", course.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
-        folder.write_bytes(f"images/{channel.camera}_{channel.side}_course.tiff", tiff(course.frames[:, i]))
+        for ending, contents in FRAME_FORMATS.items():
+            name = f"images/{channel.camera}_{channel.side}_course.{ending}"
+            folder.write_bytes(name, contents(course.frames[:, i]))
     time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
     folder.write_bytes("course.nc", netcdf(_images(run, "time", time, course.photons)))
 
@@ -89,8 +95,8 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
     """MTF and frames; the faint rings of a pinhole are stretched in its preview, levels of the others are not."""
     _write_numbers(folder, "mtf", targets.to_dict())
     for stem, name, frames in targets.images():
-        folder.write_bytes(f"images/{stem}.tiff", tiff(frames))
-        folder.write_bytes(f"images/{stem}.png", preview_png(frames, SPOT_STRETCH if name == "pinhole" else None))
+        for file, content in frame_files(stem, frames, SPOT_STRETCH if name == "pinhole" else None):
+            folder.write_bytes(file, content)
 
 
 def _irradiance(run: RenderRun) -> xr.Dataset:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
+from collections.abc import Sequence
 from pathlib import Path
 
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from analysis.monitor.recovery import ESTIMATORS
@@ -17,6 +16,8 @@ from twin.main_job.spot_figures import residuals_svg, spots_svg
 from twin.main_job.target_figures import curves_svg, images_svg, pupils_svg
 from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import FAR
+from twin.run.page import environment, section_contents
+from twin.run.report import Section
 from twin.run.versions import versions
 
 __all__ = ["render_report", "write_report"]
@@ -25,17 +26,18 @@ TEMPLATE = "report.html.j2"
 NUMBERS = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
 
 
-def write_report(run: RenderRun, place: Path) -> None:
+def write_report(run: RenderRun, place: Path, sections: Sequence[Section] = ()) -> None:
     """Write the report of a run.
 
     Args:
         run: the run.
         place: the HTML file.
+        sections: beside the report's own.
     """
-    place.write_text(render_report(run), encoding="utf-8")
+    place.write_text(render_report(run, sections), encoding="utf-8")
 
 
-def render_report(run: RenderRun) -> str:
+def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
     """The page as text."""
     experiment = run.experiment
     paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
@@ -58,30 +60,34 @@ def render_report(run: RenderRun) -> str:
             figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
     if run.quality is not None and run.quality.obstruction:
         figures["pupils"] = Markup(pupils_svg(run.quality))
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
-    return template.render(
-        setup=report_content.setup(run),
-        course=course_content.course_content(run),
-        stray=part_content.stray_content(run),
-        targets=part_content.target_content(run),
-        quality=part_content.quality_content(run),
-        tables=tables,
-        summary=report_content.summary(tables),
-        spots=report_content.spots(run),
-        goodness=report_content.goodness(run),
-        crosstalk=crosstalk_content.crosstalk_tables(run),
-        wrong_percent=round(100 * crosstalk_content.WRONG),
-        factors=crosstalk_content.factors(run),
-        statements=crosstalk_content.statements(run),
-        figures=figures,
-        labels=report_labels,
-        estimators=ESTIMATORS,
-        number=NUMBERS.get(len(ESTIMATORS), str(len(ESTIMATORS))),
-        far=f"{FAR:g}",
-        run=run,
-        pitch_um=f"{1e6 * experiment.path.pitch:g}",
-        config=run.resolved.to_yaml(),
-        versions=versions(),
-        backend=experiment.backend.name,
+    assert __package__ is not None
+    return (
+        environment(__package__)
+        .get_template(TEMPLATE)
+        .render(
+            setup=report_content.setup(run),
+            course=course_content.course_content(run),
+            stray=part_content.stray_content(run),
+            targets=part_content.target_content(run),
+            quality=part_content.quality_content(run),
+            tables=tables,
+            summary=report_content.summary(tables),
+            spots=report_content.spots(run),
+            goodness=report_content.goodness(run),
+            crosstalk=crosstalk_content.crosstalk_tables(run),
+            wrong_percent=round(100 * crosstalk_content.WRONG),
+            factors=crosstalk_content.factors(run),
+            statements=crosstalk_content.statements(run),
+            figures=figures,
+            sections=section_contents(sections),
+            labels=report_labels,
+            estimators=ESTIMATORS,
+            number=NUMBERS.get(len(ESTIMATORS), str(len(ESTIMATORS))),
+            far=f"{FAR:g}",
+            run=run,
+            pitch_um=f"{1e6 * experiment.path.pitch:g}",
+            config=run.resolved.to_yaml(),
+            versions=versions(),
+            backend=experiment.backend.name,
+        )
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import cv2
@@ -47,6 +47,23 @@ def tiff(frames: np.ndarray) -> bytes:
     stream = io.BytesIO()
     tifffile.imwrite(stream, frames, photometric="minisblack")
     return stream.getvalue()
+
+
+FRAME_FORMATS: dict[str, Callable[[np.ndarray], bytes]] = {"tiff": tiff}
+"""Ending of a file of recorded frames -> its contents, of frames uint16 (N, H, W). A new one is added here."""
+
+
+def frame_files(name: str, frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> Iterator[tuple[str, bytes]]:
+    """(file, contents) of everything that a run folder has of recorded frames: all formats, and a picture to look at.
+
+    Args:
+        name: of the frames.
+        frames: uint16 (N, H, W).
+        stretch: of the picture, see ``preview``.
+    """
+    for ending, contents in FRAME_FORMATS.items():
+        yield f"images/{name}.{ending}", contents(frames)
+    yield f"images/{name}.png", preview_png(frames, stretch)
 
 
 def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
 
@@ -11,9 +11,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, plain, significant
-from twin.run.data_files import preview_png, tiff
+from twin.run.data_files import frame_files
+from twin.run.further_sections import further_sections
 from twin.run.reference_frames import described
-from twin.run.report import Report
+from twin.run.report import Report, Section
 from twin.run.run_folder import MANIFEST, RunFolder
 from twin.run.versions import versions
 
@@ -93,6 +94,18 @@ def place(artefact: Artefact) -> str:
     return f"artefacts/{artefact.name}.{artefact.kind}"
 
 
+def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
+    """Sections as the templates want them."""
+    return [
+        {
+            "title": section.title,
+            "text": section.text,
+            "artefacts": [artefact_content(a, place(a)) for a in section.artefacts],
+        }
+        for section in sections
+    ]
+
+
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     """``report.html`` as text; its numbers are in KIND.json."""
     options = f"--seed {facts.seed} --backend {facts.backend} --out again"
@@ -103,14 +116,7 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
             kind=kind,
             report=report,
             summary=artefact_content(report.summary, place(report.summary)),
-            sections=[
-                {
-                    "title": section.title,
-                    "text": section.text,
-                    "artefacts": [artefact_content(a, place(a)) for a in section.artefacts],
-                }
-                for section in report.sections
-            ],
+            sections=section_contents(report.sections),
             facts=facts,
             command=f"python -m {facts.program} {facts.command} config.yaml {options}",
             versions=versions(),
@@ -128,13 +134,14 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
         facts: how it was run.
         folder: open.
     """
+    report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)
     folder.write_json(f"{kind}.json", described(kind, numbers))
     for artefact in (report.summary, *(a for section in report.sections for a in section.artefacts)):
         folder.write_bytes(place(artefact), artefact.content())
     for name, frames in report.images.items():
-        folder.write_bytes(f"images/{name}.tiff", tiff(frames))
-        folder.write_bytes(f"images/{name}.png", preview_png(frames, stretch=None))
+        for file, content in frame_files(name, frames, stretch=None):
+            folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
     manifest = {
         "program": facts.program,
