@@ -17,10 +17,9 @@ from rich.console import Console
 
 from scenes.specs.autocollimator_test import AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.distortion_test import DistortionTestSpec
 from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.focus_test import FocusTestSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec

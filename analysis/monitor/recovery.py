@@ -79,10 +79,12 @@ ESTIMATORS: dict[str, Estimator] = {
     "paper_single": _formula(
         "paper_single",
         "printed, single",
-        "eqs. (2), (3), (5), (7) of the paper as printed",
+        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed",
         monitoring.paper_single,
     ),
-    "paper_joint": _formula("paper_joint", "printed, joint", "Table 1 of the paper, joint changes, as printed"),
+    "paper_joint": _formula(
+        "paper_joint", "printed, joint", "Table 1 of Wang et al. (2018), joint changes, as printed"
+    ),
     "derived": _formula(
         "derived",
         "derived",

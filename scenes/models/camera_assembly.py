@@ -13,7 +13,7 @@ from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.specs.camera import CameraSpec
-from scenes.specs.focus_test import CameraUnderTestSpec
+from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.job import NodeInfo, noll, perturbation_issues
 from scenes.yaml.errors import InputError
 

@@ -5,9 +5,8 @@ from pathlib import Path
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
 from scenes.specs.detector import DetectorSpec, require_detector
-from scenes.specs.distortion_test import DistortionTestSpec
-from scenes.specs.focus_test import FocusTestSpec
 from scenes.specs.load import (
     find_camera,
     find_turntable_test,

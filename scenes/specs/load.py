@@ -10,10 +10,9 @@ from typing import TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
+from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.distortion_test import DistortionTestSpec
 from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.focus_test import CameraUnderTestSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec

@@ -12,7 +12,7 @@ from optics.targets.collimator import Collimator, TooNarrowError
 from optics.waves.pupil_function import PupilFunction
 from optics.waves.transfer import transfer
 from scenes.models.camera_assembly import ROOT, build_camera_under_test
-from scenes.specs.focus_test import CameraUnderTestSpec
+from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.load import load_camera
 from twin.targets.target_path import TargetPath
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.models.camera_assembly import build_camera_under_test
-from scenes.specs.focus_test import FocusTestSpec
+from scenes.specs.camera_tests import FocusTestSpec
 from scenes.specs.lab_setup import resolve_focus
 from scenes.specs.load import LAB, SCENES, library_names
 from scenes.yaml.errors import InputError

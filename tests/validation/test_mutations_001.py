@@ -26,15 +26,7 @@ from twin.laboratory import autocollimator_bench
 from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
 from twin.validation.checks.check import REPRODUCED, UNDECIDED
 from twin.validation.checks.group import Context
-from twin.validation.paper_001 import (
-    budget,
-    budget_checks,
-    formulas,
-    formulas_images,
-    joint,
-    monitored_errors,
-    table2,
-)
+from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_images, joint, monitored_errors, table2
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 

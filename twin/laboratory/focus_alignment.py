@@ -37,7 +37,7 @@ from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.specs.focus_test import FocusTestSpec
+    from scenes.specs.camera_tests import FocusTestSpec
     from scenes.specs.lab_setup import FocusSetup
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)

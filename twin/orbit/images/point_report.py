@@ -14,12 +14,7 @@ from matplotlib.patheffects import Normal, Stroke
 from scenes.specs.orbit_scene import ImagePointsSpec
 from twin.orbit.images.image_points import CONSENSUS, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import LineImage, Patch
-from twin.orbit.images.point_judgement import (
-    WRONG_FLOOR,
-    WRONG_PIXELS,
-    WRONG_SIGMAS,
-    judged,
-)
+from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS, judged
 from twin.orbit.images.simulate_numbers import median_sigma, median_way, reasons
 from twin.run.artefact import Cell, Data, PngFigure, Table
 from twin.run.data_files import csv_table
