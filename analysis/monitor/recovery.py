@@ -82,9 +82,7 @@ ESTIMATORS: dict[str, Estimator] = {
         "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed",
         monitoring.paper_single,
     ),
-    "paper_joint": _formula(
-        "paper_joint", "printed, joint", "Table 1 of Wang et al. (2018), joint changes, as printed"
-    ),
+    "paper_joint": _formula("paper_joint", "printed, joint", "joint changes as Wang et al. (2018) print them"),
     "derived": _formula(
         "derived",
         "derived",
