@@ -11,7 +11,7 @@ __all__ = ["SECTIONS", "further_sections"]
 
 SECTIONS: dict[tuple[str, str], Callable[[Any], Section | None]] = {}
 """(Kind of run, name of the section) -> the section, of what the run gave; None where it has nothing to say. The kind
-is ``render`` for the main job, and for a test the name of its numbers' file: ``focus``, ``orbit_angle``. A section
+is ``render`` for the main job, and for a test the name of its numbers' file: ``focus``, ``angle``. A section
 stands before the one that says how to reproduce the run; its artefacts are in the run folder. A new one is added here.
 """
 

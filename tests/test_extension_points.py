@@ -1,0 +1,595 @@
+"""Every place where docs/architecture.md says something is added: a toy from outside is added there alone, and what it
+does is seen in the results.
+"""
+
+import csv
+import html
+import importlib
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+import yaml
+from scipy import stats
+
+import twin.render
+import twin.validate
+from analysis.monitor import monitoring, recovery
+from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.monitoring import PARAMETERS, MonitorGeometry
+from analysis.spots.centroid import gaussian_fit, mean_frames
+from analysis.spots.noise import NoiseModel
+from optics.geometry.vector_shape import Polygon
+from optics.targets.target_shapes import Target
+from optics.waves.pupil_function import circular_pupil
+from scenes.schema import json_schema
+from scenes.specs.job import JobSpec
+from scenes.specs.load import LIBRARY, load_detector
+from scenes.specs.orbit_spec import OrbitSpec
+from scenes.specs.study_design import DesignSpec, Sampler
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import parse_yaml
+from tests.twin.commands import invoke
+from tests.twin.study_bench import write_study as write_study_file
+from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.orbit import Orbit, acceleration, propagate
+from twin.run.artefact import Table
+from twin.run.page import RunFacts, write_lab
+from twin.run.result import LabResult, Section
+from twin.run.run_folder import RunFolder
+from twin.sensors.area_detector import EmvaDetector
+from twin.study.runs.block_result import BlockResult
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
+from twin.study.runs.study_folder import StudyFolder
+from twin.study.study_files import StudyFacts, write_study
+from twin.targets.target_images import View
+from twin.validation.checks.check import Check
+from twin.validation.checks.group import CheckGroup
+
+PAGE = Path(__file__).resolve().parent.parent / "docs/architecture.md"
+FALSE_ALARM = 1e-6
+"""Of each statistical limit, two-sided."""
+
+TOYS: dict[str, str] = {}
+"""Place -> test that adds a toy there."""
+
+
+def extends(*places: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """The test adds a toy at these places, and at no other."""
+
+    def listed(test: Callable[..., None]) -> Callable[..., None]:
+        TOYS.update(dict.fromkeys(places, test.__name__))
+        return test
+
+    return listed
+
+
+def registered(place: str) -> tuple[Any, str, Any]:
+    """Module, name in it, and what stands there."""
+    module, _, name = place.rpartition(".")
+    owner = importlib.import_module(module)
+    return owner, name, getattr(owner, name)
+
+
+def add(patch: pytest.MonkeyPatch, place: str, name: Any, toy: Any) -> None:
+    """Register a toy as a contributor would, until the test ends."""
+    owner, attribute, there = registered(place)
+    if isinstance(there, dict):
+        assert name not in there
+        patch.setitem(there, name, toy)
+    else:
+        patch.setattr(owner, attribute, (*there, toy))
+
+
+def rows() -> list[tuple[str, str, str]]:
+    """(task, place, test) of the page's table."""
+    text = PAGE.read_text("utf-8").partition("## Where to add")[2].partition("\n## ")[0]
+    return re.findall(r"^\| ([^|]+?) \| `([a-z0-9_.]+\.[A-Z_]+)`[^|]*\| `(test_\w+)` \|$", text, re.M)
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_lists_the_places_that_are_tried_here_and_no_others() -> None:
+    found = {place: test for _, place, test in rows()}
+    assert found == TOYS
+    assert len(rows()) == len(found) >= 9
+
+
+def test_every_place_of_the_page_exists() -> None:
+    for _, place, _ in rows():
+        _, _, there = registered(place)
+        assert isinstance(there, dict | tuple)
+
+
+def test_nothing_that_is_added_here_stays() -> None:
+    before = {place: tuple(registered(place)[2]) for place in TOYS}
+    with pytest.MonkeyPatch.context() as patch:
+        for place in TOYS:
+            add(patch, place, ("toy", "toy"), object())
+    assert {place: tuple(registered(place)[2]) for place in TOYS} == before
+
+
+# --- a detector's noise -----------------------------------------------------------------------------------------------
+
+NOISE = "twin.sensors.noise_terms.NOISE_TERMS"
+
+
+@dataclass(frozen=True)
+class TwoLevels:
+    """Half of the pixels read too high, half too low, by as many electrons: a fixed pattern that is not normal."""
+
+    step_e: float
+
+    @property
+    def fixed_variance_e2(self) -> float:
+        return self.step_e**2
+
+    def temporal_variance_e2(self, electrons: Any) -> float:
+        return 0.0
+
+    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+        return self.step_e * (2.0 * rng.integers(0, 2, shape) - 1.0)
+
+    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> None:
+        return
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """A gain that changes from pixel to pixel and frame to frame: noise in proportion to the signal."""
+
+    share: float
+
+    @property
+    def fixed_variance_e2(self) -> float:
+        return 0.0
+
+    def temporal_variance_e2(self, electrons: Any) -> Any:
+        # of a Poisson number n with mean m: the mean of n^2 is m^2 + m
+        return self.share**2 * (np.square(electrons) + electrons)
+
+    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> None:
+        return
+
+    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return self.share * electrons * rng.standard_normal(electrons.shape)
+
+
+def sheet_file(folder: Path, noise: str) -> Path:
+    """The data sheet of the monitor's CCD with further noise."""
+    text = (LIBRARY / "detectors" / "monitor_ccd.yaml").read_text("utf-8")
+    path = folder / "noisy.yaml"
+    path.write_text(text.replace("name: monitor_ccd", "name: noisy") + f"\nnoise: {noise}\n", "utf-8")
+    return path
+
+
+def within_chance(chi2: float, freedom: int) -> bool:
+    return bool(FALSE_ALARM / 2 < stats.chi2.sf(chi2, freedom) < 1 - FALSE_ALARM / 2)
+
+
+@extends(NOISE)
+def test_a_noise_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames scatter by it, and spot centres scatter as the analysis says that knows its variance; one that does not is
+    wrong.
+    """
+    add(monkeypatch, NOISE, "two_levels", TwoLevels)
+    add(monkeypatch, NOISE, "flicker", Flicker)
+    sheet = load_detector(sheet_file(tmp_path, "{two_levels: 90, flicker: 0.05}"))
+    exposure, frames, count, side = 0.01, 8, 300, 24
+    detector = EmvaDetector.from_sheet(sheet, exposure)
+    plain = EmvaDetector.from_sheet(sheet.model_copy(update={"noise": None}), exposure)
+    told, silent = detector.noise_model(exposure), plain.noise_model(exposure)
+    # an even field: one frame of many pixels, fixed and temporal noise together
+    photons = np.full((1, 128, 128), 20000.0)
+    field = detector.expose(photons, detector.fixed_pattern(photons.shape, 3), 1, exposure, 4).astype(float)
+    mean = float(detector.expected_dn(photons, exposure)[0, 0, 0])
+
+    def in_variances(model: NoiseModel) -> float:
+        variance = model.temporal_variance_dn2(mean, 1) + model.fixed_variance_dn2(mean)
+        return float(np.sum((field - mean) ** 2) / variance)
+
+    assert within_chance(in_variances(told), field.size)
+    assert in_variances(silent) > 2 * field.size
+    # spots: each with a detector of its own
+    y, x = np.mgrid[0:side, 0:side]
+    spot = 4e4 * np.exp(-((x - 11.3) ** 2 + (y - 11.8) ** 2) / (2 * 2.0**2))
+    images = np.broadcast_to(spot, (count, side, side))
+    shot = detector.expose(images, detector.fixed_pattern(images.shape, 5), frames, exposure, 6)
+    scatter = {}
+    for name, model in (("told", told), ("silent", silent)):
+        found = gaussian_fit(mean_frames(shot), frames, model)
+        off = found.position - found.position.mean(axis=0)
+        scatter[name] = float(np.sum(off[:, 0] ** 2 / found.sigma_row**2 + off[:, 1] ** 2 / found.sigma_column**2))
+    assert within_chance(scatter["told"], 2 * (count - 1))
+    assert scatter["silent"] > 1.5 * 2 * (count - 1)
+
+
+def test_an_unknown_noise_is_told_with_file_line_key_and_remedy(tmp_path: Path) -> None:
+    path = sheet_file(tmp_path, "{raed: 3}")
+    with pytest.raises(InputError) as caught:
+        EmvaDetector.from_sheet(load_detector(path), 0.01)
+    line = len(path.read_text("utf-8").splitlines())
+    said = f"{path}:{line}: noise.raed: no such noise; found 'raed', allowed: read, offset; did you mean 'read'?"
+    assert str(caught.value) == said
+
+
+# --- estimator, target, report section, format of frames --------------------------------------------------------------
+
+ESTIMATORS = "analysis.monitor.recovery.ESTIMATORS"
+TARGETS = "optics.targets.target_shapes.TARGETS"
+SECTIONS = "twin.run.further_sections.SECTIONS"
+FRAMES = "twin.run.data_files.FRAME_FORMATS"
+BAR = (8, 60)
+"""Width and length of the toy target, pixels."""
+
+
+HALF = recovery.Estimator(
+    "half", "half of what derived says", lambda camera: 0.5 * monitoring.coefficients("derived", camera.geometry)
+)
+
+
+def one_bar(pitch: float, region: int) -> Target:
+    half = 0.5 * pitch * np.array(BAR)
+    return Target(0.0, ((1.0, Polygon(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))),))
+
+
+def brightest(run: Any) -> Section:
+    """The largest grey value of every channel."""
+    values = [(channel.key, int(run.after[i].max())) for i, channel in enumerate(run.experiment.path.channels)]
+    table = Table("brightest", "Brightest pixels", "After the change.", ("channel", "value [DN]"), values)
+    return Section("How bright the spots are", ("One pixel < all pixels.",), (table,))
+
+
+def as_npy(frames: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, frames)
+    return out.getvalue()
+
+
+def turned(count: int) -> dict[str, np.ndarray]:
+    """Spots of two cameras before and after, in as many states, and the covariance of their shifts."""
+    generator = np.random.default_rng(7)
+    start = generator.uniform(40.0, 60.0, (count, 4, 2))
+    roots = generator.normal(0.0, 1e-3, (count, 2, 4, 4))
+    joint = roots @ np.swapaxes(roots, -1, -2) + 1e-7 * np.eye(4)
+    return {"start": start, "end": start + generator.normal(0.0, 0.3, start.shape), "joint": joint}
+
+
+def calibrations() -> dict[str, CameraCalibration]:
+    jacobian = np.array([[0.0, 2.0, 0.0, 1.0], [3.0, 0.0, 1.0, 0.0], [0.0, 2.0, 0.0, -1.0], [3.0, 0.0, -1.0, 0.0]])
+    motions, geometry = ("x", "y", "turn", "scale"), MonitorGeometry(7.68, 0.7, 12e-6, 0.0, 0.05, 7.6, 1e-3, 1e-3)
+    changes = np.diag([1e-6, 1e-6, 1e-5, 1e-5])
+    looks = {"forward": 0.4, "backward": -0.1}
+    return {name: CameraCalibration(geometry, look, jacobian, changes, motions) for name, look in looks.items()}
+
+
+@extends(ESTIMATORS)
+def test_an_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of what ``derived`` reads, with half of its sigma, for every camera and for the angle between them."""
+    without = recovery.estimates(**turned(5), cameras=calibrations())
+    add(monkeypatch, ESTIMATORS, "half", HALF)
+    found = recovery.estimates(**turned(5), cameras=calibrations())
+    assert list(found["forward"]) == [*without["forward"], "half"]
+    for camera, estimators in found.items():
+        np.testing.assert_allclose(estimators["half"].vector, 0.5 * estimators["derived"].vector, rtol=1e-13)
+        np.testing.assert_allclose(estimators["half"].sigma, 0.5 * estimators["derived"].sigma, rtol=1e-13)
+        for name, other in without[camera].items():
+            np.testing.assert_array_equal(estimators[name].vector, other.vector)
+    angles = recovery.angles(found, calibrations())
+    # to first order; the exact formula departs by products of angles of 1e-6, and of the turn of 1e-5
+    np.testing.assert_allclose(angles["half"].change_rad, 0.5 * angles["derived"].change_rad, rtol=1e-3)
+
+
+def bar_size(image: np.ndarray) -> tuple[float, float]:
+    """Width and length of a bright bar on dark, pixels, by area over height, and see that it lies in the middle."""
+    light = image - np.median(image)
+    half = len(image) // 2
+    rows, columns = light[:, half - 10 : half + 10].sum(axis=1), light[half - 35 : half + 35].sum(axis=0)
+    for profile in (rows, columns):
+        # the window follows the image by whole pixels
+        assert np.arange(len(image)) @ profile / profile.sum() == pytest.approx(0.5 * (len(image) - 1), abs=0.6)
+    inside = np.median(rows[half - 20 : half + 20])
+    return float(columns.sum() / columns.max()), float(rows.sum() / inside)
+
+
+@extends(TARGETS)
+def test_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job may name it, and a camera's image of it is as wide and long as it is."""
+    job = "{instrument: gf7_pair, render: {images: [one_bar, star]}}"
+    with pytest.raises(InputError, match="not one of the choices; found 'one_bar', allowed: spots, knife_edge, bars"):
+        validate(JobSpec, parse_yaml(job))
+    add(monkeypatch, TARGETS, "one_bar", one_bar)
+    assert validate(JobSpec, parse_yaml(job)).render.target_images == ("star", "one_bar")
+    assert json_schema("job")["$defs"]["RenderSpec"]["properties"]["images"]["items"]["enum"][-1] == "one_bar"
+    view = View(line_ccd(), circular_pupil(F_NUMBER), identity(), np.zeros(2), 1000, np.zeros(2), REGION)
+    image = view.image(registered(TARGETS)[2]["one_bar"](PITCH, REGION))
+    # the optics take some light from the middle of the bar, and add nothing to its area
+    assert bar_size(image) == (pytest.approx(BAR[0], rel=0.1), pytest.approx(BAR[1], rel=0.02))
+
+
+def write_toy(folder: Path) -> LabResult:
+    """What a test of the laboratory could give, as a run folder."""
+    summary = Table("summary", "Found", "Nothing.", ("x",), ((21,),))
+    frames = np.arange(2 * 5 * 7, dtype=np.uint16).reshape(2, 5, 7)
+    result = LabResult("focus", "A test", (), (), {"x": 21}, summary, (Section("Own section"),), {"edge": frames})
+    with RunFolder(folder, False) as made:
+        write_lab(result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made)
+    return result
+
+
+def read(folder: Path, name: str) -> Any:
+    return json.loads((folder / f"{name}.json").read_text("utf-8"))
+
+
+def page_text(folder: Path) -> str:
+    return html.unescape((folder / "report.html").read_text("utf-8"))
+
+
+def twice(result: LabResult) -> Section:
+    value = 2 * result.data["x"]
+    return Section(f"Twice is {value}", ("Nothing < all.",), (Table("twice", "Twice", "Of it.", ("2x",), ((value,),)),))
+
+
+@extends(SECTIONS)
+def test_a_report_section(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stands in the report of its test, and of no other, before how to reproduce it; its table is a file."""
+    add(monkeypatch, SECTIONS, ("focus", "twice"), twice)
+    add(monkeypatch, SECTIONS, ("turntable", "toy"), lambda result: Section("Of another test"))
+    add(monkeypatch, SECTIONS, ("focus", "silent"), lambda result: None)
+    write_toy(tmp_path / "run")
+    page = page_text(tmp_path / "run")
+    assert re.findall(r"<h2>(.*)</h2>", page) == ["Set-up", "Own section", "Twice is 42", "How to reproduce"]
+    assert "<p>Nothing < all.</p>" in page
+    assert (tmp_path / "run" / "artefacts" / "twice.csv").read_text("utf-8") == "2x\n42\n"
+    assert "artefacts/twice.csv" in read(tmp_path / "run", "manifest")["sha256"]
+
+
+@extends(FRAMES)
+def test_an_output_format_of_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An NPY file with the same frames stands beside the TIFF file, and the manifest lists it."""
+    add(monkeypatch, FRAMES, "npy", as_npy)
+    result = write_toy(tmp_path / "run")
+    frames = np.load(tmp_path / "run" / "images" / "edge.npy")
+    np.testing.assert_array_equal(frames, result.images["edge"])
+    np.testing.assert_array_equal(frames, tifffile.imread(tmp_path / "run" / "images" / "edge.tiff"))
+    assert "images/edge.npy" in read(tmp_path / "run", "manifest")["sha256"]
+
+
+@pytest.mark.slow
+def test_all_of_them_in_one_run_of_the_main_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command, with one camera whose focal plane moves."""
+    add(monkeypatch, NOISE, "two_levels", TwoLevels)
+    add(monkeypatch, ESTIMATORS, "half", HALF)
+    add(monkeypatch, TARGETS, "one_bar", one_bar)
+    add(monkeypatch, SECTIONS, ("render", "brightest"), brightest)
+    add(monkeypatch, FRAMES, "npy", as_npy)
+    sheet_file(tmp_path, "{two_levels: 200}")
+    instrument = yaml.safe_load((LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8"))
+    instrument["name"], instrument["cameras"] = "single", {"one": instrument["cameras"]["forward"]}
+    instrument["monitor"]["area_ccd"] |= {"rows": 48, "columns": 48, "detector": "noisy.yaml"}
+    del instrument["baffles"]
+    (tmp_path / "single.yaml").write_text(yaml.safe_dump(instrument), "utf-8")
+    (tmp_path / "job.yaml").write_text(
+        "instrument: single.yaml\n"
+        "perturb:\n"
+        "  base/one/focal_plane: {rotate: [0 arcsec, 0 arcsec, 20 arcsec], shift: [10 um, -20 um, 0 um]}\n"
+        "render: {images: [spots, one_bar], frames: 4}\n",
+        "utf-8",
+    )
+    folder = tmp_path / "run"
+    done = invoke(twin.render.app, tmp_path / "job.yaml", "--out", folder)
+    assert done.exit_code == 0, done.output
+    page = page_text(folder)
+
+    # noise: in the corner, where there is hardly light, two levels of grey in all frames
+    images = [tifffile.imread(folder / "images" / f"one_left_{when}.tiff") for when in ("before", "after")]
+    corner = np.concatenate(images)[:, :6, :6].mean(axis=0)
+    step = load_detector("monitor_ccd").system_gain_dn_per_e * 200.0
+    # read noise and DSNU move the mean of a pixel by far less than a step
+    assert np.std(np.abs(corner - np.mean([corner.min(), corner.max()]))) < 0.3 * step
+    assert np.ptp(corner) == pytest.approx(2 * step, rel=0.3)
+
+    # estimator: results, crosstalk, report, terminal
+    camera = read(folder, "recovered")["cameras"]["one"]
+    assert abs(camera["derived"]["d_gamma_arcsec"]) > 10.0
+    for key in PARAMETERS:
+        # files state values to a millionth of their sigma
+        within = 1e-5 * camera["derived"][f"{key}_sigma"]
+        for name in (key, f"{key}_sigma"):
+            assert camera["half"][name] == pytest.approx(0.5 * camera["derived"][name], abs=within)
+    for row in read(folder, "crosstalk")["one"]["motions"]:
+        for key in PARAMETERS:
+            assert row["half"][key] == pytest.approx(0.5 * row["derived"][key], rel=1e-9, abs=1e-12)
+    assert "All five estimators" in page
+    assert 'data-key="one.d_gamma_arcsec.half"' in page
+    assert "half of what derived says" in page
+    assert page.count("<th>half</th>") == 1 + 4  # results, crosstalk of four parameters
+    assert re.search(r"model +half +sigma", done.stdout), done.stdout
+
+    # target
+    for when in ("before", "after"):
+        image = tifffile.imread(folder / "images" / f"one_centre_one_bar_{when}.tiff").astype(float).mean(axis=0)
+        assert bar_size(image) == (pytest.approx(BAR[0], rel=0.15), pytest.approx(BAR[1], rel=0.05))
+    assert "one bar" in page
+
+    # section
+    assert 0 < page.index("<h2>How bright the spots are</h2>") < page.index("9 How to reproduce</h2>")
+    with (folder / "artefacts" / "brightest.csv").open(encoding="utf-8", newline="") as file:
+        listed = dict(list(csv.reader(file))[1:])
+    for key in ("one/left", "one/right"):
+        assert int(listed[key]) == tifffile.imread(folder / "images" / f"{key.replace('/', '_')}_after.tiff").max()
+    checksums = read(folder, "manifest")["sha256"]
+    assert "artefacts/brightest.csv" in checksums
+
+    # format of frames
+    tiffs = sorted((folder / "images").glob("*.tiff"))
+    assert len(tiffs) == 4 + 6
+    for path in tiffs:
+        np.testing.assert_array_equal(np.load(path.with_suffix(".npy")), tifffile.imread(path))
+        assert f"images/{path.stem}.npy" in checksums
+
+
+# --- studies ----------------------------------------------------------------------------------------------------------
+
+SAMPLERS = "scenes.specs.study_design.SAMPLERS"
+FORMATS = "twin.study.study_files.FORMATS"
+MIDDLE = Sampler("all in the middle", lambda runs, factors, generator: np.full((runs, factors), 0.5))
+
+
+def study_folder(place: Path, kind: str, runs: int = 12) -> tuple[Plan, Path]:
+    """A study's plan, and the folder of its files; what the runs gave is made up here."""
+    path = write_study_file(place, ("kind: monte_carlo, runs: 100", f"kind: {kind}, runs: {runs}"))
+    setup = resolve_study(path)
+    plan = Plan.of(setup)
+    values = np.stack([np.linspace(0.0, 1.0, runs), np.linspace(0.0, 1.0, runs)], axis=-1)
+    result = BlockResult(values, np.full(values.shape, 0.1), ("",) * runs, 1.0)
+    with StudyFolder(place / "run", setup) as folder:
+        write_study(plan, result, StudyFacts("llvm", 0.0, 1.0, runs, 1, ()), folder)
+    return plan, place / "run"
+
+
+@extends(SAMPLERS)
+def test_a_sampler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every run gets the medians of its factors; the report names the design."""
+    add(monkeypatch, SAMPLERS, "middle", MIDDLE)
+    plan, folder = study_folder(tmp_path, "middle")
+    values = {column.name: column.values for column in plan.columns}
+    # of a normal distribution about 0 um, and of an even one from -1 um to 1 um; rounding of the quantile
+    assert set(values) == {"m2z", "m2x"}
+    for found in values.values():
+        np.testing.assert_allclose(found, np.zeros(12), rtol=0, atol=1e-15)
+    with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
+        assert data.attrs["design"] == "middle"
+        np.testing.assert_array_equal(data["m2x"].values, values["m2x"])
+    assert "all in the middle" in page_text(folder)
+    assert json_schema("study")["$defs"]["DesignSpec"]["properties"]["kind"]["enum"][-1] == "middle"
+
+
+@pytest.mark.parametrize("points", [np.full((3, 2), 1.5), np.full((2, 3), 0.5), np.full((3, 2), np.nan)])
+def test_a_sampler_must_keep_to_the_unit_cube(points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    add(monkeypatch, SAMPLERS, "wrong", Sampler("wrong", lambda runs, factors, generator: points))
+    with pytest.raises(ValueError, match="sampler wrong must give points"):
+        registered("scenes.specs.study_design.unit_cube")[2]("wrong", 3, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("model", "text", "said"),
+    [
+        (
+            DesignSpec,
+            "{kind: sobl, runs: 3}",
+            "kind: not one of the choices; found 'sobl', allowed: grid, latin_hypercube, sobol, monte_carlo; "
+            "did you mean 'sobol'?",
+        ),
+        (
+            JobSpec,
+            "{instrument: gf7_pair, render: {images: [spots, 5]}}",
+            "render.images[1]: not one of the choices; found 5, allowed: spots, knife_edge, bars, star, pinhole",
+        ),
+    ],
+)
+def test_an_unknown_name_is_told_as_one_of_a_fixed_list_is(model: Any, text: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        validate(model, parse_yaml(text))
+    assert str(caught.value).endswith(said)
+
+
+@extends(FORMATS)
+def test_an_output_format_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The data set as JSON: whole, in the manifest and named in the report."""
+    add(monkeypatch, FORMATS, "columns", lambda data: json.dumps(data.to_dict()).encode())
+    add(monkeypatch, FORMATS, "missing", lambda data: None)
+    _, folder = study_folder(tmp_path, "monte_carlo")
+    with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
+        found = xr.Dataset.from_dict(json.loads((folder / "study.columns").read_text("utf-8")))
+        assert set(found.data_vars) == set(data.data_vars)
+        np.testing.assert_array_equal(found["m2z"].values, data["m2z"].values)
+    assert "study.columns" in read(folder, "manifest")["sha256"]
+    assert not (folder / "study.missing").exists()
+    page = page_text(folder)
+    assert '<a href="study.columns">' in page
+    assert "study.missing" not in page
+
+
+# --- orbits -----------------------------------------------------------------------------------------------------------
+
+FORCES = "twin.orbit.flight.orbit.FORCES"
+DRAG = 2e-13
+"""Density times half of the drag coefficient times area over mass, 1/m: 1e-5 m/s^2 in a low orbit."""
+EARTH_RATE = np.array([0.0, 0.0, 7.292115e-5])
+SPAN = 600.0
+
+
+def drag(seconds: float, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Of air of even density that turns with the Earth."""
+    wind = velocity - np.cross(EARTH_RATE, position)
+    return -DRAG * np.linalg.norm(wind) * wind
+
+
+def flown() -> Orbit:
+    passing = {"longitude": "116 deg", "latitude": "40 deg"}
+    spec = {"epoch": "2011-03-05T03:05:00Z", "passing": passing, "before": "0 s", "after": f"{SPAN} s"}
+    return propagate(OrbitSpec.model_validate(spec), Earth(0.0, (0.0, 0.0)))
+
+
+@extends(FORCES)
+def test_an_orbit_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drag, against Runge and Kutta's fourth order in steps of a second."""
+    free = flown()
+    add(monkeypatch, FORCES, "drag", drag)
+    braked = flown()
+    y = np.concatenate(free.equatorial(0.0))
+
+    def derivative(y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[3:], acceleration(y[:3]) + drag(0.0, y[:3], y[3:])])
+
+    for _ in range(int(SPAN)):
+        a = derivative(y)
+        b = derivative(y + 0.5 * a)
+        c = derivative(y + 0.5 * b)
+        y = y + (a + 2.0 * b + 2.0 * c + derivative(y + c)) / 6.0
+    end, there = braked.equatorial(SPAN)[0], free.equatorial(SPAN)[0]
+    moved = float(np.linalg.norm(end - there))
+    # 3/2 a t^2 along the track for short times
+    assert 2.0 < moved < 10.0
+    # a step's error is (n h)^5/120 of the radius, 1e-10 m; the orbit's own tolerance and rounding stay below 1e-5 m
+    assert np.linalg.norm(end - y[:3]) < 1e-4
+
+
+# --- checks of the papers ---------------------------------------------------------------------------------------------
+
+GROUPS = "twin.validation.registry.GROUPS"
+SUM = Check("001.toy.sum", "none", "One and one are two.", "1", 2.0, 1e-12, "rounding", tells=1.0, against="three")
+
+
+@extends(GROUPS)
+@pytest.mark.parametrize(("one", "verdict", "code"), [(1.0, "confirmed", 0), (1.5, "refuted", 1)])
+def test_a_check_of_a_paper(
+    one: float, verdict: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is listed, run and judged; a wrong sum is refuted and fails the command."""
+    run = partial(invoke, twin.validate.app)
+
+    def answer(context: Any) -> Iterator[Any]:
+        yield context.check(SUM.id).judge(1.0 + one, None, "Added.")
+
+    add(monkeypatch, GROUPS, None, CheckGroup("001.toy", "Sums", 1.0, (SUM,), answer))
+    assert SUM.id in run("--list").stdout
+    done = run("--only", "001.toy", "--out", tmp_path / "run")
+    assert done.exit_code == code, done.output
+    (found,) = read(tmp_path / "run", "validation")["checks"]
+    assert (found["id"], found["measured"], found["verdict"]) == (SUM.id, 1.0 + one, verdict)
+    assert "One and one are two." in html.unescape((tmp_path / "run" / "validation.html").read_text("utf-8"))
