@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from scenes.specs.study_design import GRID, SAMPLERS
+from scenes.specs.study import GRID, SAMPLERS
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, Untold
 from twin.study.report.study_analysis import GOALS, Course, StudyAnalysis
 from twin.study.report.study_runs import Response, typeset

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from scenes.specs.study import StudySpec
-from scenes.specs.study_design import GRID
+from scenes.specs.study import GRID, StudySpec
 from scenes.specs.study_factor import FactorSpec
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
