@@ -8,7 +8,7 @@ import importlib
 import io
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -45,8 +45,8 @@ from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, lin
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.run.artefact import Table
-from twin.run.page import RunFacts, write_lab
-from twin.run.result import LabResult, Section
+from twin.run.page import RunFacts, write_test
+from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder
 from twin.sensors.area_detector import EmvaDetector
 from twin.study.runs.block_result import BlockResult
@@ -320,13 +320,15 @@ def test_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bar_size(image) == (pytest.approx(BAR[0], rel=0.1), pytest.approx(BAR[1], rel=0.02))
 
 
-def write_toy(folder: Path) -> LabResult:
+def write_toy(folder: Path) -> Report:
     """What a test of the laboratory could give, as a run folder."""
     summary = Table("summary", "Found", "Nothing.", ("x",), ((21,),))
     frames = np.arange(2 * 5 * 7, dtype=np.uint16).reshape(2, 5, 7)
-    result = LabResult("focus", "A test", (), (), {"x": 21}, summary, (Section("Own section"),), {"edge": frames})
+    result = Report("A test", (), (), summary, (Section("Own section"),), {"edge": frames})
     with RunFolder(folder, False) as made:
-        write_lab(result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made)
+        write_test(
+            "focus", {"x": 21}, result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made
+        )
     return result
 
 
@@ -338,8 +340,8 @@ def page_text(folder: Path) -> str:
     return html.unescape((folder / "report.html").read_text("utf-8"))
 
 
-def twice(result: LabResult) -> Section:
-    value = 2 * result.data["x"]
+def twice(numbers: Mapping[str, Any]) -> Section:
+    value = 2 * numbers["x"]
     return Section(f"Twice is {value}", ("Nothing < all.",), (Table("twice", "Twice", "Of it.", ("2x",), ((value,),)),))
 
 
@@ -347,8 +349,8 @@ def twice(result: LabResult) -> Section:
 def test_a_report_section(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It stands in the report of its test, and of no other, before how to reproduce it; its table is a file."""
     add(monkeypatch, SECTIONS, ("focus", "twice"), twice)
-    add(monkeypatch, SECTIONS, ("turntable", "toy"), lambda result: Section("Of another test"))
-    add(monkeypatch, SECTIONS, ("focus", "silent"), lambda result: None)
+    add(monkeypatch, SECTIONS, ("turntable", "toy"), lambda numbers: Section("Of another test"))
+    add(monkeypatch, SECTIONS, ("focus", "silent"), lambda numbers: None)
     write_toy(tmp_path / "run")
     page = page_text(tmp_path / "run")
     assert re.findall(r"<h2>(.*)</h2>", page) == ["Set-up", "Own section", "Twice is 42", "How to reproduce"]
@@ -572,7 +574,9 @@ def test_an_orbit_force(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- checks of the papers ---------------------------------------------------------------------------------------------
 
 GROUPS = "twin.validation.registry.GROUPS"
-SUM = Check("001.toy.sum", "none", "One and one are two.", "1", 2.0, 1e-12, "rounding", tells=1.0, against="three")
+SUM = Check(
+    "001.toy.sum", "none", "One and one are two.", "1", 2.0, 1e-12, "rounding", separation=1.0, alternative="three"
+)
 
 
 @extends(GROUPS)
@@ -584,7 +588,7 @@ def test_a_check_of_a_paper(
     run = partial(invoke, twin.validate.app)
 
     def answer(context: Any) -> Iterator[Any]:
-        yield context.check(SUM.id).judge(1.0 + one, None, "Added.")
+        yield context.check(SUM.id).evaluate(1.0 + one, None, "Added.")
 
     add(monkeypatch, GROUPS, None, CheckGroup("001.toy", "Sums", 1.0, (SUM,), answer))
     assert SUM.id in run("--list").stdout
