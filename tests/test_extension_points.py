@@ -181,13 +181,13 @@ def within_chance(chi2: float, freedom: int) -> bool:
 
 
 @extends(NOISE)
-def test_a_noise_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("toy", "number"), [(TwoLevels, 300.0), (Flicker, 0.05)])
+def test_a_noise_term(toy: type, number: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames scatter by it, and spot centres scatter as the analysis says that knows its variance; one that does not is
     wrong.
     """
-    add(monkeypatch, NOISE, "two_levels", TwoLevels)
-    add(monkeypatch, NOISE, "flicker", Flicker)
-    sheet = load_detector(sheet_file(tmp_path, "{two_levels: 90, flicker: 0.05}"))
+    add(monkeypatch, NOISE, "toy", toy)
+    sheet = load_detector(sheet_file(tmp_path, f"{{toy: {number}}}"))
     exposure, frames, count, side = 0.01, 8, 300, 24
     detector = EmvaDetector.from_sheet(sheet, exposure)
     plain = EmvaDetector.from_sheet(sheet.model_copy(update={"noise": None}), exposure)
