@@ -224,6 +224,12 @@ def test_the_way_to_what_draws_is_found() -> None:
     assert way_to(SHOWS, "twin.laboratory.focus_report", every_import())[-1].startswith("matplotlib")
 
 
+@pytest.mark.parametrize("once", [r"write_json\(MANIFEST\b", r"\bEnvironment\("], ids=["manifest", "templates"])
+def test_one_place_writes_manifests_and_one_finds_templates(once: str) -> None:
+    found = [path.relative_to(ROOT).as_posix() for path in source_files() if re.search(once, path.read_text("utf-8"))]
+    assert len(found) == 1, found
+
+
 @pytest.mark.slow
 def test_nothing_that_computes_loads_matplotlib() -> None:
     """Not through other people's packages either. (Those of a cluster load jinja2 for pages of their own.)"""

@@ -9,14 +9,13 @@ import numpy as np
 import xarray as xr
 
 from twin.main_job.render_report import write_report
-from twin.main_job.render_results import RenderRun, quality_dict, stated
+from twin.main_job.render_results import PROGRAM, RenderRun, quality_dict, stated
 from twin.main_job.summary_figure import write_summary
 from twin.monitor.time_series import CourseRun
 from twin.pictures.scene_file import write_scene
 from twin.run.data_files import SPOT_STRETCH, netcdf, preview_png, tiff
 from twin.run.reference_frames import described, frames_text
-from twin.run.run_folder import MANIFEST, RunFolder
-from twin.run.versions import versions
+from twin.run.run_folder import RunFolder, write_manifest
 from twin.targets.target_result import TargetRun
 
 
@@ -57,18 +56,16 @@ def write_run(
     folder.write_with("report.html", lambda place: write_report(run, place))
     folder.write_with("summary.png", lambda place: write_summary(run, place))
     also()
-    manifest = {
-        "program": "twin.render",
-        "versions": versions(),
-        "backend": run.experiment.backend.name,
-        "seed": run.seed,
-        "frames": run.frames,
-        "started_unix_s": started,
-        "wall_time_s": clock,
-        "warnings": list(run.warnings),
-        "sha256": folder.checksums(),
-    }
-    folder.write_json(MANIFEST, manifest)
+    write_manifest(
+        folder,
+        PROGRAM,
+        started,
+        clock,
+        backend=run.experiment.backend.name,
+        seed=run.seed,
+        frames=run.frames,
+        warnings=list(run.warnings),
+    )
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:

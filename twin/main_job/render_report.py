@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from twin.main_job import course_content, crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.course_content import parameters_svg, temperatures_svg
 from twin.main_job.light_path_figures import footprints_svg, side_view_svg
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.spot_figures import residuals_svg, spots_svg
 from twin.main_job.target_figures import curves_svg, images_svg, pupils_svg
 from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import FAR
+from twin.run.page import environment, reproduce
 from twin.run.versions import versions
 
 __all__ = ["render_report", "write_report"]
@@ -35,7 +34,7 @@ def write_report(run: RenderRun, place: Path) -> None:
 
 def render_report(run: RenderRun) -> str:
     """The page as text."""
-    experiment = run.experiment
+    experiment, backend = run.experiment, run.experiment.backend.name
     paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
     tables = report_content.results(run)
     names = list(experiment.instrument.cameras)
@@ -55,8 +54,7 @@ def render_report(run: RenderRun) -> str:
             figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
     if run.quality is not None and run.quality.obstruction:
         figures["pupils"] = Markup(pupils_svg(run.quality))
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8"))
+    template = environment(__package__).get_template(TEMPLATE)
     return template.render(
         setup=report_content.setup(run),
         course=course_content.course_content(run),
@@ -77,6 +75,7 @@ def render_report(run: RenderRun) -> str:
         run=run,
         pitch_um=f"{1e6 * experiment.path.pitch:g}",
         config=run.resolved.to_yaml(),
+        command=reproduce(PROGRAM, "config.yaml", f"--seed {run.seed} --frames {run.frames}", f"--backend {backend}"),
         versions=versions(),
-        backend=experiment.backend.name,
+        backend=backend,
     )

@@ -12,7 +12,7 @@ from optics.numerics.backend import load_backend
 from twin.run.artefact import Artefact, SvgFigure
 from twin.run.cli import InputErrorText, check_backend
 from twin.run.reference_frames import described
-from twin.run.run_folder import MANIFEST, RunFolder, chosen
+from twin.run.run_folder import RunFolder, chosen, write_manifest
 from twin.run.versions import versions
 from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
 from twin.study.runs.setup import StudySetup, resolve_study
@@ -70,24 +70,15 @@ def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], Non
         folder.write_json("gradient.json", numbers)
         folder.write_bytes("gradient.csv", whole_table(found).content())
         _write_report(found, setup, folder)
-        manifest = {
-            "program": PROGRAM,
-            "gradient": True,
-            "versions": versions(),
-            "backend": options.backend,
-            "started_unix_s": started,
-            "wall_time_s": time.perf_counter() - began,
-            "worst_relative": found.worst,
-            "sha256": folder.checksums(),
-        }
-        folder.write_json(MANIFEST, manifest)
+        told = {"gradient": True, "backend": options.backend, "worst_relative": found.worst}
+        write_manifest(folder, PROGRAM, started, time.perf_counter() - began, **told)
     return GradientRun(found, numbers, folder.target)
 
 
 def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None:
     # drawing libraries are not needed before
     from twin.run.artefact import significant
-    from twin.run.page import artefact_content, environment, place
+    from twin.run.page import artefact_content, environment, place, reproduce
     from twin.run.svg import look, to_svg
     from twin.study.gradient.gradient_report import doubtful, factor_rows, heat_map, response_table, tornado
 
@@ -123,6 +114,7 @@ def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None
             doubtful=doubtful(found),
             tables=[artefact_content(a, place(a)) for a in tables],
             figures=[artefact_content(a, place(a)) for a in figures],
+            command=reproduce(PROGRAM, "config.yaml", "--gradient"),
             versions=versions(),
         )
     )

@@ -13,8 +13,7 @@ import xarray as xr
 
 from twin.run.data_files import csv_table, netcdf
 from twin.run.reference_frames import described, frames_text
-from twin.run.run_folder import MANIFEST
-from twin.run.versions import versions
+from twin.run.run_folder import MANIFEST, write_manifest
 from twin.study.report.study_report import write_report
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.plan import Plan
@@ -192,18 +191,16 @@ def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: Stud
         folder.write("study.parquet", content)
     folder.write_json("study.json", numbers)
     write_report(data, plan, folder.path)
-    manifest = {
-        "program": PROGRAM,
-        "versions": versions(),
-        "backend": facts.backend,
-        "seed": plan.setup.study.design.seed,
-        "runs": plan.runs,
-        "failed": int(result.failed.sum()),
-        "started_unix_s": facts.started,
-        "wall_time_s": facts.seconds,
-        "workers": facts.workers,
-        "warnings": list(facts.warnings),
-        "sha256": folder.checksums(),
-    }
-    folder.write_json(MANIFEST, manifest)
+    write_manifest(
+        folder,
+        PROGRAM,
+        facts.started,
+        facts.seconds,
+        backend=facts.backend,
+        seed=plan.setup.study.design.seed,
+        runs=plan.runs,
+        failed=int(result.failed.sum()),
+        workers=facts.workers,
+        warnings=list(facts.warnings),
+    )
     return numbers
