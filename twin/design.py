@@ -28,7 +28,8 @@ from scenes.models.camera_design import (
 from scenes.models.camera_model import derive_camera
 from twin.pictures.design_figures import error_figure, layout_figure
 from twin.run.artefact import Data, SvgFigure, Table
-from twin.run.command import AsJson, BackendName, File, Force, Options, Out, Quiet, run_test
+from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet
+from twin.run.command import run_test
 from twin.run.procedure import Advance, BenchError, Procedure, silent
 from twin.run.report import Report, Section
 from twin.run.svg import look, to_svg

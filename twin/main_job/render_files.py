@@ -1,35 +1,27 @@
-"""Files of a run folder."""
+"""The files of a run that hold its numbers and images."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from twin.main_job.render_report import write_report
-from twin.main_job.render_results import PROGRAM, RenderRun, quality_dict, stated
-from twin.main_job.summary_figure import write_summary
+from twin.main_job.render_results import RenderRun, quality_dict, stated
 from twin.monitor.time_series import CourseRun
-from twin.pictures.scene_file import write_scene
 from twin.run.data_files import SPOT_STRETCH, netcdf, preview_png, tiff
 from twin.run.reference_frames import described, frames_text
-from twin.run.run_folder import RunFolder, write_manifest
+from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun
 
 
-def write_run(
-    run: RenderRun, folder: RunFolder, started: float, clock: float, also: Callable[[], None] = lambda: None
-) -> None:
-    """Write all files of a run into an open run folder.
+def write_data(run: RenderRun, folder: RunFolder) -> None:
+    """Write everything that a run computed: what it is of, numbers, frames and expected images.
 
     Args:
         run: what to write.
-        folder: where.
-        started: time of the start, seconds since the epoch.
-        clock: seconds that the computation took.
-        also: writes more files into the folder, before the manifest lists them all.
+        folder: an open run folder.
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
@@ -52,20 +44,6 @@ def write_run(
         _write_targets(run.targets, folder)
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
-    folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
-    folder.write_with("report.html", lambda place: write_report(run, place))
-    folder.write_with("summary.png", lambda place: write_summary(run, place))
-    also()
-    write_manifest(
-        folder,
-        PROGRAM,
-        started,
-        clock,
-        backend=run.experiment.backend.name,
-        seed=run.seed,
-        frames=run.frames,
-        warnings=list(run.warnings),
-    )
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:
