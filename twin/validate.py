@@ -16,8 +16,9 @@ from rich.text import Text
 from optics.numerics.backend import load_backend
 from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
 from twin.run.cli import (
-    BACKEND_HELP,
     LARGEST_SEED,
+    BackendName,
+    Force,
     InputErrorText,
     check_backend,
     exit_on_terminate,
@@ -75,8 +76,8 @@ def main(
         Path | None, typer.Option(readable=False, help="Run folder to make. Default: nothing is written.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise.")] = 1,
-    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
-    force: Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")] = False,
+    backend: BackendName = "llvm",
+    force: Force = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print validation.json (or the list) on stdout, and nothing else.")
     ] = False,
