@@ -47,7 +47,7 @@ COMPUTE = (
     "twin/study/runs",
 )
 """Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`."""
-COMMANDS = {"analysis.mtf.__main__", "twin.design"}
+COMMANDS = {"analysis.mtf.__main__"}
 ROOMS = [
     *re.findall(
         r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M

@@ -1,6 +1,9 @@
-"""Figures of an optimised camera: its layout before and after, and the wavefront error over the field."""
+"""Report of an optimised camera: before and after, its layout, the wavefront error over the field, the new file."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,8 +11,110 @@ from matplotlib.figure import Figure
 
 from optics.design.design_rays import trace_beams
 from optics.design.design_variables import Prescription
+from optics.design.merit_function import Judgement
 from optics.design.optimiser import Design
-from twin.run.svg import BLUE, GREY, INK, ORANGE, new_figure, plain_axes
+from scenes.models.camera_design import prescription_of
+from twin.design.design_run import DesignRun
+from twin.run.artefact import Data, SvgFigure, Table
+from twin.run.report import Report, Section
+from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile(Data):
+    """The optimised camera as a file of the library; ``data`` is its YAML text."""
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "yaml"
+
+    def content(self) -> bytes:
+        """The file."""
+        return str(self.data).encode()
+
+
+def design_report(run: DesignRun) -> Report:
+    """Report of an optimised camera."""
+    setup, found = run.setup, run.found
+    before, after = found.before, found.after
+    worst = float(after.errors.max())
+    lead = (
+        f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
+        f"({before.errors.max():.4f} in {setup.camera.name}); its extent along the axis is "
+        f"{1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm).",
+    )
+    numbers = _numbers(before, after)
+    summary = Table("merit", "The camera before and after", "", ("", "before", "after"), numbers, (None, 4, 4))
+    fields = np.degrees(found.judge.beams.fields)
+    by_field = Table(
+        "fields",
+        "Wavefront error by field",
+        "Waves rms, piston and tilt removed; the other half of the field is the mirror image.",
+        ("x, deg", "y, deg", "before", "after"),
+        [
+            [float(x), float(y), float(b), float(a)]
+            for (x, y), b, a in zip(fields, before.errors, after.errors, strict=True)
+        ],
+        (3, 3, 4, 4),
+    )
+    changed = Table(
+        "variables",
+        "What was varied",
+        "SI units.",
+        ("variable", "before", "after"),
+        [
+            [v.name, float(prescription_of(setup.camera).value(v)), float(found.prescription.value(v))]
+            for v in found.variables
+        ],
+    )
+    names = ("scene", *found.prescription.names)
+    passages = Table(
+        "clearances",
+        "Room between beams and edges",
+        "Least distance in y of every stretch of the beams from the edge that it passes, in the plane of symmetry, mm.",
+        ("from", "to", "passes", "before", "after"),
+        [
+            [names[p.stretch], names[p.stretch + 1], names[p.surface], 1e3 * float(b), 1e3 * float(a)]
+            for p, b, a in zip(found.judge.passages, before.clearances, after.clearances, strict=True)
+        ],
+        (None, None, None, 1, 1),
+    )
+    with look("design"):
+        layout = to_svg(layout_figure(found, prescription_of(setup.camera)))
+        errors = to_svg(error_figure(found))
+    sections = (
+        Section(
+            "Layout",
+            ("Chief ray and edges of the beam of the middle of the field, in the plane of symmetry.",),
+            (SvgFigure("layout", "Before and after", "To one scale.", layout), passages),
+        ),
+        Section("Image quality", (), (SvgFigure("errors", "Wavefront error over the field", "", errors), by_field)),
+        Section(
+            "Prescription",
+            (f"{found.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
+            (
+                changed,
+                CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/library/cameras.", run.text),
+            ),
+        ),
+    )
+    facts = (("start", setup.camera.name), ("variables", str(len(found.variables))))
+    return Report(f"Design of {setup.test.name}", lead, facts, summary, sections)
+
+
+def _numbers(before: Judgement, after: Judgement) -> list[list[str | float]]:
+    def row(name: str, of: Callable[[Judgement], float]) -> list[str | float]:
+        return [name, float(of(before)), float(of(after))]
+
+    return [
+        row("wavefront error, worst field, waves rms", lambda j: j.errors.max()),
+        row("wavefront error, rms over the field, waves", lambda j: np.sqrt(np.mean(j.errors**2))),
+        row("principal distance, m", lambda j: j.principal_distance),
+        row("extent along the axis, m", lambda j: j.envelope),
+        row("least clearance, m", lambda j: j.clearances.min()),
+    ]
+
 
 _BEFORE, _AFTER = GREY, BLUE
 
