@@ -46,7 +46,14 @@ COMPUTE = (
     "twin/orbit/ground",
     "twin/study/runs",
 )
-"""Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`."""
+"""Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`, and RUNS."""
+RUNS = {
+    "twin.main_job.render_job",
+    "twin.main_job.render_files",
+    "twin.study.gradient.study_gradient",
+    "twin.study.gradient.gradient_numbers",
+}
+"""What computes where no procedure is made of it, and writes what was computed."""
 COMMANDS = {"analysis.mtf.__main__"}
 ROOMS = [
     *re.findall(
@@ -110,13 +117,14 @@ def _finest(names: set[str]) -> Iterator[str]:
 
 
 def computing() -> list[str]:
-    """Modules that compute: those in `COMPUTE`, and every one that makes a procedure of a test."""
+    """Modules that compute: those in `COMPUTE` and `RUNS`, and every one that makes a procedure of a test."""
     return [
         module
         for module, path in modules().items()
         if module not in COMMANDS
         and (
-            any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
+            module in RUNS
+            or any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
             or re.search(r"^[A-Z]+ = Procedure\(", (ROOT / path).read_text("utf-8"), re.M)
         )
     ]
@@ -211,7 +219,8 @@ def test_a_right_arrow_is_not_complained_about(tmp_path: Path, monkeypatch: pyte
 def test_what_computes_neither_draws_nor_fills_templates() -> None:
     """Nor does anything that it imports: a study needs no figures, and a run can be shown in any way."""
     # those of the laboratory and of the orbit, by the modules that make their procedures
-    assert len([name for name in computing() if name.endswith("_numbers")]) == 7
+    assert len([name for name in computing() if re.match(r"twin\.(laboratory|orbit)\..*_numbers$", name)]) == 7
+    assert set(computing()) >= {*RUNS, "twin.design.design_run"}
     ways = {module: way_to(SHOWS, module, every_import()) for module in computing()}
     assert [" imports ".join(way) for way in ways.values() if way] == []
 
