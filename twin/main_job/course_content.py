@@ -91,8 +91,8 @@ def _range(low: str, high: str) -> str:
     return low if low == high else f"{low} … {high}"
 
 
-def _worst(course: CourseRun) -> str:
-    """The camera that the model reads worst in Δα, by how much, when, and how much truly happened."""
+def _worst(course: CourseRun) -> dict[str, str]:
+    """The camera that the model reads worst in Δα, by how much, when, and how much truly happened, in arcsec."""
     errors = {
         name: (estimators["model"].vector[:, 0] - course.truth[name][0]) * PER_SI[0]
         for name, estimators in course.parameters.items()
@@ -102,11 +102,13 @@ def _worst(course: CourseRun) -> str:
     sigma = float(course.parameters[name]["model"].sigma[k, 0]) * PER_SI[0]
     true = float(course.truth[name][0, k]) * PER_SI[0]
     places = decimals_for(sigma)
-    return (
-        f"The model's largest error of Δα is {fixed(float(errors[name][k]), places, sign=True)} arcsec, camera {name} "
-        f"at {moment(float(course.times[k]))}, where it truly is {fixed(true, places, sign=True)} "
-        f"arcsec; the noise is {fixed(sigma, places)} arcsec."
-    )
+    return {
+        "error": fixed(float(errors[name][k]), places, sign=True),
+        "camera": name,
+        "time": moment(float(course.times[k])),
+        "true": fixed(true, places, sign=True),
+        "sigma": fixed(sigma, places),
+    }
 
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, INK, GREY)

@@ -29,7 +29,7 @@ def quality_content(run: RenderRun) -> dict[str, Any] | None:
         "fields": len(quality.fields),
         "places": list(where),
         "obstruction": quality.obstruction,
-        "bodies": {name: ", ".join(camera.bodies) or "nothing" for name, camera in quality.cameras.items()},
+        "bodies": {name: ", ".join(camera.bodies) for name, camera in quality.cameras.items()},
         "rows": [_camera(name, camera, where) for name, camera in quality.cameras.items()],
     }
 
@@ -109,7 +109,7 @@ def _family(family: Family, share: float, detector: str) -> dict[str, str]:
         "share": significant(share),
         "x": x,
         "y": y,
-        "way": text or "not looked up",
+        "way": text,
         "detector": detector,
         "paths": str(family.count),
     }
@@ -207,6 +207,7 @@ def _cell(key: str, reading: EdgeReading | BarReading) -> dict[str, str]:
 
 
 def _largest_bias(run: RenderRun) -> str:
+    """By how much noise lengthens the MTF at Nyquist at most, empty when nobody knows."""
     assert run.targets is not None
     found = [
         edge.nyquist_bias
@@ -216,4 +217,4 @@ def _largest_bias(run: RenderRun) -> str:
         for edge in shots.edges.values()
     ]
     known = [bias for bias in found if bias is not None]
-    return f"at most {significant(max(known), 2, floor=0.0)}" if known else "an unknown amount"
+    return significant(max(known), 2, floor=0.0) if known else ""
