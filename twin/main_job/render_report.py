@@ -6,8 +6,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from twin.main_job import course_content, crosstalk_content, part_content, report_content, report_labels
-from twin.main_job.course_content import parameters_svg, temperatures_svg
+from twin.main_job import crosstalk_content, part_content, report_content, report_labels
+from twin.main_job.course_figures import parameters_svg, temperatures_svg
 from twin.main_job.light_path_figures import footprints_svg, side_view_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.spot_figures import residuals_svg, spots_svg
@@ -57,7 +57,7 @@ def render_report(run: RenderRun) -> str:
     template = environment(__package__).get_template(TEMPLATE)
     return template.render(
         setup=report_content.setup(run),
-        course=course_content.course_content(run),
+        course=part_content.course_content(run),
         stray=part_content.stray_content(run),
         targets=part_content.target_content(run),
         quality=part_content.quality_content(run),
