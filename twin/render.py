@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -23,7 +22,7 @@ from twin.main_job.summary_figure import write_summary
 from twin.pictures.picture import write_pictures
 from twin.pictures.picture_light import PictureError
 from twin.pictures.scene_file import write_scene
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, print_whole
+from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings, run_command
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
@@ -172,7 +171,7 @@ def _mtf_table(targets: TargetRun) -> Table | None:
     """MTF at the Nyquist frequency from the knife edges, before -> after (true); None if there are none."""
     title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
     title += "\nbefore -> after, below it the true one"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(title)
     for head in ("", *PLACES):
         table.add_column(head, no_wrap=True)
     for name, camera in targets.cameras.items():
@@ -202,7 +201,7 @@ def _table(run: RenderRun) -> Table:
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
     if run.course is not None:
         title += f"\nat {moment(float(run.course.times[run.course.shown]))} of the course"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(title)
     table.add_column("", no_wrap=True)
     heads = ("true", "paper\nsingle", "paper\njoint", "derived", "model", "sigma", "model\n- true", "in\nsigma")
     for head in heads:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
 from optics.numerics.backend import load_backend
@@ -24,6 +23,7 @@ from twin.run.cli import (
     exit_on_terminate,
     explained,
     print_whole,
+    result_table,
 )
 from twin.run.run_folder import RunFolder
 from twin.validation import registry
@@ -228,7 +228,7 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = result_table()
     table.add_column("check", no_wrap=True)
     table.add_column("claim", justify="right", no_wrap=True)
     table.add_column("measured", justify="right", no_wrap=True)

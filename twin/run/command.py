@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import Progress, TaskID
-from rich.table import Table
 
 from optics.numerics.backend import Backend, load_backend
 from scenes.yaml.errors import InputError
@@ -32,6 +30,7 @@ from twin.run.cli import (
     print_place,
     print_whole,
     progress_columns,
+    result_table,
 )
 from twin.run.page import RunFacts, cell_text, write_test
 from twin.run.procedure import Advance, BenchError, Procedure, Run
@@ -215,7 +214,7 @@ def _explained_at(test: Any, error: BenchError) -> InputError:
 
 def _print_report(report: Report, console: Console) -> None:
     summary = report.summary
-    table = Table(title=report.title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(report.title)
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(head, justify="left" if text else "right", no_wrap=text)

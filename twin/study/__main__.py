@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import AsJson, BackendName, Force, explained, print_place, print_whole
+from twin.run.cli import AsJson, BackendName, Force, explained, print_place, print_whole, result_table
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError
 from twin.study.runs.engine import Progress as EngineProgress
@@ -178,7 +176,7 @@ def _print_result(run: StudyRun) -> None:
 
     numbers = run.numbers
     title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(title)
     for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():

@@ -6,12 +6,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from twin.run.cli import InputErrorText, Options, print_whole
+from twin.run.artefact import significant
+from twin.run.cli import InputErrorText, Options, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, run_command
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
 from twin.study.gradient.gradient_numbers import gradient_numbers, whole_table
-from twin.study.gradient.gradient_report import terminal_tables, write_report
+from twin.study.gradient.gradient_report import response_table, write_report
 from twin.study.gradient.study_gradient import Gradient, study_gradient
 from twin.study.runs.setup import StudySetup, resolve_study
 from twin.study.runs.study_folder import PROGRAM
@@ -60,5 +61,12 @@ def _work(setup: StudySetup, session: Session) -> Result:
 
 
 def _print_result(found: Gradient, console: Console) -> None:
-    for table in terminal_tables(found):
-        print_whole(console, table)
+    worst = f"; AD and differences agree to {significant(found.worst, 3, floor=0.0)}" if found.worst is not None else ""
+    table = result_table(f"{len(found.responses)} responses by {len(found.factors)} factors{worst}")
+    picked = [0, 1, 2, 3, 4, 5, 8]
+    heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
+    for head, k in zip(heads, picked, strict=True):
+        table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
+    for row in response_table(found).rows:
+        table.add_row(*(str(row[k]) for k in picked))
+    print_whole(console, table)

@@ -6,8 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
-from rich import box
-from rich.table import Table as RichTable
 
 from scenes.yaml.errors import key_text
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, plain, significant
@@ -131,21 +129,6 @@ def factor_rows(found: Gradient) -> Table:
     heads = ("factor", "in the base", "unit", "value in the base", "spread", "steps", "method")
     caption = "Differences are central, at the step and half of it, extrapolated after Richardson."
     return Table("factors", "Factors", caption, heads, rows)
-
-
-def terminal_tables(found: Gradient) -> list[RichTable]:
-    """What the command prints."""
-    worst = f"; AD and differences agree to {significant(found.worst, 3, floor=0.0)}" if found.worst is not None else ""
-    title = f"{len(found.responses)} responses by {len(found.factors)} factors{worst}"
-    table = RichTable(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    shown = response_table(found)
-    picked = [0, 1, 2, 3, 4, 5, 8]
-    heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
-    for head, k in zip(heads, picked, strict=True):
-        table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
-    for row in shown.rows:
-        table.add_row(*(str(row[k]) for k in picked))
-    return [table]
 
 
 MOST_BARS = 8
