@@ -52,6 +52,7 @@ RUNS = {
     "twin.main_job.render_files",
     "twin.study.gradient.study_gradient",
     "twin.study.gradient.gradient_numbers",
+    "twin.study.study_files",
 }
 """What computes where no procedure is made of it, and writes what was computed."""
 COMMANDS = {"analysis.mtf.__main__"}
