@@ -46,8 +46,16 @@ COMPUTE = (
     "twin/orbit/ground",
     "twin/study/runs",
 )
-"""Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`."""
-COMMANDS = {"analysis.mtf.__main__", "twin.design"}
+"""Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`, and RUNS."""
+RUNS = {
+    "twin.main_job.render_job",
+    "twin.main_job.render_files",
+    "twin.study.gradient.study_gradient",
+    "twin.study.gradient.gradient_numbers",
+    "twin.study.study_files",
+}
+"""What computes where no procedure is made of it, and writes what was computed."""
+COMMANDS = {"analysis.mtf.__main__"}
 ROOMS = [
     *re.findall(
         r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M
@@ -110,13 +118,14 @@ def _finest(names: set[str]) -> Iterator[str]:
 
 
 def computing() -> list[str]:
-    """Modules that compute: those in `COMPUTE`, and every one that makes a procedure of a test."""
+    """Modules that compute: those in `COMPUTE` and `RUNS`, and every one that makes a procedure of a test."""
     return [
         module
         for module, path in modules().items()
         if module not in COMMANDS
         and (
-            any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
+            module in RUNS
+            or any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
             or re.search(r"^[A-Z]+ = Procedure\(", (ROOT / path).read_text("utf-8"), re.M)
         )
     ]
@@ -211,7 +220,8 @@ def test_a_right_arrow_is_not_complained_about(tmp_path: Path, monkeypatch: pyte
 def test_what_computes_neither_draws_nor_fills_templates() -> None:
     """Nor does anything that it imports: a study needs no figures, and a run can be shown in any way."""
     # those of the laboratory and of the orbit, by the modules that make their procedures
-    assert len([name for name in computing() if name.endswith("_numbers")]) == 7
+    assert len([name for name in computing() if re.match(r"twin\.(laboratory|orbit)\..*_numbers$", name)]) == 7
+    assert set(computing()) >= {*RUNS, "twin.design.design_run"}
     ways = {module: way_to(SHOWS, module, every_import()) for module in computing()}
     assert [" imports ".join(way) for way in ways.values() if way] == []
 
@@ -222,6 +232,12 @@ def test_the_way_to_what_draws_is_found() -> None:
     assert way_to(SHOWS, "twin.run.report", imports) == []
     # reports do draw
     assert way_to(SHOWS, "twin.laboratory.focus_report", every_import())[-1].startswith("matplotlib")
+
+
+@pytest.mark.parametrize("once", [r"write_json\(MANIFEST\b", r"\bEnvironment\("], ids=["manifest", "templates"])
+def test_one_place_writes_manifests_and_one_finds_templates(once: str) -> None:
+    found = [path.relative_to(ROOT).as_posix() for path in source_files() if re.search(once, path.read_text("utf-8"))]
+    assert len(found) == 1, found
 
 
 @pytest.mark.slow

@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from analysis.monitor.recovery import ESTIMATORS
-from optics.numerics.backend import load_backend
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob, resolve
-from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.main_job.render_files import write_run
-from twin.main_job.render_job import STAGES, render_job
-from twin.main_job.render_results import RenderRun, stated
+from twin.main_job.render_files import write_data
+from twin.main_job.render_job import render_job
+from twin.main_job.render_report import write_report
+from twin.main_job.render_results import PROGRAM, RenderRun, stated
+from twin.main_job.summary_figure import write_summary
 from twin.pictures.picture import write_pictures
 from twin.pictures.picture_light import PictureError
-from twin.run.cli import (
-    BACKEND_HELP,
-    LARGEST_SEED,
-    check_backend,
-    exit_on_terminate,
-    explained,
-    print_place,
-    print_whole,
-    progress_columns,
-)
+from twin.pictures.scene_file import write_scene
+from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, print_whole, result_table
+from twin.run.command import WRITE, Result, Session, print_warnings, run_command
+from twin.run.further_sections import further_sections
+from twin.run.page import place
 from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, chosen
+from twin.run.run_folder import write_manifest
 from twin.targets.edge_images import DIRECTIONS
 from twin.targets.target_images import PLACES
 from twin.targets.target_result import EdgeReading, TargetRun
 
-WRITE = "write the run folder"
 LABELS = {
     "d_alpha_arcsec": ('d_alpha "', 4),
     "d_beta_arcsec": ('d_beta "', 4),
@@ -61,28 +52,19 @@ def main(
     job: Annotated[
         Path, typer.Argument(readable=False, help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            readable=False, help="Run folder to make. Default: runs/JOB-001, -002, ... (the first that is free)."
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise; overrides the file's.")
-    ] = None,
+    out: Out = None,
+    seed: Seed = None,
     frames: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Frames per state; overrides the file's.")
     ] = None,
-    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
+    backend: BackendName = "llvm",
     picture: Annotated[
         bool,
         typer.Option("--picture", help="Also render pictures of the instrument itself: picture.png and two close-ups."),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print truth and recovered as JSON on stdout, and nothing else.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Perturb an instrument, render the spot images of its autocollimation monitor and recover the perturbation from
     them.
@@ -123,79 +105,55 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    errors = Console(stderr=True)
-    with explained(errors):
-        check_backend(backend)
-        resolved = resolve(job)
-        folder = RunFolder(chosen(out, job.stem), force)
-        run, problem = _run(folder, resolved, backend, frames, seed, picture, silent=as_json or quiet, errors=errors)
-    with to_stdout(errors, f"the run is complete in {folder.target}"):
-        if as_json:
-            parts = {"truth": run.truth_dict(), "recovered": stated(run.recovered_dict())}
-            if run.course is not None:
-                parts["course"] = run.course.to_dict()
-            if run.targets is not None:
-                parts["mtf"] = run.targets.to_dict()
-            print_json({kind: described(kind, data) for kind, data in parts.items()})
-        elif not quiet:
-            _print_result(run, folder.target)
-    if problem:
-        print_error(errors, f"the pictures are not complete: {problem}; all else is in {folder.target}")
-        raise typer.Exit(FAILURE)
+
+    def work(resolved: ResolvedJob, session: Session) -> Result:
+        run = render_job(resolved, session.backend, frames, seed, session.advance)
+        problem = _write(run, session, picture)
+        return Result(_numbers(run), lambda console: _print_result(run, console), problem)
+
+    run_command(job.stem, Options(out, seed, backend, force, as_json, quiet), lambda: resolve(job), work)
 
 
-def _run(
-    folder: RunFolder,
-    resolved: ResolvedJob,
-    backend: str,
-    frames: int | None,
-    seed: int | None,
-    picture: bool,
-    silent: bool,
-    errors: Console,
-) -> tuple[RenderRun, str]:
-    """The run, and why its pictures are not complete (empty when they are, or nobody asked for them)."""
-    started, clock = time.time(), time.monotonic()
-    tracer = load_backend(backend)
-    problems: list[str] = []
-    hidden = silent or not errors.is_terminal
-    with (
-        exit_on_terminate(),
-        folder,
-        Progress(*progress_columns(24), console=errors, disable=hidden, transient=True) as bar,
-    ):
-        task = bar.add_task("start", total=len(STAGES) + 1)
-        parts: dict[str, TaskID] = {}
+def _write(run: RenderRun, session: Session, picture: bool) -> str:
+    """Write all files of a run: its data, then what they look like.
 
-        def stage(name: str) -> None:
-            bar.update(task, description=name, completed=float([*STAGES, WRITE].index(name)))
-
-        def advance(part: str, done: int, total: int) -> None:
-            if part not in parts:
-                parts[part] = bar.add_task(part, total=total)
-            bar.update(parts[part], completed=done)
-
-        run = render_job(resolved, tracer, frames, seed, stage, advance)
-        stage(WRITE)
-
-        def pictures() -> None:
-            experiment = run.experiment
-            try:
-                write_pictures(experiment.instrument, tracer, run.state, folder.write_with, run.seed, advance)
-            except PictureError as error:  # what took minutes to compute is not thrown away for a picture
-                problems.append(str(error))
-
-        clock = time.monotonic() - clock
-        write_run(run, folder, started, clock, pictures if picture else lambda: None)
-        bar.update(task, completed=len(STAGES) + 1)
-    return run, " ".join(problems)
+    Returns:
+        Why the pictures are not complete, empty when they are or nobody asked for them.
+    """
+    seconds, folder = session.seconds, session.folder
+    session.advance(WRITE, 0, 1)
+    write_data(run, folder)
+    folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
+    sections = further_sections("render", run)
+    for artefact in (a for section in sections for a in section.artefacts):
+        folder.write_bytes(place(artefact), artefact.content())
+    folder.write_with("report.html", lambda file: write_report(run, file, sections))
+    folder.write_with("summary.png", lambda place: write_summary(run, place))
+    problem = ""
+    if picture:
+        instrument, write = run.experiment.instrument, folder.write_with
+        try:
+            write_pictures(instrument, session.backend, run.state, write, run.seed, session.advance)
+        except PictureError as error:  # what took minutes to compute is not thrown away for a picture
+            problem = f"the pictures are not complete: {error}"
+    told = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": list(run.warnings)}
+    write_manifest(folder, PROGRAM, session.started, seconds, **told)
+    return problem
 
 
-def _print_result(run: RenderRun, target: Path) -> None:
-    """Result table and where to look next."""
-    table = _table(run)
-    console = Terminal()
-    print_whole(console, table)
+def _numbers(run: RenderRun) -> dict[str, Any]:
+    """What ``--json`` prints: contents of the files with the main results, by their kind."""
+    parts = {"truth": run.truth_dict(), "recovered": stated(run.recovered_dict())}
+    if run.course is not None:
+        parts["course"] = run.course.to_dict()
+    if run.targets is not None:
+        parts["mtf"] = run.targets.to_dict()
+    return {kind: described(kind, data) for kind, data in parts.items()}
+
+
+def _print_result(run: RenderRun, console: Console) -> None:
+    """Result table and what to bear in mind."""
+    print_whole(console, _table(run))
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:
@@ -211,16 +169,14 @@ def _print_result(run: RenderRun, target: Path) -> None:
             f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
             highlight=False,
         )
-    for warning in run.warnings:
-        console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-    print_place(console, target)
+    print_warnings(console, run.warnings)
 
 
 def _mtf_table(targets: TargetRun) -> Table | None:
     """MTF at the Nyquist frequency from the knife edges, before -> after (true); None if there are none."""
     title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
     title += "\nbefore -> after, below it the true one"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(title)
     for head in ("", *PLACES):
         table.add_column(head, no_wrap=True)
     for name, camera in targets.cameras.items():
@@ -250,7 +206,7 @@ def _table(run: RenderRun) -> Table:
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
     if run.course is not None:
         title += f"\nat {moment(float(run.course.times[run.course.shown]))} of the course"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(title)
     table.add_column("", no_wrap=True)
     names = (name.replace("_", "\n") for name in ESTIMATORS)
     heads = ("true", *names, "sigma", "model\n- true", "in\nsigma")

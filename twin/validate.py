@@ -7,22 +7,23 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
 from optics.numerics.backend import load_backend
 from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
 from twin.run.cli import (
-    BACKEND_HELP,
     LARGEST_SEED,
+    BackendName,
+    Force,
     InputErrorText,
     check_backend,
     exit_on_terminate,
     explained,
     print_whole,
+    result_table,
 )
 from twin.run.run_folder import RunFolder
 from twin.validation import registry
@@ -75,8 +76,8 @@ def main(
         Path | None, typer.Option(readable=False, help="Run folder to make. Default: nothing is written.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise.")] = 1,
-    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
-    force: Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")] = False,
+    backend: BackendName = "llvm",
+    force: Force = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print validation.json (or the list) on stdout, and nothing else.")
     ] = False,
@@ -227,7 +228,7 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = result_table()
     table.add_column("check", no_wrap=True)
     table.add_column("claim", justify="right", no_wrap=True)
     table.add_column("measured", justify="right", no_wrap=True)

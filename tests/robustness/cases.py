@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from scenes.specs.load import SCENES, load_autocollimator_test, load_error_budget
-from twin.design import app as design
+from twin.design.__main__ import app as design
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
 from twin.render import app as render
@@ -38,7 +38,7 @@ CUTS = (
     "twin.study.study_command.local_workers",
     "twin.study.gradient.study_gradient._Traced",
     "twin.study.gradient.study_gradient._whole",
-    "twin.design.optimise",
+    "twin.design.design_run.optimise",
 )
 """Functions that begin the long computations."""
 SOONER = (

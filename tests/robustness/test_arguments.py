@@ -8,7 +8,7 @@ import pytest
 from tests.robustness.cases import cut
 from tests.robustness.fuzz import limited, listing
 from tests.twin.commands import invoke
-from twin.design import app as design
+from twin.design.__main__ import app as design
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
 from twin.render import app as render

@@ -134,12 +134,12 @@ def job_of(folder: Path, camera: dict[str, Any], instrument: dict[str, Any]) -> 
 def run_until(job: Path, backend, last: str) -> None:
     """The render command's own way up to a stage: files read, instrument built, nominal spots traced."""
 
-    def progress(stage: str) -> None:
-        if stage == last:
+    def advance(part: str, done: int, total: int) -> None:
+        if part == last:
             raise Stop
 
     with pytest.raises(Stop):
-        render_job(resolve(job), backend, progress=progress)
+        render_job(resolve(job), backend, advance=advance)
 
 
 def outcome(number: int, folder: Path, backend) -> tuple[str, str]:

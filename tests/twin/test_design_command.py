@@ -11,7 +11,7 @@ from scenes.specs.load import EXAMPLES, load_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml
-from twin.design import app
+from twin.design.__main__ import app
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"
 SHORT = """\

@@ -12,7 +12,7 @@ import pytest
 from analysis.monitor.recovery import ESTIMATORS
 from scenes.specs.resolved import resolve
 from twin.main_job.crosstalk_content import is_wrong
-from twin.main_job.render_job import render_job
+from twin.main_job.render_job import STAGES, render_job
 from twin.main_job.render_report import render_report
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import goodness, systematics
@@ -25,8 +25,18 @@ NAMESPACES = ("http://www.w3.org/1999/xlink", "http://www.w3.org/2000/svg")
 
 
 @pytest.fixture(scope="module")
-def run(backend) -> RenderRun:
-    return render_job(resolve("scenes/examples/perturb.yaml"), backend)
+def told() -> list[tuple[str, int, int]]:
+    """What the run said of its progress."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def run(backend, told) -> RenderRun:
+    return render_job(
+        resolve("scenes/examples/perturb.yaml"),
+        backend,
+        advance=lambda part, done, total: told.append((part, done, total)),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +95,10 @@ def number(text: str) -> tuple[float, float]:
     plain_text = text.strip().replace("\N{MINUS SIGN}", "-").replace("+", "")
     places = len(plain_text.partition(".")[2])
     return float(plain_text), 0.5 * 10.0**-places * (1 + 1e-6)
+
+
+def test_every_stage_is_told_when_it_begins_and_when_it_ends(run, told):
+    assert told == [(stage, done, 1) for stage in STAGES for done in (0, 1)]
 
 
 def test_well_formed_and_complete(page, parsed):

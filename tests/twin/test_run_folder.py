@@ -40,6 +40,26 @@ def write_manifest(folder: RunFolder, **other: object) -> None:
     folder.write_json(MANIFEST, {"program": "twin.test", "versions": versions(), **times, "sha256": sums, **other})
 
 
+def test_a_manifest_says_what_it_knows_in_its_own_order(tmp_path):
+    target = tmp_path / "run"
+    with RunFolder(target) as folder:
+        folder.write_text("a/b.txt", "all")
+        run_folder.write_manifest(folder, "twin.test", 1.5e9, 2.0, warnings=["mind"], only=None, seed=3, test="level")
+    manifest = json.loads((target / MANIFEST).read_text("utf-8"))
+    assert list(manifest) == [
+        *("program", "test", "versions", "seed", "only", "started_unix_s", "wall_time_s", "warnings", "sha256")
+    ]
+    assert (manifest["only"], manifest["seed"], manifest["wall_time_s"]) == (None, 3, 2.0)
+    assert set(manifest["sha256"]) == {"a/b.txt"}
+    assert is_run_folder(target)
+
+
+def test_a_manifest_refuses_what_it_does_not_know(tmp_path):
+    with pytest.raises(ValueError, match="colour, size"), RunFolder(tmp_path / "run") as folder:
+        run_folder.write_manifest(folder, "twin.test", 1.5e9, 2.0, seed=3, size=1, colour="red")
+    assert everything(tmp_path) == set()
+
+
 def test_files_appear_at_the_end_and_all_at_once(tmp_path):
     target = tmp_path / "run"
     with RunFolder(target) as folder:

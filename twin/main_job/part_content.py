@@ -1,4 +1,4 @@
-"""What the report says of image quality, of stray light and of targets."""
+"""What the report says of a series over times, of image quality, of stray light and of targets."""
 
 from __future__ import annotations
 
@@ -6,12 +6,96 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.recovery import ESTIMATORS
+from analysis.units import ARCSEC
+from scenes.specs.course import moment
 from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import PARAMETERS
 from twin.monitor.image_quality import PLACES, CameraQuality
+from twin.monitor.time_series import CourseRun
 from twin.path_tracing.path_result import Family
-from twin.run.artefact import FAR, fixed, plain, residual, residual_text, significant
+from twin.run.artefact import FAR, MINUS, decimals_for, fixed, plain, residual, residual_text, significant
 from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, PlaceTargets
+
+ANGLE_MEANING = "angle between the two lines of sight"
+
+
+def course_content(run: RenderRun) -> dict[str, Any] | None:
+    """Facts and the table of errors; None for a job without a course."""
+    course = run.course
+    if course is None:
+        return None
+    tables = []
+    for name, estimators in course.parameters.items():
+        rows = []
+        for k, p in enumerate(PARAMETERS):
+            values = {e: (v.vector[:, k] * PER_SI[k], v.sigma[:, k] * PER_SI[k]) for e, v in estimators.items()}
+            key = f"course.{name}.{p.key}"
+            rows.append(_row(key, f"{p.symbol} [{p.unit}]", p.meaning, course.truth[name][k] * PER_SI[k], values))
+        tables.append({"title": f"Camera {name}", "rows": rows})
+    if course.recovered_angle:
+        values = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in course.recovered_angle.items()}
+        row = _row("course.angle", "Δθ [arcsec]", ANGLE_MEANING, course.angle_change / ARCSEC, values)
+        tables.append({"title": "Angle between the cameras", "rows": [row]})
+    return {
+        "count": len(course.times),
+        "first": moment(float(course.times[0])),
+        "last": moment(float(course.times[-1])),
+        "shown": moment(float(course.times[course.shown])),
+        "tables": tables,
+        "worst": _worst(course),
+        "files": [f"images/{c.camera}_{c.side}_course.tiff" for c in run.experiment.path.channels],
+    }
+
+
+def _row(
+    key: str, name: str, meaning: str, true: np.ndarray, values: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> dict[str, Any]:
+    cells = []
+    finest = min(float(np.median(sigma)) for _, sigma in values.values())
+    places = decimals_for(finest)
+    for estimator in ESTIMATORS:
+        value, sigma = values[estimator]
+        error = float(np.sqrt(np.mean((value - true) ** 2)))
+        size = float(np.sqrt(np.mean(sigma**2)))
+        cells.append(
+            {
+                "key": f"{key}.{estimator}",
+                "value": fixed(error, decimals_for(size)),
+                "sigma": fixed(size, decimals_for(size)),
+                "far": size > 0 and error > FAR * size,
+            }
+        )
+    low, high = fixed(float(true.min()), places), fixed(float(true.max()), places)
+    return {"key": key, "name": name, "meaning": meaning, "true": _range(low, high), "cells": cells}
+
+
+def _range(low: str, high: str) -> str:
+    low, high = low.strip(MINUS) if not low.strip(f"{MINUS}0.") else low, high
+    return low if low == high else f"{low} … {high}"
+
+
+def _worst(course: CourseRun) -> dict[str, str]:
+    """The camera that the model reads worst in Δα, by how much, when, and how much truly happened, in arcsec."""
+    errors = {
+        name: (estimators["model"].vector[:, 0] - course.truth[name][0]) * PER_SI[0]
+        for name, estimators in course.parameters.items()
+    }
+    name = max(errors, key=lambda n: float(np.max(np.abs(errors[n]))))
+    k = int(np.argmax(np.abs(errors[name])))
+    sigma = float(course.parameters[name]["model"].sigma[k, 0]) * PER_SI[0]
+    true = float(course.truth[name][0, k]) * PER_SI[0]
+    places = decimals_for(sigma)
+    return {
+        "error": fixed(float(errors[name][k]), places, sign=True),
+        "camera": name,
+        "time": moment(float(course.times[k])),
+        "true": fixed(true, places, sign=True),
+        "sigma": fixed(sigma, places),
+    }
+
 
 WHEN = ("before", "after")
 WAVES, MICROMETRES, MTF, PERCENT = 4, 1, 4, 2
@@ -29,7 +113,7 @@ def quality_content(run: RenderRun) -> dict[str, Any] | None:
         "fields": len(quality.fields),
         "places": list(where),
         "obstruction": quality.obstruction,
-        "bodies": {name: ", ".join(camera.bodies) or "nothing" for name, camera in quality.cameras.items()},
+        "bodies": {name: ", ".join(camera.bodies) for name, camera in quality.cameras.items()},
         "rows": [_camera(name, camera, where) for name, camera in quality.cameras.items()],
     }
 
@@ -109,7 +193,7 @@ def _family(family: Family, share: float, detector: str) -> dict[str, str]:
         "share": significant(share),
         "x": x,
         "y": y,
-        "way": text or "not looked up",
+        "way": text,
         "detector": detector,
         "paths": str(family.count),
     }
@@ -209,6 +293,7 @@ def _cell(key: str, reading: EdgeReading | BarReading) -> dict[str, str]:
 
 
 def _largest_bias(run: RenderRun) -> str:
+    """By how much noise lengthens the MTF at Nyquist at most, empty when nobody knows."""
     assert run.targets is not None
     found = [
         edge.nyquist_bias
@@ -218,4 +303,4 @@ def _largest_bias(run: RenderRun) -> str:
         for edge in shots.edges.values()
     ]
     known = [bias for bias in found if bias is not None]
-    return f"at most {significant(max(known), 2, floor=0.0)}" if known else "an unknown amount"
+    return significant(max(known), 2, floor=0.0) if known else ""

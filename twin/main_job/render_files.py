@@ -1,38 +1,27 @@
-"""Files of a run folder."""
+"""The files of a run that hold its numbers and images."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from twin.main_job.render_report import write_report
 from twin.main_job.render_results import RenderRun, quality_dict, stated
-from twin.main_job.summary_figure import write_summary
 from twin.monitor.time_series import CourseRun
-from twin.pictures.scene_file import write_scene
 from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, frame_files, netcdf
-from twin.run.further_sections import further_sections
-from twin.run.page import place
 from twin.run.reference_frames import described, frames_text
-from twin.run.run_folder import MANIFEST, RunFolder
-from twin.run.versions import versions
+from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun
 
 
-def write_run(
-    run: RenderRun, folder: RunFolder, started: float, clock: float, also: Callable[[], None] = lambda: None
-) -> None:
-    """Write all files of a run into an open run folder.
+def write_data(run: RenderRun, folder: RunFolder) -> None:
+    """Write everything that a run computed: what it is of, numbers, frames and expected images.
 
     Args:
         run: what to write.
-        folder: where.
-        started: time of the start, seconds since the epoch.
-        clock: seconds that the computation took.
-        also: writes more files into the folder, before the manifest lists them all.
+        folder: an open run folder.
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
@@ -54,25 +43,6 @@ def write_run(
         _write_targets(run.targets, folder)
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
-    folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
-    sections = further_sections("render", run)
-    for artefact in (a for section in sections for a in section.artefacts):
-        folder.write_bytes(place(artefact), artefact.content())
-    folder.write_with("report.html", lambda file: write_report(run, file, sections))
-    folder.write_with("summary.png", lambda place: write_summary(run, place))
-    also()
-    manifest = {
-        "program": "twin.render",
-        "versions": versions(),
-        "backend": run.experiment.backend.name,
-        "seed": run.seed,
-        "frames": run.frames,
-        "started_unix_s": started,
-        "wall_time_s": clock,
-        "warnings": list(run.warnings),
-        "sha256": folder.checksums(),
-    }
-    folder.write_json(MANIFEST, manifest)
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:

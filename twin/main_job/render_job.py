@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -26,6 +25,7 @@ from twin.monitor.time_series import course_states, run_course, too_large
 from twin.monitor.truth import trace_truth
 from twin.path_tracing.stray_light import stray_light
 from twin.path_tracing.stray_rays import NominalPathLost
+from twin.run.procedure import Advance, silent
 from twin.targets.target_images import TargetLostError
 from twin.targets.target_measurement import check_targets, render_targets
 from twin.targets.target_result import TargetRun
@@ -50,6 +50,9 @@ STRAY = "trace ghosts and stray light"
 TARGETS = "render the targets"
 """Another one."""
 
+QUALITY = "image quality"
+"""And another."""
+
 FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
 """Said where the job asks for it."""
 
@@ -59,17 +62,13 @@ MIN_LIGHT = 0.5
 SHARP = 1.0 / 14.0
 """Wavefront error below which a nominal spot is as good as perfect, waves rms (Marechal: Strehl ratio 0.8)."""
 
-Progress = Callable[[str], None]
-Advance = Callable[[str, int, int], None]
-
 
 def render_job(
     resolved: ResolvedJob,
     backend: Backend,
     frames: int | None = None,
     seed: int | None = None,
-    progress: Progress = lambda stage: None,
-    advance: Advance = lambda part, done, total: None,
+    advance: Advance = silent,
 ) -> RenderRun:
     """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
 
@@ -78,8 +77,8 @@ def render_job(
         backend: where to trace.
         frames: per state; overrides the job's.
         seed: of all noise; overrides the job's.
-        progress: called with each of STAGES when it begins.
-        advance: told of the long parts COURSE, STRAY and TARGETS how many of how many times, paths or places are done.
+        advance: told of each of STAGES and of QUALITY when it begins and ends, and of the long parts COURSE, STRAY and
+            TARGETS how many of how many times, paths or places are done.
 
     Raises:
         InputError: an unknown node, or a perturbation so large that light misses the mirrors or a spot its CCD.
@@ -89,24 +88,25 @@ def render_job(
     # the run's config.yaml has to repeat the run, overrides included
     resolved = resolved.with_render(count, number)
     check_targets(resolved)
-    progress(STAGES[0])
+    stage = _Stages(advance)
+    stage.begin(0)
     experiment = MonitorExperiment(resolved, backend)
     check_nodes(resolved.job, experiment.instrument.nodes)
-    progress(STAGES[1])
+    stage.begin(1)
     course = resolved.job.course
     states = [experiment.state(resolved.job)] if course is None else course_states(experiment, resolved.job)
     shown = 0 if course is None else course.shown
     state = states[shown]
-    progress(STAGES[2])
+    stage.begin(2)
     try:
         focus = experiment.nominal_focus
     except (AimError, BeamMissedError) as error:
         raise _no_spots(resolved, str(error)) from error
     try:
         truth = trace_truth(experiment.instrument, backend, [state])
-        progress(STAGES[3])
+        stage.begin(3)
         calibration = experiment.calibration
-        progress(STAGES[4])
+        stage.begin(4)
         nominal = experiment.nominal_photons
         photons = experiment.path.expected_photons([state], single=False) if course is None else None
     except (AimError, BeamMissedError) as error:
@@ -120,24 +120,27 @@ def render_job(
     if resolved.job.render.stray is not None:
         stray = _stray(experiment, resolved, state, number, advance)
         nominal, photons = nominal + stray.before.photons, photons + stray.after.photons
-    progress(STAGES[5])
+    stage.begin(5)
     before = experiment.frames_before(count, number, 0.0 if stray is None else stray.before.photons)
     after = experiment.frames_after(photons, count, number, shown)
-    progress(STAGES[6])
+    stage.begin(6)
     try:
         recovery = recover(before, after, calibration, resolved.job.analysis.centroid)
     except SpotError as error:
         channels = experiment.path.channels
         reasons = "; ".join(f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items())
         raise _too_large(resolved, f"a spot cannot be measured ({reasons})") from error
-    progress(STAGES[7])
+    stage.begin(7)
     tables = crosstalk(experiment, _covariances(recovery))
+    stage.end()
     targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
     instrument = experiment.instrument
     render = resolved.job.render
     quality = None
     if render.quality:
+        advance(QUALITY, 0, 1)
         quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
+        advance(QUALITY, 1, 1)
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -165,6 +168,22 @@ def render_job(
         targets=targets,
         quality=quality,
     )
+
+
+class _Stages:
+    """Tells of each of STAGES when it begins and ends."""
+
+    def __init__(self, advance: Advance) -> None:
+        self._advance, self._now = advance, ""
+
+    def begin(self, number: int) -> None:
+        self.end()
+        self._now = STAGES[number]
+        self._advance(self._now, 0, 1)
+
+    def end(self) -> None:
+        if self._now:
+            self._advance(self._now, 1, 1)
 
 
 def _stray(

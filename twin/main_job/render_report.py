@@ -8,15 +8,15 @@ from pathlib import Path
 from markupsafe import Markup
 
 from analysis.monitor.recovery import ESTIMATORS
-from twin.main_job import course_content, crosstalk_content, part_content, report_content, report_labels
-from twin.main_job.course_content import parameters_svg, temperatures_svg
+from twin.main_job import crosstalk_content, part_content, report_content, report_labels
+from twin.main_job.course_figures import parameters_svg, temperatures_svg
 from twin.main_job.light_path_figures import footprints_svg, side_view_svg
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.spot_figures import residuals_svg, spots_svg
 from twin.main_job.target_figures import curves_svg, images_svg, pupils_svg
 from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import FAR
-from twin.run.page import environment, section_contents
+from twin.run.page import environment, reproduce, section_contents
 from twin.run.report import Section
 from twin.run.versions import versions
 
@@ -39,7 +39,7 @@ def write_report(run: RenderRun, place: Path, sections: Sequence[Section] = ()) 
 
 def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
     """The page as text."""
-    experiment = run.experiment
+    experiment, backend = run.experiment, run.experiment.backend.name
     paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
     tables = report_content.results(run)
     names = list(experiment.instrument.cameras)
@@ -60,34 +60,31 @@ def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
             figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
     if run.quality is not None and run.quality.obstruction:
         figures["pupils"] = Markup(pupils_svg(run.quality))
-    assert __package__ is not None
-    return (
-        environment(__package__)
-        .get_template(TEMPLATE)
-        .render(
-            setup=report_content.setup(run),
-            course=course_content.course_content(run),
-            stray=part_content.stray_content(run),
-            targets=part_content.target_content(run),
-            quality=part_content.quality_content(run),
-            tables=tables,
-            summary=report_content.summary(tables),
-            spots=report_content.spots(run),
-            goodness=report_content.goodness(run),
-            crosstalk=crosstalk_content.crosstalk_tables(run),
-            wrong_percent=round(100 * crosstalk_content.WRONG),
-            factors=crosstalk_content.factors(run),
-            statements=crosstalk_content.statements(run),
-            figures=figures,
-            sections=section_contents(sections),
-            labels=report_labels,
-            estimators=ESTIMATORS,
-            number=NUMBERS.get(len(ESTIMATORS), str(len(ESTIMATORS))),
-            far=f"{FAR:g}",
-            run=run,
-            pitch_um=f"{1e6 * experiment.path.pitch:g}",
-            config=run.resolved.to_yaml(),
-            versions=versions(),
-            backend=experiment.backend.name,
-        )
+    template = environment(__package__).get_template(TEMPLATE)
+    return template.render(
+        setup=report_content.setup(run),
+        course=part_content.course_content(run),
+        stray=part_content.stray_content(run),
+        targets=part_content.target_content(run),
+        quality=part_content.quality_content(run),
+        tables=tables,
+        summary=report_content.summary(tables),
+        spots=report_content.spots(run),
+        goodness=report_content.goodness(run),
+        crosstalk=crosstalk_content.crosstalk_tables(run),
+        wrong_percent=round(100 * crosstalk_content.WRONG),
+        factors=crosstalk_content.factors(run),
+        statements=crosstalk_content.statements(run),
+        figures=figures,
+        sections=section_contents(sections),
+        labels=report_labels,
+        estimators=ESTIMATORS,
+        number=NUMBERS.get(len(ESTIMATORS), str(len(ESTIMATORS))),
+        far=f"{FAR:g}",
+        run=run,
+        pitch_um=f"{1e6 * experiment.path.pitch:g}",
+        config=run.resolved.to_yaml(),
+        command=reproduce(PROGRAM, "config.yaml", f"--seed {run.seed} --frames {run.frames}", f"--backend {backend}"),
+        versions=versions(),
+        backend=backend,
     )

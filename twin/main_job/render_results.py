@@ -23,6 +23,8 @@ from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
 from twin.targets.target_result import TargetRun
 
+PROGRAM = "twin.render"
+
 
 @dataclass(frozen=True, eq=False)
 class StrayPair:

@@ -14,7 +14,7 @@ from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.specs.channel import BASE, CENTRAL_PRISM
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import CENTROID_NOTES, PARAMETERS
+from twin.main_job.report_labels import PARAMETERS
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.monitor_experiment import motions_of
 from twin.monitor.motions import ElementaryMotion
@@ -119,35 +119,31 @@ def setup(run: RenderRun) -> dict[str, Any]:
                 "look": fixed(float(np.degrees(site.look)), 2, sign=True),
                 "focal": fixed(focal, 4),
                 "f_number": fixed(focal / model.spec.entrance_pupil, 1),
-                "line": f"{line.pixels} × {plain(1e6 * line.pitch)} µm = {fixed(1e3 * line.pixels * line.pitch, 1)} mm",
+                "pixels": line.pixels,
+                "pitch_um": plain(1e6 * line.pitch),
+                "length_mm": fixed(1e3 * line.pixels * line.pitch, 1),
                 "separation": fixed(1e3 * instrument.separation[name], 2),
             }
         )
     monitor = spec.monitor
     ccd = monitor.area_ccd
-    facts = [
-        ("Instrument", f"{spec.name}: {spec.description}".rstrip(": ")),
-        (
-            "Monitor",
-            f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
-            f"{plain(1e3 * monitor.return_face.aperture)} mm wide, area CCDs at "
-            f"±{plain(float(np.degrees(monitor.field)))}° of field",
-        ),
-        (
-            "Area CCD",
-            f"{ccd.rows} × {ccd.columns} pixels of {plain(1e6 * ccd.pitch)} µm, "
-            f"{run.resolved.detector.bit_depth} bits, exposure {plain(1e3 * ccd.exposure)} ms",
-        ),
-        (
-            "Light",
-            f"{plain(1e-6 * monitor.reticle.photons_per_frame)} million photons per spot and frame expected at the CCD",
-        ),
-        ("Frames", f"{run.frames} before and {run.frames} after, seed {run.seed}"),
-        ("Spot centres", CENTROID_NOTES[run.resolved.job.analysis.centroid]),
-    ]
     return {
         "cameras": cameras,
-        "facts": facts,
+        "monitor": {
+            "wavelength_nm": plain(1e9 * monitor.wavelength),
+            "pinhole_um": plain(1e6 * monitor.reticle.pinhole),
+            "return_face_mm": plain(1e3 * monitor.return_face.aperture),
+            "field_deg": plain(float(np.degrees(monitor.field))),
+            "photons_1e6": plain(1e-6 * monitor.reticle.photons_per_frame),
+        },
+        "ccd": {
+            "rows": ccd.rows,
+            "columns": ccd.columns,
+            "pitch_um": plain(1e6 * ccd.pitch),
+            "bits": run.resolved.detector.bit_depth,
+            "exposure_ms": plain(1e3 * ccd.exposure),
+        },
+        "centroid": run.resolved.job.analysis.centroid,
         "perturbations": _perturbations(run),
         "reference": fixed(spec.temperature - ZERO_CELSIUS, 2),
         "heated": _heated(run),
@@ -164,7 +160,7 @@ def _perturbations(run: RenderRun) -> list[dict[str, str]]:
         motion = motions.get(path, Motion())
         parts = [_motion_text(motion)] if _motion_text(motion) or path not in fields else []
         parts += [_heat_text(fields[path])] if path in fields else []
-        out.append({"node": path, "motion": "; ".join(parts) or "nothing (all zero)", "pivot": motion.pivot})
+        out.append({"node": path, "motion": "; ".join(parts), "pivot": motion.pivot})
     return out
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: exit codes, errors as one sentence, and an orderly end on signals."""
+"""What the commands share: options, exit codes, errors as one sentence, and an orderly end on signals."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -29,6 +32,38 @@ from twin.run.run_folder import RunFolderError
 BAD_INPUT, INTERRUPTED = 2, 128 + signal.SIGINT
 LARGEST_SEED = 2**63 - 1
 BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
+OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first that is free), NAME that of the file."
+
+File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
+Out = Annotated[Path | None, typer.Option(readable=False, help=OUT_HELP)]
+Seed = Annotated[
+    int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything drawn; overrides the file's.")
+]
+BackendName = Annotated[str, typer.Option("--backend", help=BACKEND_HELP)]
+Force = Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user chose.
+
+    Attributes:
+        out: run folder, None for the next free one.
+        seed: None for the file's.
+        backend: where to trace.
+        force: replace the run folder.
+        as_json: print the numbers as JSON.
+        quiet: print nothing.
+    """
+
+    out: Path | None
+    seed: int | None
+    backend: str
+    force: bool
+    as_json: bool
+    quiet: bool
 
 
 class InputErrorText(Exception):
@@ -71,6 +106,11 @@ def progress_columns(width: int) -> tuple[ProgressColumn, ...]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
+
+
+def result_table(title: str | None = None) -> Table:
+    """An empty table for a result in the terminal."""
+    return Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
 
 
 def print_whole(console: Console, table: Table) -> None:

@@ -1,68 +1,139 @@
-"""What the commands that run one test have in common: options, progress, the run folder, the result in the terminal."""
+"""The one way of the commands that make a run folder: options, progress, the folder, the result in the terminal."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, TypeVar
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import Progress, TaskID
-from rich.table import Table
 
-from optics.numerics.backend import load_backend
+from optics.numerics.backend import Backend, load_backend
 from scenes.yaml.errors import InputError
-from scenes.yaml.standard_output import Terminal, print_json, to_stdout
+from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
-    BACKEND_HELP,
-    LARGEST_SEED,
+    AsJson,
+    BackendName,
+    File,
+    Force,
+    Options,
+    Out,
+    Quiet,
+    Seed,
     check_backend,
     exit_on_terminate,
     explained,
     print_place,
     print_whole,
     progress_columns,
+    result_table,
 )
 from twin.run.page import RunFacts, cell_text, write_test
-from twin.run.procedure import BenchError, Procedure, Run
+from twin.run.procedure import Advance, BenchError, Procedure, Run
 from twin.run.reference_frames import described
 from twin.run.report import Report
 from twin.run.run_folder import RunFolder, chosen
 
-File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
-Out = Annotated[Path | None, typer.Option(readable=False, help="Run folder to make. Default: runs/TEST-001, -002, ...")]
-Seed = Annotated[
-    int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything drawn; overrides the file's.")
-]
-BackendName = Annotated[str, typer.Option("--backend", help=BACKEND_HELP)]
-Force = Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+WRITE = "write the run folder"
+"""Name of the work in the progress display."""
 
 
 @dataclass(frozen=True)
-class Options:
-    """What the user chose.
+class Session:
+    """A command at work.
 
     Attributes:
-        out: run folder, None for the next free one.
-        seed: None for the file's.
+        folder: its run folder, open.
         backend: where to trace.
-        force: replace the run folder.
-        as_json: print the numbers as JSON.
-        quiet: print nothing.
+        advance: shows the user how far it is.
+        started: seconds since the epoch.
+        clock: reading of the monotonic clock then.
     """
 
-    out: Path | None
-    seed: int | None
-    backend: str
-    force: bool
-    as_json: bool
-    quiet: bool
+    folder: RunFolder
+    backend: Backend
+    advance: Advance
+    started: float
+    clock: float
+
+    @property
+    def seconds(self) -> float:
+        """Since the start."""
+        return time.monotonic() - self.clock
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a command tells in the terminal when its run folder is complete.
+
+    Attributes:
+        numbers: plain data, for ``--json``.
+        show: prints the result for a reader.
+        problem: why something asked for is not in the run folder, empty for nothing; the exit code is then 1.
+    """
+
+    numbers: Mapping[str, Any]
+    show: Callable[[Console], None]
+    problem: str = ""
+
+
+Given = TypeVar("Given")
+
+
+def run_command(
+    stem: str, options: Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
+) -> None:
+    """Read what is asked for, do it in a run folder and print what it gave.
+
+    Args:
+        stem: of the run folder's name where the user chose none.
+        options: what the user chose.
+        resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
+        work: computes and writes all files of the run folder, the manifest last. Raises InputError.
+
+    Raises:
+        typer.Exit: with the exit code of a failure, which has been told.
+    """
+    errors = Console(stderr=True)
+    with explained(errors):
+        check_backend(options.backend)
+        given = resolve()
+        folder = RunFolder(chosen(options.out, stem), options.force)
+        started, clock = time.time(), time.monotonic()
+        tracer = load_backend(options.backend)
+        hidden = options.as_json or options.quiet or not errors.is_terminal
+        with (
+            exit_on_terminate(),
+            folder,
+            Progress(*progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+        ):
+            result = work(given, Session(folder, tracer, _advance(bar), started, clock))
+    with to_stdout(errors, f"the run is complete in {folder.target}"):
+        if options.as_json:
+            print_json(result.numbers)
+        elif not options.quiet:
+            console = Terminal()
+            result.show(console)
+            print_place(console, folder.target)
+    if result.problem:
+        print_error(errors, f"{result.problem}; all else is in {folder.target}")
+        raise typer.Exit(FAILURE)
+
+
+def _advance(bar: Progress) -> Advance:
+    """Shows every part of the work as a line, from its beginning on."""
+    parts: dict[str, TaskID] = {}
+
+    def advance(part: str, done: int, total: int) -> None:
+        if part not in parts:
+            parts[part] = bar.add_task(part, total=total)
+        bar.update(parts[part], completed=done, total=total)
+
+    return advance
 
 
 def add_test(
@@ -118,41 +189,20 @@ def run_test(
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
     """
-    errors = Console(stderr=True)
-    with explained(errors):
-        check_backend(options.backend)
-        setup = procedure.resolve(file)
+
+    def work(setup: Any, session: Session) -> Result:
         number = setup.test.seed if options.seed is None else options.seed
-        folder = RunFolder(chosen(options.out, file.stem), options.force)
-        tracer = load_backend(options.backend)
-        started, clock = time.time(), time.monotonic()
-        hidden = options.as_json or options.quiet or not errors.is_terminal
-        with (
-            exit_on_terminate(),
-            folder,
-            Progress(*progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
-        ):
-            parts: dict[str, TaskID] = {}
+        try:
+            run = procedure.run(setup, session.backend, number, session.advance)
+        except BenchError as error:
+            raise _explained_at(setup.test, error) from error
+        numbers, shown = procedure.numbers(run), report(run)
+        config, name = setup.with_seed(number).to_yaml(), session.backend.name
+        facts = RunFacts(config, str(file), name, number, session.started, session.seconds, program, command)
+        write_test(procedure.kind, numbers, shown, facts, session.folder)
+        return Result(described(procedure.kind, numbers), lambda console: _print_report(shown, console))
 
-            def advance(part: str, done: int, total: int) -> None:
-                if part not in parts:
-                    parts[part] = bar.add_task(part, total=total)
-                bar.update(parts[part], completed=done, total=total)
-
-            try:
-                run = procedure.run(setup, tracer, number, advance)
-            except BenchError as error:
-                raise _explained_at(setup.test, error) from error
-            numbers, shown = procedure.numbers(run), report(run)
-            config = setup.with_seed(number).to_yaml()
-            seconds = time.monotonic() - clock
-            facts = RunFacts(config, str(file), tracer.name, number, started, seconds, program, command)
-            write_test(procedure.kind, numbers, shown, facts, folder)
-    with to_stdout(errors, f"the run is complete in {folder.target}"):
-        if options.as_json:
-            print_json(described(procedure.kind, numbers))
-        elif not options.quiet:
-            _print_report(shown, folder.target)
+    run_command(file.stem, options, lambda: procedure.resolve(file), work)
 
 
 def _explained_at(test: Any, error: BenchError) -> InputError:
@@ -162,18 +212,21 @@ def _explained_at(test: Any, error: BenchError) -> InputError:
     return result
 
 
-def _print_report(report: Report, target: Path) -> None:
+def _print_report(report: Report, console: Console) -> None:
     summary = report.summary
-    table = Table(title=report.title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(report.title)
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(head, justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
         table.add_row(*(cell_text(cell) for cell in row))
-    console = Terminal()
     print_whole(console, table)
     for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    for warning in report.warnings:
+    print_warnings(console, report.warnings)
+
+
+def print_warnings(console: Console, warnings: Sequence[str]) -> None:
+    """What the user should know before using the numbers."""
+    for warning in warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
-    print_place(console, target)

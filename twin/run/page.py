@@ -15,7 +15,7 @@ from twin.run.data_files import frame_files
 from twin.run.further_sections import further_sections
 from twin.run.reference_frames import described
 from twin.run.report import Report, Section
-from twin.run.run_folder import MANIFEST, RunFolder
+from twin.run.run_folder import RunFolder, write_manifest
 from twin.run.versions import versions
 
 SHARED = "twin.run"
@@ -26,6 +26,11 @@ def environment(package: str) -> Environment:
     """Environment that finds the templates of ``package`` and the shared ones."""
     loader = FileSystemLoader([str(files(package)), str(files(SHARED))])
     return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+def reproduce(*words: str) -> str:
+    """The command that makes a run again from its own folder: program, subcommand and options, empty ones left out."""
+    return " ".join(["python -m", *filter(None, words), "--out again"])
 
 
 def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
@@ -108,7 +113,7 @@ def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
 
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     """``report.html`` as text; its numbers are in KIND.json."""
-    options = f"--seed {facts.seed} --backend {facts.backend} --out again"
+    options = f"--seed {facts.seed} --backend {facts.backend}"
     return (
         environment(__package__)
         .get_template(TEMPLATE)
@@ -118,7 +123,7 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
             summary=artefact_content(report.summary, place(report.summary)),
             sections=section_contents(report.sections),
             facts=facts,
-            command=f"python -m {facts.program} {facts.command} config.yaml {options}",
+            command=reproduce(facts.program, facts.command, "config.yaml", options),
             versions=versions(),
         )
     )
@@ -143,15 +148,5 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
         for file, content in frame_files(name, frames, stretch=None):
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
-    manifest = {
-        "program": facts.program,
-        "test": kind,
-        "versions": versions(),
-        "backend": facts.backend,
-        "seed": facts.seed,
-        "started_unix_s": facts.started,
-        "wall_time_s": facts.seconds,
-        "warnings": list(report.warnings),
-        "sha256": folder.checksums(),
-    }
-    folder.write_json(MANIFEST, manifest)
+    told = {"test": kind, "backend": facts.backend, "seed": facts.seed, "warnings": list(report.warnings)}
+    write_manifest(folder, facts.program, facts.started, facts.seconds, **told)

@@ -12,11 +12,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from twin.run.unfinished import OLD, PARTIAL, Unfinished, sweep
+from twin.run.versions import versions
 
 MANIFEST = "manifest.json"
 STUDY_STATE = "study_state.json"
@@ -235,29 +236,88 @@ def _inside(name: str) -> str:
 
 
 class Manifest(BaseModel):
-    """What all programs write into their manifest. Other people's programs call their files manifest.json as well.
+    """All that manifests say, in the order in which they say it; what has a default is said by some programs only.
+    Other people's programs call their files manifest.json as well.
 
     Attributes:
         program: that made the folder, ``twin.render``.
+        test: kind of the test, ``focus``.
+        gradient: the run differentiates a study.
         versions: of the twin and of what it uses.
+        backend: where it was traced.
+        seed: of all that was drawn.
+        only, fast: the checks that were chosen, None for all; whether with fewer trials.
+        frames: per state.
+        runs, failed: of a study.
         started_unix_s: when, seconds since the epoch.
         wall_time_s: that it took.
+        workers: processes.
+        worst_relative: largest relative deviation of derivatives from differences, None where none was compared.
+        warnings: what the user was told.
         sha256: checksum of every file of the run but this one.
     """
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
 
     program: Annotated[str, Field(pattern=r"^twin\.[a-z_]+$")]
+    test: str = ""
+    gradient: bool = False
     versions: Annotated[dict[str, str], AfterValidator(lambda found: _ours(found))]
+    backend: str = ""
+    seed: int = 0
+    only: str | None = None
+    fast: bool = False
+    frames: int = 0
+    runs: int = 0
+    failed: int = 0
     started_unix_s: float
     wall_time_s: float
+    workers: int = 0
+    worst_relative: float | None = None
+    warnings: list[str] = []
     sha256: dict[Annotated[str, AfterValidator(_inside)], Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
 
 
-def _ours(versions: dict[str, str]) -> dict[str, str]:
-    if "space-camera-twin" not in versions:
+def _ours(found: dict[str, str]) -> dict[str, str]:
+    if "space-camera-twin" not in found:
         raise ValueError("made by another program")
-    return versions
+    return found
+
+
+class FilesOfRun(Protocol):
+    """A folder that a run's files are written into."""
+
+    def write_json(self, name: str, data: Any) -> None:
+        """Write plain data."""
+
+    def checksums(self) -> dict[str, str]:
+        """SHA-256 of every file of the run so far."""
+
+
+def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: float, **facts: Any) -> None:
+    """Write the manifest, which lists every other file of the run; the last thing that is done in a folder.
+
+    Args:
+        folder: open.
+        program: that makes it, as the user calls it.
+        started: seconds since the epoch.
+        seconds: that it took.
+        facts: others that `Manifest` knows, in any order.
+
+    Raises:
+        ValueError: a fact that it does not know.
+    """
+    told = {
+        **facts,
+        "program": program,
+        "versions": versions(),
+        "started_unix_s": started,
+        "wall_time_s": seconds,
+        "sha256": folder.checksums(),
+    }
+    if unknown := sorted(told.keys() - Manifest.model_fields.keys()):
+        raise ValueError(f"no fact of a manifest: {', '.join(unknown)}")
+    folder.write_json(MANIFEST, {key: told[key] for key in Manifest.model_fields if key in told})
 
 
 def read_manifest(folder: Path) -> Manifest | None:

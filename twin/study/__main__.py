@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import BACKEND_HELP, explained, print_place, print_whole
+from twin.run.cli import AsJson, BackendName, Force, explained, print_place, print_whole, result_table
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError
 from twin.study.runs.engine import Progress as EngineProgress
@@ -45,14 +42,14 @@ def main(
         ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the folder if it exists.")] = False,
+    force: Force = False,
     gradient: Annotated[
         bool,
         typer.Option("--gradient", help="Differentiate the responses by the factors at the base, instead of the runs."),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Run more runs than the study's limit.")] = False,
-    backend: Annotated[str, typer.Option(help=BACKEND_HELP)] = "llvm",
-    as_json: Annotated[bool, typer.Option("--json", help="Print study.json on stdout, and nothing else.")] = False,
+    backend: BackendName = "llvm",
+    as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
 ) -> None:
     """Run a job many times with varied values and keep the numbers that matter.
@@ -75,7 +72,10 @@ def main(
     options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
     place: list[Path] = []
     if gradient:
-        _differentiate(file, options, errors, as_json, quiet)
+        # drawing libraries are not needed before
+        from twin.study.gradient_command import run_gradient
+
+        run_gradient(file, options, as_json, quiet)
         return
     with explained(errors):
         display = _Display(errors, quiet or as_json)
@@ -96,30 +96,6 @@ def main(
             print_json(run.numbers)
         elif not quiet:
             _print_result(run)
-
-
-def _differentiate(file: Path, options: StudyOptions, errors: Console, as_json: bool, quiet: bool) -> None:
-    from twin.study.gradient.gradient_report import terminal_tables
-    from twin.study.gradient_command import run_gradient
-
-    with explained(errors):
-        try:
-            with errors.status("reading the study") if not (quiet or as_json) else nullcontext() as status:
-                run = run_gradient(file, options, lambda text: status.update(text) if status is not None else None)
-        except Broken as broken:
-            print_error(errors, f"{broken}: nothing was kept")
-            raise typer.Exit(broken.code) from None
-        except OSError as error:
-            print_error(errors, error.strerror or str(error))
-            raise typer.Exit(FAILURE) from None
-    with to_stdout(errors, f"the gradient is complete in {run.folder}"):
-        if as_json:
-            print_json(run.numbers)
-        elif not quiet:
-            console = Terminal()
-            for table in terminal_tables(run.gradient):
-                print_whole(console, table)
-            print_place(console, run.folder)
 
 
 def _how_to_go_on(file: Path, place: list[Path]) -> str:
@@ -200,7 +176,7 @@ def _print_result(run: StudyRun) -> None:
 
     numbers = run.numbers
     title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = result_table(title)
     for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():

@@ -1,129 +1,72 @@
-"""What ``python -m twin.study --gradient`` does between its options and its files."""
+"""``python -m twin.study --gradient``: a study differentiated at its base."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from optics.numerics.backend import load_backend
-from twin.run.artefact import Artefact, SvgFigure
-from twin.run.cli import InputErrorText, check_backend
+from rich.console import Console
+
+from twin.run.artefact import significant
+from twin.run.cli import InputErrorText, Options, print_whole, result_table
+from twin.run.command import WRITE, Result, Session, run_command
 from twin.run.reference_frames import described
-from twin.run.run_folder import MANIFEST, RunFolder, chosen
-from twin.run.versions import versions
-from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
+from twin.run.run_folder import write_manifest
+from twin.study.gradient.gradient_numbers import gradient_numbers, whole_table
+from twin.study.gradient.gradient_report import response_table, write_report
+from twin.study.gradient.study_gradient import Gradient, study_gradient
 from twin.study.runs.setup import StudySetup, resolve_study
 from twin.study.runs.study_folder import PROGRAM
-from twin.study.study_command import StudyOptions, broken_by_signals
-
-TEMPLATE = "gradient.html.j2"
+from twin.study.study_command import StudyOptions
 
 
-@dataclass(frozen=True, eq=False)
-class GradientRun:
-    """A differentiated study.
-
-    Attributes:
-        gradient: the Jacobian.
-        numbers: contents of gradient.json.
-        folder: where it is.
-    """
-
-    gradient: Gradient
-    numbers: dict[str, Any]
-    folder: Path
-
-
-def run_gradient(file: Path, options: StudyOptions, advance: Callable[[str], None] = lambda text: None) -> GradientRun:
-    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report.
+def run_gradient(file: Path, options: StudyOptions, as_json: bool, quiet: bool) -> None:
+    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, print what they say.
 
     Args:
         file: of the study, or a config.yaml.
         options: what the user chose.
-        advance: told what is being done.
+        as_json: print the numbers as JSON.
+        quiet: print nothing.
 
     Raises:
-        InputError, InputErrorText, RunFolderError: bad input; nothing that was there is lost.
-        Broken: SIGINT, SIGTERM or SIGHUP; nothing is kept.
+        typer.Exit: with the exit code of a failure, which has been told.
     """
-    check_backend(options.backend)
-    for given, name in (
-        (options.workers is not None, "--workers"),
-        (options.scheduler is not None, "--scheduler"),
-        (options.resume, "--resume"),
-        (options.confirmed, "--yes"),
-    ):
-        if given:
-            raise InputErrorText(f"--gradient differentiates at the base in this process, so {name} has no meaning")
-    setup = resolve_study(file)
-    started, began = time.time(), time.perf_counter()
-    with broken_by_signals(), RunFolder(chosen(options.out, f"{file.stem}-gradient"), options.force) as folder:
-        found = study_gradient(setup, load_backend(options.backend), advance)
-        advance("writing the report")
-        from twin.study.gradient.gradient_report import plain_data, whole_table
 
-        numbers = described("gradient", plain_data(found))
-        folder.write_text("config.yaml", setup.to_yaml())
-        folder.write_json("gradient.json", numbers)
-        folder.write_bytes("gradient.csv", whole_table(found).content())
-        _write_report(found, setup, folder)
-        manifest = {
-            "program": PROGRAM,
-            "gradient": True,
-            "versions": versions(),
-            "backend": options.backend,
-            "started_unix_s": started,
-            "wall_time_s": time.perf_counter() - began,
-            "worst_relative": found.worst,
-            "sha256": folder.checksums(),
-        }
-        folder.write_json(MANIFEST, manifest)
-    return GradientRun(found, numbers, folder.target)
+    def resolve() -> StudySetup:
+        for given, name in (
+            (options.workers is not None, "--workers"),
+            (options.scheduler is not None, "--scheduler"),
+            (options.resume, "--resume"),
+            (options.confirmed, "--yes"),
+        ):
+            if given:
+                raise InputErrorText(f"--gradient differentiates at the base in this process, so {name} has no meaning")
+        return resolve_study(file)
+
+    shared = Options(options.out, None, options.backend, options.force, as_json, quiet)
+    run_command(f"{file.stem}-gradient", shared, resolve, _work)
 
 
-def _write_report(found: Gradient, setup: StudySetup, folder: RunFolder) -> None:
-    # drawing libraries are not needed before
-    from twin.run.artefact import significant
-    from twin.run.page import artefact_content, environment, place
-    from twin.run.svg import look, to_svg
-    from twin.study.gradient.gradient_report import doubtful, factor_rows, heat_map, response_table, tornado
+def _work(setup: StudySetup, session: Session) -> Result:
+    found = study_gradient(setup, session.backend, session.advance)
+    session.advance(WRITE, 0, 1)
+    folder, numbers = session.folder, described("gradient", gradient_numbers(found))
+    folder.write_text("config.yaml", setup.to_yaml())
+    folder.write_json("gradient.json", numbers)
+    folder.write_bytes("gradient.csv", whole_table(found).content())
+    write_report(setup, found, folder)
+    told = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    write_manifest(folder, PROGRAM, session.started, session.seconds, **told)
+    return Result(numbers, lambda console: _print_result(found, console))
 
-    with look("gradient"):
-        figures = [
-            SvgFigure(
-                "heat-map",
-                "Which factor moves which response",
-                "Change of each response per spread of each factor, as a share of the response's largest one; the "
-                "scale is logarithmic above 0.001.",
-                to_svg(heat_map(found)),
-            ),
-            SvgFigure(
-                "tornado",
-                "Largest changes",
-                "Change of each response when a factor rises by its spread, the largest first; in brackets the root of "
-                "the sum of squares over all factors.",
-                to_svg(tornado(found)),
-            ),
-        ]
-    tables: list[Artefact] = [response_table(found), factor_rows(found)]
-    for artefact in (*figures, *tables):
-        folder.write_bytes(place(artefact), artefact.content())
-    page = (
-        environment(__package__)
-        .get_template(TEMPLATE)
-        .render(
-            study=setup.study,
-            found=found,
-            exact=int((found.method == AD).sum()),
-            entries=found.method.size,
-            worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
-            doubtful=doubtful(found),
-            tables=[artefact_content(a, place(a)) for a in tables],
-            figures=[artefact_content(a, place(a)) for a in figures],
-            versions=versions(),
-        )
-    )
-    folder.write_text("report.html", page)
+
+def _print_result(found: Gradient, console: Console) -> None:
+    worst = f"; AD and differences agree to {significant(found.worst, 3, floor=0.0)}" if found.worst is not None else ""
+    table = result_table(f"{len(found.responses)} responses by {len(found.factors)} factors{worst}")
+    picked = [0, 1, 2, 3, 4, 5, 8]
+    heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
+    for head, k in zip(heads, picked, strict=True):
+        table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
+    for row in response_table(found).rows:
+        table.add_row(*(str(row[k]) for k in picked))
+    print_whole(console, table)

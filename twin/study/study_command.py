@@ -13,14 +13,14 @@ from typing import Any
 
 from optics.numerics.threads import cores
 from twin.run.cli import InputErrorText, check_backend, ending_signals
-from twin.run.run_folder import RunFolderError, chosen
+from twin.run.run_folder import RunFolderError, chosen, write_manifest
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import LEAST_MEMORY, Workers, local_workers, remote_workers
 from twin.study.runs.engine import Engine, Progress, fit_workers
 from twin.study.runs.plan import Plan
 from twin.study.runs.sampling import run_count
 from twin.study.runs.setup import StudySetup, resolve_study
-from twin.study.runs.study_folder import StudyFolder
+from twin.study.runs.study_folder import PROGRAM, StudyFolder
 
 
 @dataclass(frozen=True)
@@ -132,11 +132,16 @@ def run_study(
             else:
                 progress.done(store.runs, plan.runs)
             # drawing libraries and the like are not needed before
-            from twin.study.study_files import StudyFacts, write_study
+            from twin.study.report.study_report import write_report
+            from twin.study.study_files import write_data
 
-            facts = StudyFacts(options.backend, started, engine.seconds, engine.computed, count, tuple(warnings))
-            numbers = write_study(plan, store.result(), facts, folder)
-    return StudyRun(numbers, folder.path, plan, tuple(warnings))
+            result = store.result()
+            numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
+            write_report(numbers.data, plan, folder.path, numbers.files)
+            told = {"backend": options.backend, "seed": setup.study.design.seed, "workers": count, "warnings": warnings}
+            told |= {"runs": plan.runs, "failed": int(result.failed.sum())}
+            write_manifest(folder, PROGRAM, started, engine.seconds, **told)
+    return StudyRun(numbers.summary, folder.path, plan, tuple(warnings))
 
 
 def _check_size(setup: StudySetup, confirmed: bool) -> None:

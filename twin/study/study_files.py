@@ -15,11 +15,9 @@ import xarray as xr
 from twin.run.data_files import csv_table, netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import MANIFEST
-from twin.run.versions import versions
-from twin.study.report.study_report import write_report
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.plan import Plan
-from twin.study.runs.study_folder import PROGRAM, StudyFolder
+from twin.study.runs.study_folder import StudyFolder
 
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
@@ -152,41 +150,40 @@ def _statistics(values: np.ndarray) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class StudyFacts:
-    """How a study was run; the only things in its folder that are not the same each time.
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """What a study gave.
 
     Attributes:
-        backend: where it was traced.
-        started: seconds since the epoch.
-        seconds: that this command took for the runs it computed.
-        computed: number of these.
-        workers: processes.
-        warnings: what the user was told.
+        data: of every run, as `make_dataset` makes it.
+        summary: contents of study.json.
+        files: names of the files that hold the data.
     """
 
-    backend: str
-    started: float
-    seconds: float
-    computed: int
-    workers: int
-    warnings: tuple[str, ...]
+    data: xr.Dataset
+    summary: dict[str, Any]
+    files: tuple[str, ...]
 
 
-def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: StudyFolder) -> dict[str, Any]:
-    """Write the data set in all FORMATS, study.json, report.html and, last, the manifest.
+def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: StudyFolder) -> Numbers:
+    """Write the data set in all FORMATS, and study.json; the folder is no longer a complete study's until its
+    manifest is written.
 
-    Returns:
-        Contents of study.json.
+    Args:
+        plan: the study.
+        result: of all its runs.
+        seconds: that this command took for the runs it computed.
+        computed: number of these.
+        folder: of the study.
     """
     data = make_dataset(plan, result)
     numbers = described(
         "study",
         {
             **summary(data, plan),
-            "seconds": facts.seconds,
-            "runs_computed": facts.computed,
-            "states_per_second": facts.computed / facts.seconds if facts.computed else None,
+            "seconds": seconds,
+            "runs_computed": computed,
+            "states_per_second": computed / seconds if computed else None,
             "worker_seconds": result.seconds,
         },
     )
@@ -199,19 +196,4 @@ def write_study(plan: Plan, result: BlockResult, facts: StudyFacts, folder: Stud
             files.append(f"study.{ending}")
             folder.write(files[-1], content)
     folder.write_json("study.json", numbers)
-    write_report(data, plan, folder.path, files)
-    manifest = {
-        "program": PROGRAM,
-        "versions": versions(),
-        "backend": facts.backend,
-        "seed": plan.setup.study.design.seed,
-        "runs": plan.runs,
-        "failed": int(result.failed.sum()),
-        "started_unix_s": facts.started,
-        "wall_time_s": facts.seconds,
-        "workers": facts.workers,
-        "warnings": list(facts.warnings),
-        "sha256": folder.checksums(),
-    }
-    folder.write_json(MANIFEST, manifest)
-    return numbers
+    return Numbers(data, numbers, tuple(files))

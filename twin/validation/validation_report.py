@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from twin.run.artefact import PngFigure, SvgFigure, decimals_for, fixed, plain, significant
-from twin.run.page import artefact_content, environment
-from twin.run.run_folder import MANIFEST, RunFolder
+from twin.run.page import artefact_content, environment, reproduce
+from twin.run.run_folder import RunFolder, write_manifest
 from twin.run.versions import versions
 from twin.validation.checks.check import (
     AGREED,
@@ -28,6 +28,7 @@ from twin.validation.checks.check import (
 )
 from twin.validation.runner import GroupRun, Validation
 
+PROGRAM = "twin.validate"
 SUMMARY = "summary"
 """Folder of the summary in the run folder."""
 PAGE = "README.md"
@@ -189,9 +190,9 @@ def duration_text(seconds: float) -> str:
 
 def command(validation: Validation) -> str:
     """What repeats this validation."""
-    only = "" if validation.only is None else f" --only {validation.only.replace(' ', '')}"
-    fast = " --fast" if validation.fast else ""
-    return f"python -m twin.validate{only}{fast} --seed {validation.seed} --backend {validation.backend} --out again"
+    only = "" if validation.only is None else f"--only {validation.only.replace(' ', '')}"
+    fast = "--fast" if validation.fast else ""
+    return reproduce(PROGRAM, only, fast, f"--seed {validation.seed} --backend {validation.backend}")
 
 
 def measured_text(result: CheckResult) -> str:
@@ -275,15 +276,5 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     folder.write_text("validation.html", render_report(validation))
     for name, content in summary_files(validation).items():
         folder.write_bytes(f"{SUMMARY}/{name}", content)
-    manifest = {
-        "program": "twin.validate",
-        "versions": versions(),
-        "backend": validation.backend,
-        "seed": validation.seed,
-        "only": validation.only,
-        "fast": validation.fast,
-        "started_unix_s": validation.started,
-        "wall_time_s": validation.seconds,
-        "sha256": folder.checksums(),
-    }
-    folder.write_json(MANIFEST, manifest)
+    told = {"backend": validation.backend, "seed": validation.seed, "only": validation.only, "fast": validation.fast}
+    write_manifest(folder, PROGRAM, validation.started, validation.seconds, **told)

@@ -1,85 +1,73 @@
-"""The Jacobian of a study as data, tables and figures."""
+"""The Jacobian of a study as figures, tables and a report."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
-from rich import box
-from rich.table import Table as RichTable
 
 from scenes.yaml.errors import key_text
-from twin.run.artefact import Cell, Table, plain, significant
-from twin.run.svg import BLUE, INK, LIGHT, VERMILION, new_figure
+from twin.run.artefact import Artefact, Cell, SvgFigure, Table, plain, significant
+from twin.run.page import artefact_content, environment, place, reproduce
+from twin.run.run_folder import RunFolder
+from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
+from twin.run.versions import versions
+from twin.study.gradient.gradient_numbers import doubtful, unit_text
 from twin.study.gradient.study_gradient import AD, Gradient
 from twin.study.report.study_figures import finish
 from twin.study.report.study_runs import typeset
+from twin.study.runs.setup import StudySetup
+from twin.study.runs.study_folder import PROGRAM
 
-DOUBTFUL = 0.01
-"""Differences that Richardson's extrapolation moved by more than this share of a response's largest change are told."""
-
-
-def unit_text(response: str, factor: str) -> str:
-    """Unit of a derivative."""
-    if not factor:
-        return response or "1"
-    return f"{response or '1'}/{factor}" if "/" not in factor else f"{response or '1'}/({factor})"
+TEMPLATE = "gradient.html.j2"
 
 
-def plain_data(found: Gradient) -> dict[str, Any]:
-    """Contents of gradient.json; rows are responses, columns factors."""
-    units = [[unit_text(unit, factor.unit) for factor in found.factors] for unit in found.units]
-    return {
-        "responses": list(found.responses),
-        "factors": [factor.name for factor in found.factors],
-        "response_units": list(found.units),
-        "factor_units": [factor.unit for factor in found.factors],
-        "base": [factor.value for factor in found.factors],
-        "spread": [factor.spread for factor in found.factors],
-        "spread_of": [factor.spread_of for factor in found.factors],
-        "units": units,
-        "ad": _rows(found.ad),
-        "differences": _rows(found.differences),
-        "difference_error": _rows(found.error),
-        "step": _rows(found.step),
-        "relative": _rows(found.relative),
-        "worst_relative": found.worst,
-        "change": _rows(found.change),
-        "method": found.method.tolist(),
-    }
+def write_report(setup: StudySetup, found: Gradient, folder: RunFolder) -> None:
+    """Write report.html, its figures and tables into an open run folder.
 
-
-def _rows(table: np.ndarray) -> list[list[float | None]]:
-    return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in table]
-
-
-HEADS = (
-    "response",
-    "factor",
-    "unit",
-    "method",
-    "AD",
-    "differences",
-    "relative deviation",
-    "extrapolated by",
-    "step",
-    "change per spread",
-)
-
-
-def whole_table(found: Gradient) -> Table:
-    """Every entry of the Jacobian, a row each."""
-    rows: list[list[Cell]] = []
-    numbers = (found.ad, found.differences, found.relative, found.error, found.step, found.change)
-    for i, response in enumerate(found.responses):
-        for k, factor in enumerate(found.factors):
-            cells = [None if np.isnan(table[i, k]) else float(table[i, k]) + 0.0 for table in numbers]
-            unit = unit_text(found.units[i], factor.unit)
-            rows.append([response, factor.name, unit, str(found.method[i, k]), *cells])
-    return Table("gradient", "Jacobian", "All entries.", HEADS, rows)
+    Args:
+        setup: the study.
+        found: its Jacobian.
+        folder: where.
+    """
+    with look("gradient"):
+        figures = [
+            SvgFigure(
+                "heat-map",
+                "Which factor moves which response",
+                "Change of each response per spread of each factor, as a share of the response's largest one; the "
+                "scale is logarithmic above 0.001.",
+                to_svg(heat_map(found)),
+            ),
+            SvgFigure(
+                "tornado",
+                "Largest changes",
+                "Change of each response when a factor rises by its spread, the largest first; in brackets the root of "
+                "the sum of squares over all factors.",
+                to_svg(tornado(found)),
+            ),
+        ]
+    tables: list[Artefact] = [response_table(found), factor_rows(found)]
+    for artefact in (*figures, *tables):
+        folder.write_bytes(place(artefact), artefact.content())
+    page = (
+        environment(__package__)
+        .get_template(TEMPLATE)
+        .render(
+            study=setup.study,
+            found=found,
+            exact=int((found.method == AD).sum()),
+            entries=found.method.size,
+            worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
+            doubtful=doubtful(found),
+            tables=[artefact_content(a, place(a)) for a in tables],
+            figures=[artefact_content(a, place(a)) for a in figures],
+            command=reproduce(PROGRAM, "config.yaml", "--gradient"),
+            versions=versions(),
+        )
+    )
+    folder.write_text("report.html", page)
 
 
 def response_table(found: Gradient) -> Table:
@@ -141,32 +129,6 @@ def factor_rows(found: Gradient) -> Table:
     heads = ("factor", "in the base", "unit", "value in the base", "spread", "steps", "method")
     caption = "Differences are central, at the step and half of it, extrapolated after Richardson."
     return Table("factors", "Factors", caption, heads, rows)
-
-
-def doubtful(found: Gradient) -> list[str]:
-    """Responses some of whose differences are not to be trusted to 1%: noise, or a step over a kink or a bend."""
-    spread = np.array([factor.spread for factor in found.factors])
-    largest = np.max(np.abs(found.change), axis=1, initial=0.0, keepdims=True)
-    bad = (found.method != AD) & (found.error * spread > DOUBTFUL * largest)
-    return [
-        f"{found.responses[i]}: by {', '.join(found.factors[k].name for k in np.flatnonzero(bad[i]))}"
-        for i in np.flatnonzero(bad.any(axis=1))
-    ]
-
-
-def terminal_tables(found: Gradient) -> list[RichTable]:
-    """What the command prints."""
-    worst = f"; AD and differences agree to {significant(found.worst, 3, floor=0.0)}" if found.worst is not None else ""
-    title = f"{len(found.responses)} responses by {len(found.factors)} factors{worst}"
-    table = RichTable(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    shown = response_table(found)
-    picked = [0, 1, 2, 3, 4, 5, 8]
-    heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
-    for head, k in zip(heads, picked, strict=True):
-        table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
-    for row in shown.rows:
-        table.add_row(*(str(row[k]) for k in picked))
-    return [table]
 
 
 MOST_BARS = 8

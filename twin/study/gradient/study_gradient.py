@@ -28,6 +28,7 @@ from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.spot_gradient import spot_gradient
 from twin.run.cli import InputErrorText
+from twin.run.procedure import Advance, silent
 from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient
 from twin.study.runs.base_job import Failure, Run
 from twin.study.runs.config_tree import leaf
@@ -147,7 +148,8 @@ SMALL = 1e-3
 share: what is zero by symmetry has no digits. An entry of a response that is a difference counts as much as the larger
 of its two terms, for the digits that they have in common are lost."""
 AD, TRACED, WHOLE = "ad", "traced differences", "differences of the whole job"
-Advance = Callable[[str], None]
+AD_PART = "automatic differentiation"
+"""Name of the work in the progress display; that of the others is their method."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,13 +264,13 @@ class _Table:
         self.method[rows, k] = method
 
 
-def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = lambda text: None) -> Gradient:
+def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silent) -> Gradient:
     """Differentiate a study at its base.
 
     Args:
         setup: the study; its design plays no part.
         backend: where to trace.
-        advance: told what is being done.
+        advance: told of each kind of derivative by how many of how many factors it is done.
 
     Raises:
         InputError: a factor or response has no number, the base's schema refuses a value beside the base's, or a
@@ -372,7 +374,7 @@ class _Traced:
         done: dict[int, np.ndarray] = {}
         for start in range(0, len(moving), TOGETHER):
             some = moving[start : start + TOGETHER]
-            self.advance(f"differences by {self.factors[some[0]].name}")
+            self.advance(TRACED, start, len(moving))
             jobs = [self._job(self.factors[k], share * steps[k]) for k in some for share in SHARES]
             try:
                 outcomes = self._outcomes(chain, jobs, rows)
@@ -382,9 +384,10 @@ class _Traced:
                 done[k] = self._numbers(outcomes[i * len(SHARES) : (i + 1) * len(SHARES)], rows)
         for k, factor in enumerate(self.factors):
             if k not in done:
-                self.advance(f"differences by {factor.name}")
+                self.advance(TRACED, k, len(self.factors))
                 done[k] = self._values(chain, factor, steps[k], rows)
             table.put(rows, k, done[k], steps[k], TRACED)
+        self.advance(TRACED, len(self.factors), len(self.factors))
 
     def _numbers(self, outcomes: Sequence[Any], rows: Sequence[int]) -> np.ndarray:
         return np.array([[self.asked[i].value(one, self.setup) for i in rows] for one in outcomes])
@@ -403,7 +406,7 @@ class _Traced:
 
     def _exact(self, chain: Chain, about: State, table: _Table) -> dict[int, float]:
         """Fill in what AD finds; the steps of the differences by these factors."""
-        self.advance("automatic differentiation")
+        self.advance(AD_PART, 0, 1)
         motions = list(dict.fromkeys(motion for slopes in table.slopes.values() for motion in slopes))
         spots: np.ndarray = np.zeros((*chain.nominal[0].shape[1:], 0))
         sight: np.ndarray = np.zeros((*chain.nominal[1].shape[1:], 0))
@@ -427,6 +430,7 @@ class _Traced:
                 if slopes
                 else PART * self.factors[k].spread
             )
+        self.advance(AD_PART, 1, 1)
         return sizes
 
     def _values(self, chain: Chain, factor: GradientFactor, step: float, rows: Sequence[int]) -> np.ndarray:
@@ -469,7 +473,7 @@ def _whole(
 ) -> None:
     """Differences of the base command's own results; all runs have the noise of the base's seed."""
     for k, factor in enumerate(factors):
-        advance(f"whole job, {factor.name}")
+        advance(WHOLE, k, len(factors))
         step = PART * factor.spread
         runs = [Run(s, factor.values(factor.value + share * step), None) for s, share in enumerate(SHARES)]
         try:
@@ -482,6 +486,7 @@ def _whole(
                 raise setup.error(text, ("factors", factor.name))
         values = np.array([[one.value(outcome, setup) for one in asked] for outcome in outcomes])
         table.put(list(rows), k, values, step, WHOLE)
+    advance(WHOLE, len(factors), len(factors))
 
 
 def _refused(setup: StudySetup, factor: GradientFactor, step: float, error: InputError) -> InputError:

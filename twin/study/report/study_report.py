@@ -12,13 +12,14 @@ import xarray as xr
 
 from scenes.specs.study import StudySpec
 from twin.run.artefact import Artefact
-from twin.run.page import artefact_content, environment, place
+from twin.run.page import artefact_content, environment, place, reproduce
 from twin.run.versions import versions
 from twin.study.report.conclusions import conclusions, design_title, warnings
 from twin.study.report.study_analysis import StudyAnalysis, plain_data, summary
 from twin.study.report.study_runs import StudyRuns
 from twin.study.report.study_sections import factor_table, own_file, response_table, sections
 from twin.study.runs.plan import Plan
+from twin.study.runs.study_folder import PROGRAM
 
 __all__ = ["summary", "write_report", "write_study_report"]
 
@@ -75,6 +76,7 @@ def write_study_report(
                 for section in parts
             ],
             files=files,
+            command=reproduce(PROGRAM, "config.yaml"),
             versions=versions(),
         )
     )

@@ -1,0 +1,1 @@
+"""Optimisation of a camera's prescription."""

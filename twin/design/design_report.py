@@ -1,0 +1,173 @@
+"""Report of an optimised camera: before and after, its layout, the wavefront error over the field, the new file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from optics.design.design_rays import trace_beams
+from optics.design.design_variables import Prescription
+from optics.design.merit_function import Judgement
+from optics.design.optimiser import Design
+from scenes.models.camera_design import prescription_of
+from twin.design.design_run import DesignRun
+from twin.run.artefact import Data, SvgFigure, Table
+from twin.run.report import Report, Section
+from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile(Data):
+    """The optimised camera as a file of the library; ``data`` is its YAML text."""
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "yaml"
+
+    def content(self) -> bytes:
+        """The file."""
+        return str(self.data).encode()
+
+
+def design_report(run: DesignRun) -> Report:
+    """Report of an optimised camera."""
+    setup, found = run.setup, run.found
+    before, after = found.before, found.after
+    worst = float(after.errors.max())
+    lead = (
+        f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
+        f"({before.errors.max():.4f} in {setup.camera.name}); its extent along the axis is "
+        f"{1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm).",
+    )
+    numbers = _numbers(before, after)
+    summary = Table("merit", "The camera before and after", "", ("", "before", "after"), numbers, (None, 4, 4))
+    fields = np.degrees(found.judge.beams.fields)
+    by_field = Table(
+        "fields",
+        "Wavefront error by field",
+        "Waves rms, piston and tilt removed; the other half of the field is the mirror image.",
+        ("x, deg", "y, deg", "before", "after"),
+        [
+            [float(x), float(y), float(b), float(a)]
+            for (x, y), b, a in zip(fields, before.errors, after.errors, strict=True)
+        ],
+        (3, 3, 4, 4),
+    )
+    changed = Table(
+        "variables",
+        "What was varied",
+        "SI units.",
+        ("variable", "before", "after"),
+        [
+            [v.name, float(prescription_of(setup.camera).value(v)), float(found.prescription.value(v))]
+            for v in found.variables
+        ],
+    )
+    names = ("scene", *found.prescription.names)
+    passages = Table(
+        "clearances",
+        "Room between beams and edges",
+        "Least distance in y of every stretch of the beams from the edge that it passes, in the plane of symmetry, mm.",
+        ("from", "to", "passes", "before", "after"),
+        [
+            [names[p.stretch], names[p.stretch + 1], names[p.surface], 1e3 * float(b), 1e3 * float(a)]
+            for p, b, a in zip(found.judge.passages, before.clearances, after.clearances, strict=True)
+        ],
+        (None, None, None, 1, 1),
+    )
+    with look("design"):
+        layout = to_svg(layout_figure(found, prescription_of(setup.camera)))
+        errors = to_svg(error_figure(found))
+    sections = (
+        Section(
+            "Layout",
+            ("Chief ray and edges of the beam of the middle of the field, in the plane of symmetry.",),
+            (SvgFigure("layout", "Before and after", "To one scale.", layout), passages),
+        ),
+        Section("Image quality", (), (SvgFigure("errors", "Wavefront error over the field", "", errors), by_field)),
+        Section(
+            "Prescription",
+            (f"{found.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
+            (
+                changed,
+                CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/library/cameras.", run.text),
+            ),
+        ),
+    )
+    facts = (("start", setup.camera.name), ("variables", str(len(found.variables))))
+    return Report(f"Design of {setup.test.name}", lead, facts, summary, sections)
+
+
+def _numbers(before: Judgement, after: Judgement) -> list[list[str | float]]:
+    def row(name: str, of: Callable[[Judgement], float]) -> list[str | float]:
+        return [name, float(of(before)), float(of(after))]
+
+    return [
+        row("wavefront error, worst field, waves rms", lambda j: j.errors.max()),
+        row("wavefront error, rms over the field, waves", lambda j: np.sqrt(np.mean(j.errors**2))),
+        row("principal distance, m", lambda j: j.principal_distance),
+        row("extent along the axis, m", lambda j: j.envelope),
+        row("least clearance, m", lambda j: j.clearances.min()),
+    ]
+
+
+_BEFORE, _AFTER = GREY, BLUE
+
+
+def layout_figure(design: Design, start: Prescription) -> Figure:
+    """Beams in the plane of symmetry, before and after, to one scale."""
+    figure = new_figure(4.4)
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    for one, prescription, title in zip(axes, (start, design.prescription), ("before", "after"), strict=True):
+        _layout(one, design, prescription)
+        one.set_title(title)
+    axes[0].set_ylabel("y, m")
+    return figure
+
+
+def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
+    rays = trace_beams(design.judge.backend, prescription, design.judge.beams)
+    points = rays.points[..., 1:].copy()  # y, z of (K + 1, F, N)
+    first, then = rays.points[0], rays.points[1]
+    z = 1.25 * rays.points[1:, ..., 2].min()
+    share = (z - first[..., 2]) / (then - first)[..., 2]
+    points[0] = np.stack([first[..., 1] + share * (then - first)[..., 1], np.full(share.shape, z)], axis=-1)
+    middle = np.flatnonzero(np.all(design.judge.beams.fields == 0.0, axis=1))[0]
+    for colour, ray in ((ORANGE, 0), *((GREY, n) for n in _edges(points[1, middle]))):
+        axes.plot(points[:, middle, ray, 1], points[:, middle, ray, 0], color=colour, lw=0.8)
+    for k, name in enumerate(prescription.names):
+        y = np.linspace(points[k + 1, ..., 0].min(), points[k + 1, ..., 0].max(), 60)
+        stand = prescription.stands[name]
+        sag = prescription.surfaces[name].sag(0.0, y - stand.y)
+        axes.plot(stand.z + sag, y, color=INK, lw=2.2)
+        axes.annotate(name, (float(stand.z + sag[-1]), float(y[-1])), (4, 4), textcoords="offset points")
+    axes.set_aspect("equal")
+    axes.set_xlabel("z, m")
+    plain_axes(axes)
+
+
+def _edges(hits: np.ndarray) -> tuple[int, int]:
+    """The rays (N, 2) of a beam that are farthest out in y."""
+    return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
+
+
+def error_figure(design: Design) -> Figure:
+    """Wavefront error of every field, before and after."""
+    figure = new_figure(2.9)
+    axes = figure.subplots()
+    fields = np.degrees(design.judge.beams.fields)
+    at = np.arange(len(fields))
+    axes.bar(at - 0.2, design.before.errors, 0.38, color=_BEFORE, label="before")
+    axes.bar(at + 0.2, design.after.errors, 0.38, color=_AFTER, label="after")
+    axes.set_xticks(at, [f"{x:.2f}, {y:+.2f}" for x, y in fields])
+    axes.set_xlabel("field x, y, degrees")
+    axes.set_ylabel("waves rms")
+    axes.legend(frameon=False, ncols=2, loc="upper left")
+    axes.set_ylim(0.0, 1.25 * float(max(design.before.errors.max(), design.after.errors.max())))
+    plain_axes(axes)
+    return figure
