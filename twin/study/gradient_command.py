@@ -50,7 +50,8 @@ def run_gradient(file: Path, options: StudyOptions, as_json: bool, quiet: bool) 
 def _work(setup: StudySetup, session: Session) -> Result:
     found = study_gradient(setup, session.backend, session.advance)
     session.advance(WRITE, 0, 1)
-    folder, numbers = session.folder, described("gradient", gradient_numbers(found))
+    folder = session.folder
+    numbers = described("gradient", gradient_numbers(found))
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", whole_table(found).content())
