@@ -47,13 +47,14 @@ from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.run.artefact import Table
 from twin.run.page import RunFacts, write_test
 from twin.run.report import Report, Section
-from twin.run.run_folder import RunFolder
+from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
+from twin.study.report.study_report import write_report
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
-from twin.study.study_files import StudyFacts, write_study
+from twin.study.study_files import write_data
 from twin.targets.target_images import View
 from twin.validation.checks.check import Check
 from twin.validation.checks.group import CheckGroup
@@ -459,7 +460,11 @@ def study_folder(place: Path, kind: str, runs: int = 12) -> tuple[Plan, Path]:
     values = np.stack([np.linspace(0.0, 1.0, runs), np.linspace(0.0, 1.0, runs)], axis=-1)
     result = BlockResult(values, np.full(values.shape, 0.1), ("",) * runs, 1.0)
     with StudyFolder(place / "run", setup) as folder:
-        write_study(plan, result, StudyFacts("llvm", 0.0, 1.0, runs, 1, ()), folder)
+        numbers = write_data(plan, result, 1.0, runs, folder)
+        write_report(numbers.data, plan, folder.path, numbers.files)
+        write_manifest(
+            folder, "twin.study", 0.0, 1.0, backend="llvm", seed=1, runs=runs, failed=0, workers=1, warnings=[]
+        )
     return plan, place / "run"
 
 
