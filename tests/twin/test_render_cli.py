@@ -109,7 +109,7 @@ def ready(repeated, monkeypatch):
     _, _, _, kept = repeated
     monkeypatch.setattr(command, "render_job", lambda *arguments, **options: kept[0])
     for writer in ("write_report", "write_scene", "write_summary"):
-        monkeypatch.setattr(command, writer, lambda *drawn: drawn[-1].touch())
+        monkeypatch.setattr(command, writer, lambda *drawn: next(d for d in drawn if isinstance(d, Path)).touch())
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------

@@ -282,7 +282,7 @@ MUTATIONS = (
     Mutation("001.table5.d_gamma", "spots taken as one", "budget_checks",
              "001.table5.d_beta.propagated 001.table5.d_alpha.propagated 001.table5.d_gamma.propagated "
              "001.table5.d_f.propagated 001.table5.d_f.by_table1",
-             formula(monitored_errors, "TABLE_4", lambda sound: sound * np.sqrt(2))),
+             formula(monitored_errors, "_TABLE_4", lambda sound: sound * np.sqrt(2))),
     Mutation("001.table2", "sine for cosine about Y", "table2", f"001.table2.y 001.table2.relation.y {LIMITS}",
              relation(lambda axis, unit, b, sound: np.sin(b) if (axis, unit) == ("Y", 2) else sound)),
     Mutation("001.table2", "cosine for sine about Z", "table2",
