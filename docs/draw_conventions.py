@@ -14,12 +14,12 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from optics.backend import Backend, load_backend  # noqa: E402
-from optics.system import assemble  # noqa: E402
-from optics.trace import make_rays, trace  # noqa: E402
-from scenes.camera_model import CameraModel, collimated, derive_camera, field_direction  # noqa: E402
-from scenes.instrument import InstrumentSpec  # noqa: E402
-from scenes.load import load_camera, load_instrument  # noqa: E402
+from optics.numerics.backend import Backend, load_backend  # noqa: E402
+from optics.raytrace.system import assemble  # noqa: E402
+from optics.raytrace.trace import make_rays, trace  # noqa: E402
+from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction  # noqa: E402
+from scenes.specs.instrument import InstrumentSpec  # noqa: E402
+from scenes.specs.load import load_camera, load_instrument  # noqa: E402
 
 INSTRUMENT = "gf7_pair"
 INK, CAMERA, PRESCRIPTION, PLANE, LIGHT, CCD = "#1b1f24", "#0b5cad", "#6b7280", "#b3261e", "#e6a700", "#1a7f4b"

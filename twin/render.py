@@ -18,7 +18,7 @@ from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
 from twin.main_job.render_report import write_report
 from twin.main_job.render_results import PROGRAM, RenderRun, stated
-from twin.main_job.summary_figure import write_summary
+from twin.main_job.summary_plot import write_summary
 from twin.pictures.picture import write_pictures
 from twin.pictures.picture_light import PictureError
 from twin.pictures.scene_file import write_scene

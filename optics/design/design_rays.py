@@ -15,7 +15,7 @@ from optics.design.design_variables import BIAS, Prescription, Variable
 from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
-from optics.raytrace.derivatives import push_forward
+from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import FrameNumbers, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.imaging import aim_collimated
@@ -26,7 +26,7 @@ LAUNCH_DISTANCE = 9.0
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams that a prescription is judged by.
+    """The beams that a prescription is evaluated by.
 
     Attributes:
         fields: angles x, y about the field bias, radians, (F, 2).
@@ -146,11 +146,11 @@ def _differentiated(
     fixed = -LAUNCH_DISTANCE * along_step + np.einsum("fk,vfkx->vfx", place, axes_step)
     single = assemble(prescription.assembly(), ["to_stop"])
     twice = np.repeat(chief, 2, axis=0)[None], np.repeat(along, 2, axis=0)[None]
-    slopes = push_forward(backend, single, *twice, axes.reshape(1, -1, 3)).position[0, :, :2]
+    slopes = jvp(backend, single, *twice, axes.reshape(1, -1, 3)).position[0, :, :2]
     slopes = np.swapaxes(slopes.reshape(fields, 2, 2), -1, -2)
     to_stop = prescription.tangents(variables, "to_stop")
     every = np.broadcast_to(chief, (count, fields, 3)), np.broadcast_to(along, (count, fields, 3))
-    drift = push_forward(backend, to_stop, *every, fixed, along_step).position[..., :2]
+    drift = jvp(backend, to_stop, *every, fixed, along_step).position[..., :2]
     moved = -np.linalg.solve(np.broadcast_to(slopes, (count, fields, 2, 2)), drift[..., None])[..., 0]
     chief_step = fixed + np.einsum("vfk,fkx->vfx", moved, axes)
 
@@ -163,7 +163,7 @@ def _differentiated(
     systems = prescription.tangents(variables, "imaging")
     keep = range(len(prescription.names))
     flat = (count, -1, 3)
-    pushed = push_forward(
+    pushed = jvp(
         backend,
         systems,
         np.broadcast_to(launch, shape).reshape(flat),

@@ -17,8 +17,8 @@ from optics.numerics.backend import Backend
 
 
 @dataclass(frozen=True)
-class Goals:
-    """What is asked for.
+class Operands:
+    """Operands of the merit function and its constraints.
 
     Attributes:
         wavelength: metres.
@@ -50,7 +50,7 @@ class Passage:
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
+class Evaluation:
     """A prescription's merit.
 
     Attributes:
@@ -79,29 +79,29 @@ class Judgement:
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
-    """Judges prescriptions.
+class MeritFunction:
+    """The merit function of a prescription, and what its constraints ask for.
 
     Attributes:
         backend: where to trace.
         beams: the fields and pupils.
-        goals: what is asked for.
+        operands: what is asked for.
         passages: which beams pass which surfaces.
     """
 
     backend: Backend
     beams: Beams
-    goals: Goals
+    operands: Operands
     passages: tuple[Passage, ...]
 
     @classmethod
-    def of(cls, backend: Backend, start: Prescription, beams: Beams, goals: Goals) -> Judge:
-        """A judge that takes the sides on which beams pass surfaces from the prescription ``start``.
+    def of(cls, backend: Backend, start: Prescription, beams: Beams, operands: Operands) -> MeritFunction:
+        """A merit function that takes the sides on which beams pass surfaces from the prescription ``start``.
 
         Raises:
             ValueError: no field lies on the line (y = 0) beside its centre, or the measure is unknown.
         """
-        if not _on_line(beams).any() or goals.measure not in ("wavefront", "spot"):
+        if not _on_line(beams).any() or operands.measure not in ("wavefront", "spot"):
             raise ValueError("a design needs fields on the line off its centre, and the measure wavefront or spot")
         points = trace_beams(backend, start, beams).points
         last, passages = len(points) - 1, []
@@ -113,10 +113,10 @@ class Judge:
                 y = _crossing(points[stretch], points[stretch + 1], level)[..., 0]
                 side = float(np.sign(np.mean(y) - np.mean(points[surface, ..., 1])))
                 passages.append(Passage(stretch, surface, side))
-        return cls(backend, beams, goals, tuple(passages))
+        return cls(backend, beams, operands, tuple(passages))
 
-    def judge(self, prescription: Prescription, variables: Sequence[Variable] | None = None) -> Judgement:
-        """Trace and judge a prescription, with derivatives by the variables if they are given.
+    def evaluate(self, prescription: Prescription, variables: Sequence[Variable] | None = None) -> Evaluation:
+        """Trace and evaluate a prescription, with derivatives by the variables if they are given.
 
         Raises:
             AimError, BeamMissedError: light does not get through.
@@ -126,16 +126,16 @@ class Judge:
         distance, d_distance, departure, d_departure = self._principal_distance(rays, prescription)
         extents, d_extents = _extents(rays)
         clearances = [self._clearance(rays, passage) for passage in self.passages]
-        if self.goals.distortion:
-            residuals = np.concatenate([residuals, self.goals.distortion * departure])
+        if self.operands.distortion:
+            residuals = np.concatenate([residuals, self.operands.distortion * departure])
         value = np.array([c for c, _ in clearances])
         if d_residuals is None:
-            return Judgement(residuals, errors, distance, extents, value)
-        if self.goals.distortion:
+            return Evaluation(residuals, errors, distance, extents, value)
+        if self.operands.distortion:
             assert d_departure is not None
-            d_residuals = np.concatenate([d_residuals, self.goals.distortion * d_departure], axis=1)
+            d_residuals = np.concatenate([d_residuals, self.operands.distortion * d_departure], axis=1)
         slopes = np.stack([slope for _, slope in clearances], axis=1)
-        return Judgement(residuals, errors, distance, extents, value, d_residuals, d_distance, d_extents, slopes)
+        return Evaluation(residuals, errors, distance, extents, value, d_residuals, d_distance, d_extents, slopes)
 
     def _errors(self, rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Residuals (P,), their derivatives (V, P), and errors per field (F,) in waves."""
@@ -143,8 +143,8 @@ class Judge:
         own = slice(1, 1 + nodes.count)
         weight = np.sqrt(nodes.share / len(rays.path))
         differentiate = rays.d_path is not None
-        if self.goals.measure == "spot":
-            unit = self.goals.wavelength * self._focal_ratio
+        if self.operands.measure == "spot":
+            unit = self.operands.wavelength * self._focal_ratio
             project = np.eye(nodes.count) - nodes.share
             value = (project @ rays.position[:, own, :2]) * weight[:, None] / unit
             errors = np.sqrt(np.sum(value**2, axis=(1, 2)) * len(value))
@@ -153,8 +153,8 @@ class Judge:
             assert rays.d_position is not None
             slope = (project @ rays.d_position[:, :, own, :2]) * weight[:, None] / unit
             return value.ravel(), slope.reshape(len(slope), -1), errors
-        if self.goals.measure != "wavefront":
-            raise ValueError(f"a design has no measure {self.goals.measure!r}; there are wavefront and spot")
+        if self.operands.measure != "wavefront":
+            raise ValueError(f"a design has no measure {self.operands.measure!r}; there are wavefront and spot")
         # eikonal about the chief ray's image; the exit pupil is taken as far away, which matters by offset^2 / (2 R):
         # some 1e-12 m for spots of 1 um
         offset = rays.position[:, own] - rays.position[:, :1]
@@ -163,7 +163,7 @@ class Judge:
         weighted = basis * nodes.share[:, None]
         project = np.eye(nodes.count) - basis @ np.linalg.solve(basis.T @ weighted, weighted.T)
         # the projection takes a metre of common path out; before that the mean, so that no digits are lost
-        value = (eikonal - rays.path[:, :1]) @ project.T * weight / self.goals.wavelength
+        value = (eikonal - rays.path[:, :1]) @ project.T * weight / self.operands.wavelength
         errors = np.sqrt(np.sum(value**2, axis=1) * len(value))
         if not differentiate:
             return value.ravel(), None, errors
@@ -173,12 +173,12 @@ class Judge:
         d_offset = rays.d_position[:, :, own] - rays.d_position[:, :, :1]
         slope = rays.d_path[:, :, own] - rays.d_path[:, :, :1]
         slope = slope - np.sum(rays.d_direction[:, :, own] * offset + rays.direction[:, own] * d_offset, axis=-1)
-        slope = slope @ project.T * weight / self.goals.wavelength
+        slope = slope @ project.T * weight / self.operands.wavelength
         return value.ravel(), slope.reshape(len(slope), -1), errors
 
     @property
     def _focal_ratio(self) -> float:
-        distance = self.goals.principal_distance
+        distance = self.operands.principal_distance
         return 1.0 if distance is None else distance / self.beams.diameter
 
     def _principal_distance(
@@ -210,7 +210,7 @@ class Judge:
         start, end = points[passage.stretch], points[passage.stretch + 1]
         y, share = np.moveaxis(_crossing(start, end, points[passage.surface, edge, 2]), -1, 0)
         nearest = int(np.argmin(passage.side * y))
-        value = passage.side * (y[nearest] - points[passage.surface, edge, 1]) - self.goals.edge_margin
+        value = passage.side * (y[nearest] - points[passage.surface, edge, 1]) - self.operands.edge_margin
         if rays.d_points is None:
             return value, np.empty(0)
         steps = rays.d_points.reshape(len(rays.d_points), len(points), -1, 3)

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from optics.design.design_rays import Beams
 from optics.design.design_variables import Prescription, Variable
-from optics.design.merit_function import Goals, Judge, Judgement
+from optics.design.merit_function import Evaluation, MeritFunction, Operands
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -44,50 +44,50 @@ class Design:
         prescription: what came out.
         before, after: judgements of the start and of the result.
         variables: what was varied.
-        judge: judged both; it names the passages.
+        merit: evaluated both; it names the passages.
         evaluations: traces with derivatives that it took.
     """
 
     prescription: Prescription
-    before: Judgement
-    after: Judgement
+    before: Evaluation
+    after: Evaluation
     variables: tuple[Variable, ...]
-    judge: Judge
+    merit: MeritFunction
     evaluations: int
 
 
-def constraint_values(judgement: Judgement, goals: Goals) -> tuple[np.ndarray, list[str]]:
+def constraint_values(evaluation: Evaluation, operands: Operands) -> tuple[np.ndarray, list[str]]:
     """Violations (C,), metres, positive when violated (the first, of the principal distance, in both directions), and
     what each is about.
     """
     out, names = [], []
-    if goals.principal_distance is not None:
-        out.append(judgement.principal_distance - goals.principal_distance)
+    if operands.principal_distance is not None:
+        out.append(evaluation.principal_distance - operands.principal_distance)
         names.append("principal distance")
-    if goals.envelope is not None:
+    if operands.envelope is not None:
         # one constraint for each pair of surfaces: their largest alone would have a kink wherever two pairs are equal
-        out += list(judgement.extents - goals.envelope)
-        names += ["envelope"] * len(judgement.extents)
-    if goals.clearance is not None:
-        out += list(goals.clearance - judgement.clearances)
-        names += ["clearance"] * len(judgement.clearances)
+        out += list(evaluation.extents - operands.envelope)
+        names += ["envelope"] * len(evaluation.extents)
+    if operands.clearance is not None:
+        out += list(operands.clearance - evaluation.clearances)
+        names += ["clearance"] * len(evaluation.clearances)
     return np.array(out), names
 
 
-def _constraint_slopes(judgement: Judgement, goals: Goals) -> np.ndarray:
+def _constraint_slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
     """Derivatives of the violations, (V, C)."""
-    assert judgement.d_residuals is not None
+    assert evaluation.d_residuals is not None
     columns: list[np.ndarray] = []
-    if goals.principal_distance is not None:
-        assert judgement.d_principal_distance is not None
-        columns.append(judgement.d_principal_distance)
-    if goals.envelope is not None:
-        assert judgement.d_extents is not None
-        columns += list(judgement.d_extents.T)
-    if goals.clearance is not None:
-        assert judgement.d_clearances is not None
-        columns += list(-judgement.d_clearances.T)
-    return np.stack(columns, axis=1) if columns else np.zeros((len(judgement.d_residuals), 0))
+    if operands.principal_distance is not None:
+        assert evaluation.d_principal_distance is not None
+        columns.append(evaluation.d_principal_distance)
+    if operands.envelope is not None:
+        assert evaluation.d_extents is not None
+        columns += list(evaluation.d_extents.T)
+    if operands.clearance is not None:
+        assert evaluation.d_clearances is not None
+        columns += list(-evaluation.d_clearances.T)
+    return np.stack(columns, axis=1) if columns else np.zeros((len(evaluation.d_residuals), 0))
 
 
 def optimise(
@@ -95,7 +95,7 @@ def optimise(
     start: Prescription,
     variables: Sequence[Variable],
     beams: Beams,
-    goals: Goals,
+    operands: Operands,
     steps: int = 1,
     iterations: int = 60,
     advance: Advance | None = None,
@@ -107,7 +107,7 @@ def optimise(
         start: where to begin; it must pass all light.
         variables: what may vary, and within which bounds.
         beams: fields and pupil.
-        goals: merit and constraints.
+        operands: merit and constraints.
         steps: of the envelope from the start's to the goal's.
         iterations: of least squares, at most, in each round.
         advance: told (done, total) after each round of the last step, or each step before it.
@@ -121,18 +121,18 @@ def optimise(
         if not variable.low <= value <= variable.high:
             raise DesignError(f"{variable.name} starts at {value:.6g}, outside its bounds")
     try:
-        judge = Judge.of(backend, start, beams, goals)
-        before = judge.judge(start)
+        merit = MeritFunction.of(backend, start, beams, operands)
+        before = merit.evaluate(start)
     except (AimError, BeamMissedError) as error:
         raise DesignError(f"the prescription that the design starts from passes no light: {error}") from error
     evaluations, current = 0, start
     total = steps + ROUNDS
     for step in range(1, steps + 1):
-        goal = goals
-        if goals.envelope is not None:
+        eased = operands
+        if operands.envelope is not None:
             share = step / steps
-            goal = replace(goals, envelope=before.envelope + share * (goals.envelope - before.envelope))
-        own = replace(judge, goals=goal)
+            eased = replace(operands, envelope=before.envelope + share * (operands.envelope - before.envelope))
+        own = replace(merit, operands=eased)
         shift: np.ndarray | None = None
         penalty = PENALTY
         rounds = ROUNDS if step == steps else 1
@@ -144,15 +144,15 @@ def optimise(
             if worst < HELD and turn >= 1:
                 break
             penalty *= STEEPER
-    after = judge.judge(current)
-    _require_held(judge, after)
+    after = merit.evaluate(current)
+    _require_held(merit, after)
     if advance is not None:
         advance(total, total)
-    return Design(current, before, after, variables, judge, evaluations)
+    return Design(current, before, after, variables, merit, evaluations)
 
 
 def _round(
-    judge: Judge,
+    merit: MeritFunction,
     start: Prescription,
     variables: tuple[Variable, ...],
     shift: np.ndarray | None,
@@ -160,7 +160,7 @@ def _round(
     iterations: int,
 ) -> tuple[Prescription, int, np.ndarray, float]:
     """One least-squares solution; the prescription, evaluations, new shifts and the worst violation, metres."""
-    equal = judge.goals.principal_distance is not None
+    equal = merit.operands.principal_distance is not None
     last: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     x0 = start.values(variables)
     size = np.maximum(np.abs(x0), [_SMALLEST[v.quantity] for v in variables])
@@ -169,20 +169,20 @@ def _round(
         if "at" in last and np.array_equal(last["at"][0], u):
             return last["at"][1:]
         try:
-            judged = judge.judge(start.with_values(variables, u * size), variables)
+            evaluated = merit.evaluate(start.with_values(variables, u * size), variables)
         except (AimError, BeamMissedError):
             value, slope = last["at"][1:]
             return np.full_like(value, LOST), slope
-        assert judged.d_residuals is not None
-        g, _ = constraint_values(judged, judge.goals)
+        assert evaluated.d_residuals is not None
+        g, _ = constraint_values(evaluated, merit.operands)
         shifted = g + (0.0 if shift is None else shift)
         active = shifted > 0.0
         if equal:
             active[0] = True
         bound = penalty * np.where(active, shifted, 0.0)
-        slopes = penalty * np.where(active, _constraint_slopes(judged, judge.goals), 0.0)
-        value = np.concatenate([judged.residuals, bound])
-        slope = np.concatenate([judged.d_residuals, slopes], axis=1).T * size
+        slopes = penalty * np.where(active, _constraint_slopes(evaluated, merit.operands), 0.0)
+        value = np.concatenate([evaluated.residuals, bound])
+        slope = np.concatenate([evaluated.d_residuals, slopes], axis=1).T * size
         last["at"] = (u.copy(), value, slope)
         return value, slope
 
@@ -200,7 +200,7 @@ def _round(
         gtol=1e-13,
     )
     ended = start.with_values(variables, found.x * size)
-    g, _ = constraint_values(judge.judge(ended), judge.goals)
+    g, _ = constraint_values(merit.evaluate(ended), merit.operands)
     moved = g + (0.0 if shift is None else shift)
     moved = np.concatenate([moved[: int(equal)], np.maximum(moved[int(equal) :], 0.0)]) / STEEPER
     worst = np.maximum(g, 0.0)
@@ -223,9 +223,9 @@ _SMALLEST = {
 """Least sizes by which variables are made dimensionless."""
 
 
-def _require_held(judge: Judge, after: Judgement) -> None:
+def _require_held(merit: MeritFunction, after: Evaluation) -> None:
     """Raise DesignError that names the constraints which are not held."""
-    g, names = constraint_values(after, judge.goals)
+    g, names = constraint_values(after, merit.operands)
     failed = []
     for value, name in zip(g, names, strict=True):
         if (abs(value) if name == "principal distance" else value) > 50.0 * HELD:

@@ -35,7 +35,7 @@ class RayTangents:
     traced: Traced
 
 
-def push_forward(
+def jvp(
     backend: Backend,
     systems: SystemBatch,
     position: np.ndarray,
@@ -95,7 +95,7 @@ class RayCotangents:
     direction: np.ndarray
 
 
-def pull_back(
+def vjp(
     backend: Backend,
     systems: SystemBatch,
     position: np.ndarray,

@@ -8,7 +8,7 @@ import numpy as np
 
 from optics.numerics.array_math import determinant, inverse, product
 from optics.numerics.backend import Backend
-from optics.raytrace.derivatives import push_forward
+from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import SystemBatch
 
 
@@ -63,7 +63,7 @@ def ray_matrix(
         axes: two launch axes square to the direction, (B, 2, 3).
     """
     zero = np.zeros_like(axes)
-    out = push_forward(
+    out = jvp(
         backend,
         systems,
         np.repeat(position[:, None], 4, axis=1),

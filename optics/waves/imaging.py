@@ -20,7 +20,7 @@ from optics.geometry.aperture import Circle
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import RayFan, aim, transverse_axes
-from optics.raytrace.derivatives import push_forward
+from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import require_some
 from optics.waves.diffraction import PupilField
@@ -111,7 +111,7 @@ def imaging_rays(
     # every ray twice, once for each axis of the wavefront along which its launch point is moved
     twice, heading = (np.repeat(array, 2, axis=1) for array in (launched, heading))
     moves = np.broadcast_to(axes[:, None], (*launched.shape[:2], 2, 3)).reshape(twice.shape)
-    out = push_forward(backend, systems, twice, heading, moves, keep=(stop_index,))
+    out = jvp(backend, systems, twice, heading, moves, keep=(stop_index,))
     hit, turn = (
         np.swapaxes(step[..., :2].reshape(*launched.shape[:2], 2, 2), -1, -2)
         for step in (out.hits[stop_index], out.direction)

@@ -7,7 +7,7 @@ import numpy as np
 
 from optics.design.design_rays import Beams
 from optics.design.design_variables import Prescription, Stand, Variable
-from optics.design.merit_function import Goals
+from optics.design.merit_function import Operands
 from optics.geometry.surface import Surface, plane
 from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, _even_terms
@@ -62,11 +62,11 @@ def beams_of(camera: CameraSpec) -> Beams:
     return Beams(np.array(fields), camera.entrance_pupil, quadrature.disk(_RINGS))
 
 
-def goals_of(setup: CameraDesignSetup, principal_distance: float, envelope: float) -> Goals:
+def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: float) -> Operands:
     """What is asked for, given the start's principal distance and envelope, metres."""
     largest = None if setup.test.envelope is None else setup.test.envelope * envelope
     camera = setup.camera
-    return Goals(camera.wavelength, principal_distance, largest, setup.test.clearance, camera.edge_margin)
+    return Operands(camera.wavelength, principal_distance, largest, setup.test.clearance, camera.edge_margin)
 
 
 def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:

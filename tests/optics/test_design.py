@@ -7,7 +7,7 @@ import pytest
 
 from optics.design.design_rays import beam_axes
 from optics.design.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
-from optics.design.merit_function import Goals, Judge
+from optics.design.merit_function import MeritFunction, Operands
 from optics.design.optimiser import DesignError, optimise
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 
@@ -39,14 +39,14 @@ def beams(gf7):
 
 @pytest.mark.parametrize("measure", ["wavefront", "spot"])
 def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) -> None:
-    goals = Goals(650e-9, principal_distance=5.5, measure=measure, distortion=1.0)
-    judge = Judge.of(backend, start, beams, goals)
-    exact = judge.judge(start, EVERY)
+    operands = Operands(650e-9, principal_distance=5.5, measure=measure, distortion=1.0)
+    merit = MeritFunction.of(backend, start, beams, operands)
+    exact = merit.evaluate(start, EVERY)
     compared = 0
     for k, variable in enumerate(EVERY):
         h = STEP[variable.quantity]
         value = start.value(variable)
-        high, low = (judge.judge(start.with_values([variable], np.array([value + s * h]))) for s in (1, -1))
+        high, low = (merit.evaluate(start.with_values([variable], np.array([value + s * h]))) for s in (1, -1))
         for name, rounding in (
             ("residuals", WAVES),
             ("principal_distance", METRES),
@@ -73,10 +73,10 @@ def test_axes_of_a_beam() -> None:
 def test_a_detuned_camera_comes_back(backend, gf7, beams) -> None:
     """From its own conics and from conics that are wrong by a percent gf7 gets to one optimum, no worse than itself."""
     nominal = prescription_of(gf7.spec)
-    goals = Goals(gf7.spec.wavelength)
-    best = optimise(backend, nominal, CONICS, beams, goals)
+    operands = Operands(gf7.spec.wavelength)
+    best = optimise(backend, nominal, CONICS, beams, operands)
     wrong = nominal.with_values(CONICS, nominal.values(CONICS) + np.array([0.015, -0.02, 0.01]))
-    found = optimise(backend, wrong, CONICS, beams, goals)
+    found = optimise(backend, wrong, CONICS, beams, operands)
     merit = [np.sqrt(np.sum(j.residuals**2)) for j in (best.before, best.after, found.before, found.after)]
     assert merit[1] < merit[0] < 0.03
     assert merit[2] > 20.0 * merit[0]
@@ -91,9 +91,9 @@ def test_a_detuned_camera_gets_its_focal_length_back(backend, gf7, beams) -> Non
     """The principal distance as a constraint: held to 2 um, with curvatures that made it 1 % wrong."""
     variables = [Variable("M1", "curvature"), Variable("M3", "curvature"), Variable("image", "z"), *CONICS]
     nominal = prescription_of(gf7.spec)
-    distance = Judge.of(backend, nominal, beams, Goals(650e-9)).judge(nominal).principal_distance
+    distance = MeritFunction.of(backend, nominal, beams, Operands(650e-9)).evaluate(nominal).principal_distance
     start = nominal.with_values(variables[:1], nominal.values(variables[:1]) * 1.01)
-    found = optimise(backend, start, variables, beams, Goals(650e-9, principal_distance=distance))
+    found = optimise(backend, start, variables, beams, Operands(650e-9, principal_distance=distance))
     assert abs(found.before.principal_distance - distance) > 0.01
     assert found.after.principal_distance == pytest.approx(distance, abs=2e-6)
     assert found.after.errors.max() < 0.05
@@ -103,16 +103,16 @@ def test_constraints_that_cannot_be_held(backend, gf7, beams) -> None:
     """An envelope of half the length with nothing to vary but the image plane."""
     nominal = prescription_of(gf7.spec)
     with pytest.raises(DesignError, match=r"holds all constraints: envelope \(off by 1.* mm\); allow a longer"):
-        optimise(backend, nominal, [Variable("image", "z")], beams, Goals(650e-9, envelope=1.0), iterations=10)
+        optimise(backend, nominal, [Variable("image", "z")], beams, Operands(650e-9, envelope=1.0), iterations=10)
 
 
 def test_a_start_outside_its_bounds_or_without_light(backend, gf7, beams) -> None:
     nominal = prescription_of(gf7.spec)
     with pytest.raises(DesignError, match=r"M1 conic starts at -1\.51.*outside its bounds"):
-        optimise(backend, nominal, [Variable("M1", "conic", low=-1.0)], beams, Goals(650e-9))
+        optimise(backend, nominal, [Variable("M1", "conic", low=-1.0)], beams, Operands(650e-9))
     lost = nominal.with_values([Variable("M1", "curvature")], np.array([1.5]))
     with pytest.raises(DesignError, match="passes no light"):
-        optimise(backend, lost, CONICS, beams, Goals(650e-9))
+        optimise(backend, lost, CONICS, beams, Operands(650e-9))
 
 
 def test_numbers_of_a_prescription(start) -> None:

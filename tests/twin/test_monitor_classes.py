@@ -32,7 +32,7 @@ def off_middle(path: MonitorPath, wanted: float) -> State:
     half = 0.5 * np.array(path.shape)
 
     def excess(by: float) -> float:
-        place = path.scouted([shifted(path, by)]).place
+        place = path.coarse_trace([shifted(path, by)]).place
         return float(np.max(np.linalg.norm(np.abs(place) + half, axis=-1)) / np.linalg.norm(half) - wanted)
 
     return shifted(path, brentq(excess, 0.0, 0.5 * path.pitch * half[0] * wanted, xtol=1e-11))
@@ -47,7 +47,7 @@ def setup(request, experiment):
 def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     path = setup.path
     inner, outer = (off_middle(path, 1.0 + SPOT_RANGES[number] + side * 2e-5) for side in (-1, 1))
-    chosen = path.class_of(path.scouted([inner, outer]).place)
+    chosen = path.class_of(path.coarse_trace([inner, outer]).place)
     assert chosen.tolist() == [number, number + 1]
     assert path.classes[number].nodes.count < 0.85 * path.classes[number + 1].nodes.count
     fine = MonitorPath(path.instrument, path.backend, quadrature.disk(30, 120))
@@ -81,7 +81,7 @@ def test_a_state_has_its_class_in_any_company(setup) -> None:
     path = setup.path
     states = [off_middle(path, 1.0 + share) for share in (0.1, 0.4, 0.7, 0.2)]
     together = path.expected_photons(states)
-    assert path.class_of(path.scouted(states).place).tolist() == [0, 1, 2, 0]
+    assert path.class_of(path.coarse_trace(states).place).tolist() == [0, 1, 2, 0]
     for state, image in zip(states, together, strict=True):
         alone = path.expected_photons([state])[0]
         # the compiler may contract other products; then sums in single precision round elsewhere
@@ -96,10 +96,10 @@ def test_margin_counts_as_distance(setup) -> None:
 
 
 def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
-    """Rays turned as the few scouted ones say, against rays that are aimed one by one from the nominal ones."""
+    """Rays turned as the few coarse ones say, against rays that are aimed one by one from the nominal ones."""
     states = [{f"{BASE}/forward/M2": Motion(shift=(2e-6, -3e-6, 4e-6), rotate=(3e-6, 1e-6, 0.0), pivot="centre")}]
     path = setup.path
-    known = path.scouted(states)
+    known = path.coarse_trace(states)
     path.rays(states, known)  # nominal rays are aimed before calls are counted
     calls = []
 

@@ -17,7 +17,7 @@ from twin.main_job.render_report import render_report
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import goodness, systematics
 from twin.main_job.report_labels import PARAMETERS
-from twin.main_job.summary_figure import write_summary
+from twin.main_job.summary_plot import write_summary
 from twin.run.artefact import FAR, decimals_for, fixed, plain, residual_text, significant
 
 VOID = {"meta", "br", "hr", "img", "input", "link", "col", "wbr"}

@@ -124,8 +124,8 @@ def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, bac
     found = spots(path, path.rays(states))
     assert np.abs(found).max() > 15.0
     np.testing.assert_allclose(found[:, 1:] - found[:, :1], 0.0, rtol=0, atol=PIXELS)
-    scouted = path.scouted(states).place
-    np.testing.assert_allclose(scouted[:, 1:] - scouted[:, :1], 0.0, rtol=0, atol=PIXELS)
+    coarse = path.coarse_trace(states).place
+    np.testing.assert_allclose(coarse[:, 1:] - coarse[:, :1], 0.0, rtol=0, atol=PIXELS)
 
 
 @pytest.mark.parametrize("camera", ["gf7", "monitor"])

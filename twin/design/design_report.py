@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from optics.design.design_rays import trace_beams
 from optics.design.design_variables import Prescription
-from optics.design.merit_function import Judgement
+from optics.design.merit_function import Evaluation
 from optics.design.optimiser import Design
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DesignRun
@@ -46,7 +46,7 @@ def design_report(run: DesignRun) -> Report:
     )
     numbers = _numbers(before, after)
     summary = Table("merit", "The camera before and after", "", ("", "before", "after"), numbers, (None, 4, 4))
-    fields = np.degrees(found.judge.beams.fields)
+    fields = np.degrees(found.merit.beams.fields)
     by_field = Table(
         "fields",
         "Wavefront error by field",
@@ -76,7 +76,7 @@ def design_report(run: DesignRun) -> Report:
         ("from", "to", "passes", "before", "after"),
         [
             [names[p.stretch], names[p.stretch + 1], names[p.surface], 1e3 * float(b), 1e3 * float(a)]
-            for p, b, a in zip(found.judge.passages, before.clearances, after.clearances, strict=True)
+            for p, b, a in zip(found.merit.passages, before.clearances, after.clearances, strict=True)
         ],
         (None, None, None, 1, 1),
     )
@@ -103,8 +103,8 @@ def design_report(run: DesignRun) -> Report:
     return Report(f"Design of {setup.test.name}", lead, facts, summary, sections)
 
 
-def _numbers(before: Judgement, after: Judgement) -> list[list[str | float]]:
-    def row(name: str, of: Callable[[Judgement], float]) -> list[str | float]:
+def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
+    def row(name: str, of: Callable[[Evaluation], float]) -> list[str | float]:
         return [name, float(of(before)), float(of(after))]
 
     return [
@@ -131,13 +131,13 @@ def layout_figure(design: Design, start: Prescription) -> Figure:
 
 
 def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
-    rays = trace_beams(design.judge.backend, prescription, design.judge.beams)
+    rays = trace_beams(design.merit.backend, prescription, design.merit.beams)
     points = rays.points[..., 1:].copy()  # y, z of (K + 1, F, N)
     first, then = rays.points[0], rays.points[1]
     z = 1.25 * rays.points[1:, ..., 2].min()
     share = (z - first[..., 2]) / (then - first)[..., 2]
     points[0] = np.stack([first[..., 1] + share * (then - first)[..., 1], np.full(share.shape, z)], axis=-1)
-    middle = np.flatnonzero(np.all(design.judge.beams.fields == 0.0, axis=1))[0]
+    middle = np.flatnonzero(np.all(design.merit.beams.fields == 0.0, axis=1))[0]
     for colour, ray in ((ORANGE, 0), *((GREY, n) for n in _edges(points[1, middle]))):
         axes.plot(points[:, middle, ray, 1], points[:, middle, ray, 0], color=colour, lw=0.8)
     for k, name in enumerate(prescription.names):
@@ -160,7 +160,7 @@ def error_figure(design: Design) -> Figure:
     """Wavefront error of every field, before and after."""
     figure = new_figure(2.9)
     axes = figure.subplots()
-    fields = np.degrees(design.judge.beams.fields)
+    fields = np.degrees(design.merit.beams.fields)
     at = np.arange(len(fields))
     axes.bar(at - 0.2, design.before.errors, 0.38, color=_BEFORE, label="before")
     axes.bar(at + 0.2, design.after.errors, 0.38, color=_AFTER, label="after")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.design.merit_function import Goals, Judge
+from optics.design.merit_function import MeritFunction, Operands
 from optics.design.optimiser import Design, DesignError, optimise
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
@@ -17,7 +17,7 @@ from scenes.models.camera_design import (
     beams_of,
     camera_file,
     camera_of,
-    goals_of,
+    operands_of,
     prescription_of,
     resolve_design,
     variables_of,
@@ -54,18 +54,18 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
     test, camera = setup.test, setup.camera
     start, beams = prescription_of(camera), beams_of(camera)
     try:
-        first = Judge.of(backend, start, beams, Goals(camera.wavelength)).judge(start)
+        first = MeritFunction.of(backend, start, beams, Operands(camera.wavelength)).evaluate(start)
     except (AimError, BeamMissedError) as error:
         problem = f"no beams to design with come through: {str(error).partition(';')[0]}"
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
-    goals = goals_of(setup, first.principal_distance, first.envelope)
+    operands = operands_of(setup, first.principal_distance, first.envelope)
     try:
         found = optimise(
             backend,
             start,
             variables_of(test),
             beams,
-            goals,
+            operands,
             test.steps,
             advance=lambda done, total: advance("optimise", done, total),
         )
@@ -90,7 +90,7 @@ def design_numbers(run: DesignRun) -> dict[str, Any]:
         "camera": setup.test.name,
         "start": setup.camera.name,
         "wavefront_error_waves": {"before": before.errors.tolist(), "after": after.errors.tolist()},
-        "fields_deg": np.degrees(found.judge.beams.fields).tolist(),
+        "fields_deg": np.degrees(found.merit.beams.fields).tolist(),
         "principal_distance_m": {"before": before.principal_distance, "after": after.principal_distance},
         "envelope_m": {"before": before.envelope, "after": after.envelope},
         "clearance_m": {"before": before.clearances.tolist(), "after": after.clearances.tolist()},

@@ -10,8 +10,8 @@ import numpy as np
 from analysis.units import ARCMIN
 from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment
-from twin.laboratory.focus_figures import defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.laboratory.focus_numbers import focus_numbers
+from twin.laboratory.focus_plots import defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.run.artefact import SvgFigure, Table, fixed
 from twin.run.report import Report, Section
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK

@@ -9,11 +9,11 @@ from markupsafe import Markup
 
 from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job import crosstalk_content, part_content, report_content, report_labels
-from twin.main_job.course_figures import parameters_svg, temperatures_svg
-from twin.main_job.light_path_figures import footprints_svg, side_view_svg
+from twin.main_job.course_plots import parameters_svg, temperatures_svg
+from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
-from twin.main_job.spot_figures import residuals_svg, spots_svg
-from twin.main_job.target_figures import curves_svg, images_svg, pupils_svg
+from twin.main_job.spot_plots import residuals_svg, spots_svg
+from twin.main_job.target_plots import curves_svg, images_svg, pupils_svg
 from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import FAR
 from twin.run.page import environment, reproduce, section_contents

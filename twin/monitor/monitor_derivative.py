@@ -10,7 +10,7 @@ from optics.geometry.tree import COMPLEX_STEP, PlacedBodies
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import transverse_axes
-from optics.raytrace.derivatives import RayTangents, push_forward
+from optics.raytrace.derivatives import RayTangents, jvp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.waves.diffraction import PupilTangent, image_derivative
 from twin.monitor.monitor_path import MonitorPath
@@ -42,7 +42,7 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tupl
     def push(sequence: str, direction_step: np.ndarray | float) -> RayTangents:
         names = [f"{channel.key}/{sequence}" for channel in path.channels]
         systems = assemble(path.instrument.assembly, names, states, steps, placed)
-        return push_forward(path.backend, systems, position, direction, position_step, direction_step)
+        return jvp(path.backend, systems, position, direction, position_step, direction_step)
 
     drift = push("outgoing", 0.0).position[..., :2]
     outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
@@ -71,7 +71,7 @@ def hit_slopes(
     """
     axes = transverse_axes(direction, np.broadcast_to([0.0, 1.0, 0.0], direction.shape))
     place, heading = np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1)
-    pushed = push_forward(backend, systems, place, heading, 0.0, axes.reshape(len(direction), -1, 3))
+    pushed = jvp(backend, systems, place, heading, 0.0, axes.reshape(len(direction), -1, 3))
     return axes, np.swapaxes(pushed.position[..., :2].reshape(*direction.shape[:2], 2, 2), -1, -2)
 
 

@@ -67,7 +67,7 @@ class Aimed:
 
 
 @dataclass(frozen=True, eq=False)
-class Scouted:
+class CoarseTrace:
     """What a few rays say of C channels x S states (channel-major).
 
     Attributes:
@@ -83,12 +83,12 @@ class Scouted:
     turn: np.ndarray
     place: np.ndarray
 
-    def take(self, states: np.ndarray) -> Scouted:
+    def take(self, states: np.ndarray) -> CoarseTrace:
         """The states of the given indices."""
         channels, count = self.place.shape[:2]
         own = (np.arange(channels)[:, None] * count + states).ravel()
         fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
-        return Scouted(fan, self.outgoing.take(own), self.back.take(own), self.turn[:, own], self.place[:, states])
+        return CoarseTrace(fan, self.outgoing.take(own), self.back.take(own), self.turn[:, own], self.place[:, states])
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +236,7 @@ class MonitorPath:
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
 
-    def scouted(self, states: Sequence[State]) -> Scouted:
+    def coarse_trace(self, states: Sequence[State]) -> CoarseTrace:
         """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
 
         Raises:
@@ -254,20 +254,20 @@ class MonitorPath:
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
         pitch = self.pitch * back.size[:, None]
         place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / pitch
-        return Scouted(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
+        return CoarseTrace(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
 
-    def rays(self, states: Sequence[State], scouted: Scouted | None = None) -> CcdRays:
+    def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
 
         Args:
             states: S states.
-            scouted: what ``scouted`` says of them, if it is known.
+            coarse: what ``coarse_trace`` says of them, if it is known.
 
         Raises:
             BeamMissedError, AimError: a perturbation moves a beam off the mirrors or a spot off its CCD, named in the
                 message.
         """
-        known = self.scouted(states) if scouted is None else scouted
+        known = self.coarse_trace(states) if coarse is None else coarse
         start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
         q = start + np.moveaxis(product(known.turn, self._smooth[1].T), 0, -1)
         launch = known.fan.at(q)
@@ -392,12 +392,12 @@ class MonitorPath:
         """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class."""
         channels, response = len(self.channels), self.response
         y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
-        scouted = self.scouted(states)
-        chosen = self.class_of(scouted.place, margin)
+        coarse = self.coarse_trace(states)
+        chosen = self.class_of(coarse.place, margin)
         out = np.empty((len(states), channels, *(n + 2 * margin for n in self.shape)))
         for number in np.unique(chosen):
             own = np.flatnonzero(chosen == number)
-            path, known = self.classes[number], scouted.take(own)
+            path, known = self.classes[number], coarse.take(own)
             field = path.field_of(path.rays([states[s] for s in own.tolist()], known))
             photons = response.apply(image(field, x, y, single))
             photons *= self.light_per_pixel

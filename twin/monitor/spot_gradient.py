@@ -21,7 +21,7 @@ import numpy as np
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State
 from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.aim import RayFan, aim
-from optics.raytrace.derivatives import pull_back
+from optics.raytrace.derivatives import vjp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.instrument_model import Instrument
@@ -93,11 +93,11 @@ def spot_gradient(
         # system 2c is the row of channel c's spot (y of the CCD), 2c + 1 its column (x)
         share = path.nodes.share[piece, None] * np.array([[[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]])
         weight = np.tile(share, (len(path.channels), 1, 1)) / pitch[:, None, None]
-        there = pull_back(path.backend, monitor, place, heading, weight, monitor_steps.names)
+        there = vjp(path.backend, monitor, place, heading, weight, monitor_steps.names)
         turn = np.einsum("bnkx,bnx->bnk", across, there.direction)
         back = -np.linalg.solve(np.repeat(np.swapaxes(slope, -1, -2), 2, axis=0), turn[..., None])[..., 0]
         aside = np.concatenate([back, np.zeros_like(back[..., :1])], axis=-1)
-        node = pull_back(path.backend, outgoing, place, heading, aside, outgoing_steps.names)
+        node = vjp(path.backend, outgoing, place, heading, aside, outgoing_steps.names)
         pinhole = (there.position + node.position).sum(axis=1).reshape(len(path.channels), 2, 3)
         out += monitor_steps.dot(there.values) + outgoing_steps.dot(node.values)
         out += np.einsum("ckx,cmx->ckm", pinhole, source)

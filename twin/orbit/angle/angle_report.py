@@ -9,7 +9,7 @@ import numpy as np
 from analysis.units import ARCSEC
 from scenes.specs.job import DEFAULT_PIVOT, PerturbationSpec
 from scenes.yaml.units import LENGTH, format_quantity
-from twin.orbit.angle.angle_figures import signs
+from twin.orbit.angle.angle_plots import signs
 from twin.orbit.angle.angle_run import AngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections
 from twin.run.artefact import Cell, Table, fixed

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.units import ARCSEC
-from twin.orbit.angle.angle_figures import drawn, panels, signs
+from twin.orbit.angle.angle_plots import drawn, panels, signs
 from twin.orbit.angle.angle_run import AngleRun, Scatter, values_of
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT
 from twin.run.artefact import Cell, SvgFigure, Table, fixed

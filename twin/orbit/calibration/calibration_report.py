@@ -8,7 +8,7 @@ from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.calibration_sections import bought, gained, said, scheme_names, sections
+from twin.orbit.calibration.calibration_sections import monitor_gain, scheme_names, scheme_summary, sections, strip_gain
 from twin.orbit.calibration.influences import SURPRISE
 from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.scheme_numbers import meets
@@ -29,11 +29,11 @@ def calibration_report(run: CalibrationRun) -> Report:
     verdict = f"schemes {', '.join(good)}" if good else "no scheme"
     lead = (
         f"Before calibration {plan:.0f} m in plan and {height:.0f} m in height, mean of the fields' RMS. "
-        + said(run.scheme_means),
+        + scheme_summary(run.scheme_means),
         f"{limits.plan:g} m in plan and {limits.height:g} m in height, assumed for 1:50 000, are met in every field by "
         f"{verdict}.",
-        *(() if run.monitoring is None else (bought(run.monitoring),)),
-        *(() if run.strips is None else (gained(run.schemes, run.strips),)),
+        *(() if run.monitoring is None else (monitor_gain(run.monitoring),)),
+        *(() if run.strips is None else (strip_gain(run.schemes, run.strips),)),
     )
     return Report(
         "Calibration in orbit over test fields",

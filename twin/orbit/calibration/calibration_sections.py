@@ -11,8 +11,8 @@ from analysis.orbit.forward_intersection import CheckErrors
 from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.calibration_figures import drawn, drift_drawn
 from twin.orbit.calibration.calibration_numbers import unit
+from twin.orbit.calibration.calibration_plots import drawn, drift_drawn
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
 from twin.orbit.calibration.field_sections import (
@@ -30,7 +30,7 @@ from twin.run.artefact import Artefact, Cell, SvgFigure, Table
 from twin.run.report import Section
 
 
-def bought(found: Monitoring) -> str:
+def monitor_gain(found: Monitoring) -> str:
     """What the monitor buys, in one sentence, from the scheme with most averaged parameters."""
     none, here = found.at(0.0), found.at(1.0)
     scheme = list(none.without.schemes)[-2]
@@ -141,7 +141,7 @@ def _angles(values: tuple[float, float, float]) -> str:
     return ", ".join(format_quantity(v, ANGLE) for v in values)
 
 
-def gained(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -> str:
+def strip_gain(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -> str:
     """What the adjustment gains, in one sentence, from the scheme with most averaged parameters."""
     scheme = list(found.schemes)[-2]
     old, new = (PooledErrors.of(e[scheme].values()) for e in (before, found.schemes))
@@ -252,7 +252,7 @@ def _schemes(run: CalibrationRun) -> Section:
         f"and each scheme uses the mean of the parameters of its fields: {'; '.join(scheme_names(run))}. Check points "
         "are intersected from all three lines with these parameters and the measured orbit and attitude, without "
         "ground control.",
-        said(run.scheme_means),
+        scheme_summary(run.scheme_means),
         "What averaging changes are the biases of attitude, which differ from field to field and move all three lines "
         "alike: they act in plan. Heights depend on the difference between the outer lines, which the interior "
         "orientation holds and which hardly differs between fields; noise of the image and of the attitude makes the "
@@ -280,7 +280,7 @@ def _good(run: CalibrationRun) -> str:
     return f"scheme{'s' * (len(good) > 1)} {', '.join(good)}" if good else "no scheme"
 
 
-def said(means: SchemeMeans | None) -> str:
+def scheme_summary(means: SchemeMeans | None) -> str:
     """What averaging over more fields changes."""
     if means is None:
         return "With one scheme of averaged parameters there is nothing to compare."

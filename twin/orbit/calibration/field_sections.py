@@ -9,7 +9,7 @@ from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.calibration_figures import drawn
+from twin.orbit.calibration.calibration_plots import drawn
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import BEYOND, FieldImages

@@ -10,8 +10,8 @@ from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit_monitor import PARAMETERS
-from twin.orbit.monitoring.monitoring_figures import PART_NAMES, drawn
 from twin.orbit.monitoring.monitoring_numbers import cause_heights
+from twin.orbit.monitoring.monitoring_plots import PART_NAMES, drawn
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.report import Report, Section

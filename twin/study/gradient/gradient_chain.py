@@ -20,7 +20,7 @@ from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import RayFan, aim, transverse_axes
-from optics.raytrace.derivatives import push_forward
+from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import SystemBatch, assemble
 from scenes.models.instrument_model import Instrument
 from scenes.specs.resolved import ResolvedJob
@@ -185,11 +185,11 @@ def sight_gradient(
     def systems(sequence: str) -> SystemBatch:
         return assemble(assembly, [f"{name}/{sequence}" for name in names], states, steps, stepped)
 
-    drift = push_forward(backend, systems("image_to_stop"), place, heading, moved, 0.0).position[..., :2]
+    drift = jvp(backend, systems("image_to_stop"), place, heading, moved, 0.0).position[..., :2]
     turn = -turned(np.repeat(inverse(slope), m, axis=0), drift)
     to_object = systems("image_to_object")
     heading_step = np.einsum("bnk,bnkx->bnx", turn, np.repeat(axes, m, axis=0))
-    pushed = push_forward(backend, to_object, place, heading, moved, heading_step)
+    pushed = jvp(backend, to_object, place, heading, moved, heading_step)
     local = pushed.traced.numpy()[1]
     # from the frame of the last element, which moves too, to the world
     assert to_object.world_tangents is not None

@@ -15,7 +15,7 @@ from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
 from twin.run.versions import versions
 from twin.study.gradient.gradient_numbers import doubtful, unit_text
 from twin.study.gradient.study_gradient import AD, Gradient
-from twin.study.report.study_figures import finish
+from twin.study.report.study_plots import finish
 from twin.study.report.study_runs import typeset
 from twin.study.runs.setup import StudySetup
 from twin.study.runs.study_folder import PROGRAM

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from scenes.specs.study import GRID, SAMPLERS
-from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, Untold
+from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Course, StudyAnalysis
 from twin.study.report.study_runs import Response, typeset
 from twin.study.report.study_statistics import LEAST
@@ -59,7 +59,7 @@ def indices_texts(found: StudyAnalysis) -> list[str]:
             "Noise that differs from run to run counts as an interaction of all factors and raises every total index."
         ]
     for name, part in found.indices.items():
-        if isinstance(part, Untold):
+        if isinstance(part, NoIndices):
             out.append(f"{name}: {part.reason}.")
         elif part.method == "chaos":
             out.append(_model_text(name, part))

@@ -206,13 +206,13 @@ class Indices:
 
 
 @dataclass(frozen=True)
-class Untold:
+class NoIndices:
     """Why there are no indices."""
 
     reason: str
 
 
-def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | Untold:
+def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndices:
     """Indices of a response, by the method that fits the design.
 
     No design of a study is Saltelli's, so that the indices come from the given runs. A complete grid is its own
@@ -223,24 +223,24 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | Untold
     """
     axes = [axis for axis in runs.axes if any(len(np.unique(f.values[response.good])) > 1 for f in axis)]
     if response.constant:
-        return Untold("the response is constant")
+        return NoIndices("the response is constant")
     if not axes:
-        return Untold("no factor varies")
+        return NoIndices("no factor varies")
     noise = _noise(response)
     if not runs.drawn:
         if not np.all(response.good):
-            return Untold("runs of the grid are missing, and its variance cannot be taken apart")
+            return NoIndices("runs of the grid are missing, and its variance cannot be taken apart")
         return Indices("grid", _of_grid(axes, response.values), 0, 0, None, 0.0, noise)
     n = len(response.known)
     if n < LEAST:
-        return Untold(f"{n} runs are too few; {LEAST} or more are needed")
+        return NoIndices(f"{n} runs are too few; {LEAST} or more are needed")
     good = response.good & (np.cumsum(response.good) <= MOST_RUNS)
     try:
         chaos = _Chaos.fitted(axes, good, response.values[good])
     except NoBasis as error:
-        return Untold(str(error))
+        return NoIndices(str(error))
     if chaos is None:
-        return Untold(f"{n} runs are too few for {len(axes)} factors")
+        return NoIndices(f"{n} runs are too few for {len(axes)} factors")
     return Indices("chaos", chaos.indices(runs), chaos.degree, len(chaos.coefficients), chaos.held_out,
                    chaos.rest, noise)  # fmt: skip
 

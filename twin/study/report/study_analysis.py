@@ -13,7 +13,7 @@ import xarray as xr
 
 from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
 from twin.study.report.linear_model import LinearModel, MainEffect, linear_model, main_effects
-from twin.study.report.sensitivity_indices import Indices, Untold, sensitivity_indices
+from twin.study.report.sensitivity_indices import Indices, NoIndices, sensitivity_indices
 from twin.study.report.study_runs import Factor, Response, StudyRuns
 from twin.study.report.study_statistics import (
     CONFIDENCE,
@@ -256,7 +256,7 @@ class StudyAnalysis:
     descriptions: Mapping[str, Description]
     linear: Mapping[str, LinearModel | None]
     effects: Mapping[str, tuple[MainEffect, ...]]
-    indices: Mapping[str, Indices | Untold]
+    indices: Mapping[str, Indices | NoIndices]
     courses: Mapping[str, tuple[Course, ...]]
     requirements: tuple[Requirement, ...]
     fronts: tuple[ParetoFront, ...]
@@ -409,8 +409,8 @@ def _linear(model: LinearModel | None) -> dict[str, Any] | None:
     }
 
 
-def _indices(found: Indices | Untold) -> dict[str, Any]:
-    if isinstance(found, Untold):
+def _indices(found: Indices | NoIndices) -> dict[str, Any]:
+    if isinstance(found, NoIndices):
         return {"method": None, "reason": found.reason}
     return {
         "method": found.method,

@@ -14,7 +14,7 @@ from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Section
 from twin.run.svg import look, to_svg
 from twin.study.report import conclusions
-from twin.study.report.influence_figures import (
+from twin.study.report.influence_plots import (
     chosen,
     indices_figure,
     matrix_figure,
@@ -24,7 +24,7 @@ from twin.study.report.influence_figures import (
 )
 from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
-from twin.study.report.study_figures import (
+from twin.study.report.study_plots import (
     MOST_PANELS,
     convergence_figure,
     curve_figure,

@@ -34,7 +34,7 @@ from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult,
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.checks.printed import load_printed
-from twin.validation.paper_001.table2_figure import bench_png
+from twin.validation.paper_001.table2_plot import bench_png
 
 _TABLE = load_printed("001")
 ANGLES = _TABLE.column("table2.turn_arcsec")

@@ -17,8 +17,8 @@ from twin.validation.checks.check import REFUTED, UNDECIDED, Check, CheckResult,
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.checks.printed import load_printed
 from twin.validation.paper_004 import orientation, sensitivity_checks
-from twin.validation.paper_004.figures_004 import points_svg, reduction_svg
 from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS, SpotTest, evaluate_equations
+from twin.validation.paper_004.plots_004 import points_svg, reduction_svg
 from twin.validation.paper_004.turntable_checks import dividing
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ from twin.validation.checks.check import NOT_CHECKABLE, Check, CheckResult, mean
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.checks.printed import load_printed
-from twin.validation.paper_004.figures_004 import alignment_svg
+from twin.validation.paper_004.plots_004 import alignment_svg
 
 Array = NDArray[np.float64]
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")

@@ -83,7 +83,7 @@ class Bench:
             BeamMissedError, AimError: a beam is lost, or a part of it.
         """
         path = self.experiment.path
-        known, scout = path.scouted(states), path.scout
+        known, scout = path.coarse_trace(states), path.scout
         basis = zernike.basis(known.turn.shape[-1], scout.nodes.x, scout.nodes.y)
         start = np.repeat(scout.nominal.parameters, len(states), axis=0)
         launch = known.fan.at(start + np.moveaxis(known.turn @ basis.T, 0, -1))

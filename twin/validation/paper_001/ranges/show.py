@@ -11,10 +11,10 @@ from analysis.monitor.monitoring import MonitorGeometry
 from analysis.units import ARCSEC
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.validation.checks.group import Context
-from twin.validation.paper_001.ranges import ranges_figures
+from twin.validation.paper_001.ranges import ranges_plots
 from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, FORMS, JOINT, PRINTED, Curves
 from twin.validation.paper_001.ranges.defocus import CONFOCAL, SMALL, FieldPoint, PupilStudy, Response
-from twin.validation.paper_001.ranges.ranges_figures import SYMBOLS
+from twin.validation.paper_001.ranges.ranges_plots import SYMBOLS
 from twin.validation.paper_001.ranges.turns import CUT, KINDS, NAMES, UNITS, Corners, Range, Separation, criterion, key
 
 _GAIN_TEXT = "reading over truth"
@@ -139,7 +139,7 @@ def singles_shown(context: Context, ranges: Mapping[str, Mapping[str, list[Range
             f"Error of each formula over the size of the change, {first}",
             "Marks: noise-free rendered images through the centroid; lines: exact trace. Shaded: what the instrument's "
             "area CCDs can record. At the right end an aperture begins to cut the beam.",
-            ranges_figures.singles_svg(ranges[first]),
+            ranges_plots.singles_svg(ranges[first]),
         )
     )
 
@@ -183,7 +183,7 @@ def joint_shown(context: Context, corners: Corners, found: Separation, data: dic
             "All four changes at once: the worst of 16 corners over the size of the box",
             "1 on the horizontal axis is ±(4″, 4″, 24″, 0.95 mm), which just keeps the spots on the area CCDs. Marks: "
             "images; lines: exact trace, until an aperture cuts a beam.",
-            ranges_figures.joint_svg(corners, (JOINT, CORRECTED, CALIBRATED)),
+            ranges_plots.joint_svg(corners, (JOINT, CORRECTED, CALIBRATED)),
         )
     )
 
@@ -242,7 +242,7 @@ def defocus_shown(
             "Defocus and the place of the monitor's beam in the pupil",
             "Left: false Δα over the sub-aperture's X, false Δβ over its Y, images and theory z h/f². Right: false "
             "readings of the instrument as built over the motion of the line CCD along Z.",
-            ranges_figures.defocus_svg(pupil, curves, (f_x, f)),
+            ranges_plots.defocus_svg(pupil, curves, (f_x, f)),
         )
     )
 
@@ -273,7 +273,7 @@ def field_shown(context: Context, points: Sequence[FieldPoint], data: dict[str, 
             "Scale of the readings over the field of the area CCDs",
             "Reading over truth less one. Only the printed cos²β depends on the field: it follows cos²β (line), the "
             "corrected forms stay within 0.4 %.",
-            ranges_figures.field_svg(points),
+            ranges_plots.field_svg(points),
         )
     )
     data["field"] = [

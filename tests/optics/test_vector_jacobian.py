@@ -5,7 +5,7 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.numerics.number_tree import leaves
-from optics.raytrace.derivatives import pull_back, push_forward
+from optics.raytrace.derivatives import jvp, vjp
 from optics.raytrace.system import assemble
 from scenes.models.camera_model import collimated, field_direction
 
@@ -31,11 +31,11 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(gf7, backend, launch) -> 
     place, heading = launch
     rng = np.random.default_rng(2)
     position_step, direction_step, weight = rng.normal(size=(3, *place.shape))
-    pushed = push_forward(backend, systems, place, heading, position_step, direction_step)
+    pushed = jvp(backend, systems, place, heading, position_step, direction_step)
     steps = [leaves(tangents) for tangents in systems.tangents]
     names = [tuple(path for path, step in own.items() if np.any(step)) for own in steps]
     assert [len(own) > 0 for own in names] == [True] * 4
-    pulled = pull_back(backend, systems, place, heading, weight, names)
+    pulled = vjp(backend, systems, place, heading, weight, names)
 
     forward = np.sum(weight * pushed.position, axis=(1, 2))
     reverse = np.sum(pulled.position * position_step + pulled.direction * direction_step, axis=(1, 2))
@@ -49,9 +49,9 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(gf7, backend, launch) -> 
 
 def test_only_what_is_asked_for(gf7, backend, launch) -> None:
     systems = assemble(gf7.bare_assembly(), ["imaging"], [{}] * len(STEPS))
-    nothing = pull_back(backend, systems, *launch, np.array([1.0, 0.0, 0.0]), [()] * 4)
+    nothing = vjp(backend, systems, *launch, np.array([1.0, 0.0, 0.0]), [()] * 4)
     assert nothing.values == ({}, {}, {}, {})
-    curvature = pull_back(backend, systems, *launch, np.array([1.0, 0.0, 0.0]), [(CURVATURE,), (), (), ()])
+    curvature = vjp(backend, systems, *launch, np.array([1.0, 0.0, 0.0]), [(CURVATURE,), (), (), ()])
     assert set(curvature.values[0]) == {CURVATURE}
     assert curvature.values[0][CURVATURE].shape == (len(STEPS),)
     np.testing.assert_allclose(curvature.position, nothing.position, rtol=1e-12)

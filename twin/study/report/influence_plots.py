@@ -13,7 +13,7 @@ from scipy import stats
 from twin.run.svg import BLUE, GREEN, GREY, INK, SKY, VERMILION, new_figure, plain_axes
 from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
-from twin.study.report.study_figures import finish, jitter, name_texts, positions, short, some
+from twin.study.report.study_plots import finish, jitter, name_texts, positions, short, some
 from twin.study.report.study_runs import Factor, Response, typeset
 
 MOST_BARS = 10

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import results
-from twin.main_job.spot_figures import GRAY, airy_radius, core_window, cross, mean_images, stretch
+from twin.main_job.spot_plots import GRAY, airy_radius, core_window, cross, mean_images, stretch
 from twin.run.artefact import FAR
 from twin.run.svg import AFTER, BEFORE, BLUE, GREY, INK, LIGHT, VERMILION, look, to_png
 

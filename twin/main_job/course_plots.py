@@ -9,7 +9,7 @@ from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.channel import BASE
 from twin.main_job.report_labels import PARAMETERS
-from twin.main_job.spot_figures import marks
+from twin.main_job.spot_plots import marks
 from twin.monitor.time_series import CourseRun
 from twin.run.artefact import MINUS
 from twin.run.svg import (
