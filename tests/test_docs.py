@@ -1,5 +1,7 @@
-"""The pages in docs/ keep up with the code: every module is named, every link leads somewhere."""
+"""The pages in docs/ keep up with the code: links lead somewhere, and what draws their pictures finds its modules."""
 
+import ast
+import importlib
 import re
 from pathlib import Path
 
@@ -15,3 +17,14 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert links
     for link in links:
         assert link.startswith("https://") or (page.parent / link).exists(), link
+
+
+def test_what_the_drawing_of_the_conventions_imports_exists() -> None:
+    tree = ast.parse((ROOT / "docs/draw_conventions.py").read_text("utf-8"))
+    own = [
+        n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and (n.module or "").startswith(("optics", "scenes"))
+    ]
+    assert own
+    for node in own:
+        module = importlib.import_module(node.module or "")
+        assert all(hasattr(module, alias.name) for alias in node.names), node.module

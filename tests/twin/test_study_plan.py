@@ -208,5 +208,5 @@ def test_every_base_command_is_known(tmp_path) -> None:
 
 def test_a_design_that_does_not_exist_draws_no_points() -> None:
     """It was drawn as monte_carlo."""
-    with pytest.raises(ValueError, match="no design of kind 'halton'"):
+    with pytest.raises(KeyError, match="halton"):
         unit_cube("halton", 4, 2, 0)
