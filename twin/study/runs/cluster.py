@@ -124,45 +124,43 @@ def local_workers(count: int) -> Iterator[Workers]:
         "temporary-directory": str(place),
         "logging": {"distributed": "critical", "distributed.nanny": "critical", "tornado": "critical"},
     }
-    _silence()
-    try:
-        with (
-            _kept_environment(ONE_THREAD),
-            dask.config.set(settings),
-            LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                protocol="tls",
-                security=Security.temporary(),
-                # no dashboard; the port for it cannot be left out, so it is a free one, seen by this machine only
-                dashboard_address="127.0.0.1:0",
-                worker_dashboard_address="127.0.0.1:0",
-                scheduler_kwargs={"dashboard": False},
-                local_directory=str(place),
-                memory_limit=0,
-                silence_logs=logging.CRITICAL,
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):
-            yield Workers(client, True)
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
+    with _kept_environment():
+        _silence()
+        try:
+            with (
+                dask.config.set(settings),
+                LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    protocol="tls",
+                    security=Security.temporary(),
+                    # no dashboard; the port for it cannot be left out, so it is a free one, seen by this machine only
+                    dashboard_address="127.0.0.1:0",
+                    worker_dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},
+                    local_directory=str(place),
+                    memory_limit=0,
+                    silence_logs=logging.CRITICAL,
+                ) as cluster,
+                Client(cluster, set_as_default=False) as client,
+            ):
+                yield Workers(client, True)
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
 
 
 @contextmanager
-def _kept_environment(names: Iterable[str]) -> Iterator[None]:
-    """Restore these variables of this process at the end: Dask's nannies set here what their workers are to inherit."""
-    before = {name: os.environ.get(name) for name in names}
+def _kept_environment() -> Iterator[None]:
+    """Restore the variables of this process at the end: Dask's nannies set here what their workers are to inherit."""
+    before = dict(os.environ)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in os.environ.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
 
 
 @contextmanager

@@ -152,12 +152,19 @@ class Engine:
         return first
 
     def _all(self, workers: Workers, config: str, chunks: list[range]) -> None:
-        """Compute chunks, never more than a few ahead. One in which workers die is cut into blocks to find which."""
+        """Compute chunks, never more than a few ahead. One in which workers die is cut into blocks to find which; a
+        block is blamed only when it is alone, for the scheduler suspects all that a worker had before it when it died.
+        """
         waiting = list(reversed(chunks))
+        suspects: list[range] = []
+        alone: set[int] = set()
         running: dict[Any, tuple[range, Any]] = {}
         bad: list[range] = []
         reasons: list[str] = []
-        while waiting or running:
+        while waiting or running or suspects:
+            if not waiting and not running:
+                waiting.append(suspects.pop(0))
+                alone.add(waiting[0].start)
             while waiting and len(running) < AHEAD * max(1, workers.count):
                 blocks = waiting.pop()
                 future = workers.submit(evaluate, self._task(config, blocks))
@@ -174,6 +181,9 @@ class Engine:
             error = future.exception()
             if len(blocks) > 1:
                 waiting.extend(range(block, block + 1) for block in reversed(blocks))
+                continue
+            if killed(error) and blocks.start not in alone:
+                suspects.append(blocks)
                 continue
             bad.append(self.plan.block(blocks.start))
             reason = "the workers died" if killed(error) else f"the program failed: {_told(error)}"
