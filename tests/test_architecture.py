@@ -320,3 +320,10 @@ def test_general_commands_know_no_paper(room: str) -> None:
 def test_folders_are_small_enough_to_look_through() -> None:
     count = Counter(path.parent.as_posix() for path in modules().values())
     assert {folder: number for folder, number in count.items() if number > MOST_FILES} == {}
+
+
+def test_no_folder_of_the_source_is_ignored_by_git() -> None:
+    """What .gitignore hides, ruff does not check, and a new file in it is never committed."""
+    ignored = {line.strip("/") for line in (ROOT / ".gitignore").read_text("utf-8").split() if not line.startswith("/")}
+    folders = {part for path in modules().values() for part in path.parent.parts}
+    assert folders & ignored == set()

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from optics.numerics.backend import Backend
-from scenes.yaml.errors import KeyPath
-from scenes.yaml.spec import Spec
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, KeyPath
+from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.procedure import BenchError, Procedure, silent

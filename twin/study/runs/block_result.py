@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from scenes.yaml.errors import Problem
 from scenes.specs.study import ResponseSpec
+from scenes.yaml.errors import Problem
 from twin.study.runs.base_job import Failure, Outcome
 from twin.study.runs.config_tree import leaf
 

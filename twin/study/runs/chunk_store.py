@@ -6,19 +6,20 @@ when the power failed is seen and left out. Whatever is not listed is not there.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 import errno
 import hashlib
 import io
 import json
+import os
 import stat
+from pathlib import Path
 from typing import Annotated, Self
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.plan import Plan
-
 
 PARTIAL = ".partial"
 

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,8 +21,8 @@ from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
 from twin.run.cli import InputErrorText
-from twin.study.runs.task import ONE_THREAD
 from twin.run.versions import source_digest, versions
+from twin.study.runs.task import ONE_THREAD
 
 REACH_SECONDS = 5.0
 """How long a scheduler may take to answer before the user is told that it does not."""

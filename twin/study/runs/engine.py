@@ -9,13 +9,13 @@ from typing import Any
 
 from scenes.yaml.errors import KeyPath, Problem
 from twin.run.cli import InputErrorText
+from twin.run.versions import source_digest
 from twin.study.runs.block_result import check_response
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import ClusterError, Workers, killed
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 from twin.study.runs.task import Pilot, Task, evaluate, pilot
-from twin.run.versions import source_digest
 
 CHUNK_SECONDS = 6.0
 """How long a worker is to be busy with a chunk: what is lost when it dies, against what handing over costs."""

@@ -73,4 +73,6 @@ JOBS: dict[str, Callable[[], BaseJob]] = {
     "orbit calibrate": _calibrate,
     "orbit monitor": _monitor,
 }
-"""As scenes.specs.study.BaseCommand names them -> the job. A test needs no more than its `twin.run.procedure.Procedure`."""
+"""As scenes.specs.study.BaseCommand names them -> the job. A test needs no more than its
+`twin.run.procedure.Procedure`.
+"""

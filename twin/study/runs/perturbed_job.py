@@ -8,10 +8,10 @@ from typing import Any
 from pydantic import BaseModel
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.specs.job import JobSpec, PerturbationSpec, TemperatureSpec
-from scenes.yaml.quantity import Quantity, Vector
 from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
+from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile

@@ -14,8 +14,7 @@ from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.study.runs.base_job import Run
 from twin.study.runs.config_tree import leaf, with_values
-from twin.study.runs.sampling import draw, extremes, run_count
-from twin.study.runs.sampling import Scaling, number_of, ratios, scaled
+from twin.study.runs.sampling import Scaling, draw, extremes, number_of, ratios, run_count, scaled
 from twin.study.runs.setup import StudySetup
 
 

@@ -5,41 +5,34 @@ A state's numbers differ in the last bits with the states it is done with; so a 
 
 from __future__ import annotations
 
-from typing import Any
-import numpy as np
-from analysis.monitor.recovery import Recovery
-from optics.geometry.tree import State
-from scenes.specs.resolved import ResolvedJob
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.main_job.render_results import RenderRun
-from twin.monitor.truth import Truth
+import json
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
+
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_positions import SpotError
-from optics.raytrace.aim import AimError
-from optics.numerics.threads import one_blas_thread
-from optics.raytrace.trace import BeamMissedError
-from twin.study.runs.base_job import Failure, Outcome
-from twin.monitor.truth import Truth, trace_truth
-import json
-from collections import OrderedDict
-from collections.abc import Sequence
-from pathlib import Path
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
+from optics.numerics.threads import one_blas_thread
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.spec import Spec
+from twin.main_job.render_results import RenderRun, quality_dict
 from twin.monitor.image_quality import quality_dicts
-from twin.main_job.render_results import quality_dict
-from twin.study.runs.base_job import Failure, Outcome, Run
-from twin.study.runs.base_job import PHYSICS, one_line
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import Truth, trace_truth
+from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, one_line
 from twin.study.runs.config_tree import Tree
 from twin.study.runs.perturbed_job import PERTURB, JobMaker, needs_more, read_job
-
 
 _NOTHING = np.empty(0)
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from scenes.specs.study import StudySpec
-from scenes.specs.study import GRID, unit_cube
+from scenes.specs.study import GRID, StudySpec, unit_cube
 from scenes.specs.study_factor import FactorSpec
 from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio

@@ -14,17 +14,17 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
-from scenes.yaml.spec import Source
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
+from scenes.yaml.spec import Source
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
+from twin.run.versions import source_digest, versions
 from twin.study.runs.base_job import BaseJob
 from twin.study.runs.config_tree import Tree, with_place, with_values
 from twin.study.runs.jobs import base_job
-from twin.run.versions import source_digest, versions
 
 WHERE = {"render": EXAMPLES, "lab": SCENES / LAB, "orbit": SCENES / ORBIT}
 """First word of a base's command -> folder of the library with its files."""

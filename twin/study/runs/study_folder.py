@@ -26,11 +26,10 @@ from twin.run.run_folder import (
     remove_study,
     unlisted,
 )
-from twin.study.runs.chunk_store import FOLDER, INDEX
-from twin.study.runs.chunk_store import write_safely
-from twin.study.runs.setup import StudySetup
 from twin.run.unfinished import OLD, Unfinished, sweep
 from twin.run.versions import sources, versions
+from twin.study.runs.chunk_store import FOLDER, INDEX, write_safely
+from twin.study.runs.setup import StudySetup
 
 PROGRAM = "twin.study"
 
