@@ -7,7 +7,7 @@ consists of, which work on floats, NumPy arrays and in kernels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -118,12 +118,35 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class Rectangle:
-    """Rectangle of half-widths ``half_x``, ``half_y`` about ``centre`` (metres)."""
+class _TwoHalves:
+    """What has two half sizes, ``half_x`` and ``half_y``, about ``centre`` (metres)."""
 
     half_x: float
     half_y: float
     centre: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, x_max, y_min, y_max, metres."""
+        (cx, cy) = self.centre
+        return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
+
+    @property
+    def inscribed(self) -> float:
+        """Radius of the largest disk about the centre that lies inside, metres."""
+        return min(self.half_x, self.half_y)
+
+    def grown(self, size: float) -> Self:
+        """The same on a body of another size, 1 being the nominal one."""
+        return type(self)(*self._scaled(size), (size * self.centre[0], size * self.centre[1]))
+
+    def _scaled(self, size: Any) -> tuple[Any, Any]:
+        return size * self.half_x, size * self.half_y
+
+
+@dataclass(frozen=True)
+class Rectangle(_TwoHalves):
+    """Rectangle of half-widths ``half_x``, ``half_y`` about ``centre`` (metres)."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -138,23 +161,7 @@ class Rectangle:
 
     def numbers(self, size: Any = 1.0) -> RectangleNumbers:
         """What decides on a body of that size (1 is the nominal one, or an array)."""
-        return RectangleNumbers(size * self.centre[0], size * self.centre[1], size * self.half_x, size * self.half_y)
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
-        (cx, cy) = self.centre
-        return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
-
-    @property
-    def inscribed(self) -> float:
-        """Radius of the largest disk about the centre that lies inside, metres."""
-        return min(self.half_x, self.half_y)
-
-    def grown(self, size: float) -> Rectangle:
-        """The same on a body of another size, 1 being the nominal one."""
-        x, y = self.centre
-        return Rectangle(size * self.half_x, size * self.half_y, (size * x, size * y))
+        return RectangleNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:
         """Closed outline, shape (n, 2), metres."""
@@ -167,12 +174,8 @@ class Rectangle:
 
 
 @dataclass(frozen=True)
-class Ellipse:
+class Ellipse(_TwoHalves):
     """Ellipse of half axes ``half_x``, ``half_y`` about ``centre`` (metres): a round beam on a slanted face."""
-
-    half_x: float
-    half_y: float
-    centre: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -185,23 +188,7 @@ class Ellipse:
 
     def numbers(self, size: Any = 1.0) -> EllipseNumbers:
         """What decides on a body of that size (1 is the nominal one, or an array)."""
-        return EllipseNumbers(size * self.centre[0], size * self.centre[1], size * self.half_x, size * self.half_y)
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
-        (cx, cy) = self.centre
-        return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
-
-    @property
-    def inscribed(self) -> float:
-        """Radius of the largest disk about the centre that lies inside, metres."""
-        return min(self.half_x, self.half_y)
-
-    def grown(self, size: float) -> Ellipse:
-        """The same on a body of another size, 1 being the nominal one."""
-        x, y = self.centre
-        return Ellipse(size * self.half_x, size * self.half_y, (size * x, size * y))
+        return EllipseNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:
         """Closed outline, shape (points, 2), metres."""
