@@ -11,7 +11,7 @@ from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.calibration_sections import monitor_gain, scheme_names, scheme_summary, sections, strip_gain
 from twin.orbit.calibration.influences import SURPRISE
 from twin.orbit.calibration.observations import any_effect, light_effects
-from twin.orbit.calibration.scheme_numbers import meets
+from twin.orbit.calibration.scheme_numbers import meets, schemes_within
 from twin.orbit.calibration.schemes import values_of
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report
@@ -25,7 +25,7 @@ def calibration_report(run: CalibrationRun) -> Report:
     setup = run.setup
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
-    good = [k for k, errors in run.schemes.items() if meets(errors, limits.plan, limits.height)]
+    good = schemes_within(run)
     verdict = f"schemes {', '.join(good)}" if good else "no scheme"
     lead = (
         f"Before calibration {plan:.0f} m in plan and {height:.0f} m in height, mean of the fields' RMS. "

@@ -23,7 +23,7 @@ from twin.orbit.calibration.field_sections import (
     light_section,
 )
 from twin.orbit.calibration.influences import INNER
-from twin.orbit.calibration.scheme_numbers import meets
+from twin.orbit.calibration.scheme_numbers import meets, schemes_within
 from twin.orbit.calibration.schemes import RMS, Repeats, SchemeMeans, values_of
 from twin.orbit.calibration.strip import Strips
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table
@@ -275,8 +275,7 @@ def _schemes(run: CalibrationRun) -> Section:
 
 
 def _good(run: CalibrationRun) -> str:
-    limits = run.campaign.spec.limits
-    good = [k for k, errors in run.schemes.items() if meets(errors, limits.plan, limits.height)]
+    good = schemes_within(run)
     return f"scheme{'s' * (len(good) > 1)} {', '.join(good)}" if good else "no scheme"
 
 

@@ -16,7 +16,7 @@ from twin.orbit.calibration.field_images import BEYOND, FieldImages
 from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.influences import INNER, SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
-from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS
+from twin.orbit.images.point_judgement import WRONG
 from twin.orbit.images.point_report import drawn_points
 from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
 from twin.run.report import Section
@@ -238,17 +238,12 @@ def _matching(images: tuple[FieldImages, ...]) -> Table:
     for one in images:
         for sort, lines in MatchingNumbers.by_line(one).items():
             for line, n in lines.items():
-                wrong = (
-                    f"{n.wrong_found} of {n.found}",
-                    f"{n.wrong_matched} of {n.matched}",
-                    f"{n.wrong_accepted} of {n.accepted}",
-                )
                 cells = (n.right_rejected_by_consensus, n.rms_lines_px, n.rms_pixels_px, n.chi_square_ratio)
-                rows.append((one.name, _SORTS[sort], line, *wrong, *cells))
+                rows.append((one.name, _SORTS[sort], line, *n.wrong_shares, *cells))
     return Table(
         "image-matching",
         "Matching",
-        f"Wrong: more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px; "
+        f"Wrong: {WRONG}; "
         "before any test, after the thresholds of matching, after consensus. RMS along the track and the line, px, and "
         "chi-square of the errors over degrees of freedom, of right places.",
         (

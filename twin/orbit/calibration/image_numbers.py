@@ -8,20 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.orbit.calibration.field_images import FieldImages, PatchRecord
-from twin.orbit.images.point_judgement import LineJudgement
+from twin.orbit.images.point_judgement import LineJudgement, MatchCounts, counts_of
 
 
 @dataclass(frozen=True)
-class ImageTotals:
+class ImageTotals(MatchCounts):
     """Points in images, over all fields and lines; wrong by truth."""
 
-    found: int
-    matched: int
-    accepted: int
-    wrong_found: int
-    wrong_matched: int
-    wrong_accepted: int
-    right_rejected_by_consensus: int
     entered: int
     left: int
     wrong_entered: int
@@ -36,31 +29,21 @@ class ImageTotals:
         """Of all fields."""
         every = [j for one in images for patch in one.patches for j in judgements(patch).values()]
         screenings = [one.screening for one in images if one.screening is not None]
-        matched = {name: sum(getattr(j, name) for j in every) for name in _COUNTS}
         screened = {name: sum(getattr(s, name) for s in screenings) for name in _SCREENED}
         return cls(
-            **matched,
-            right_rejected_by_consensus=sum(j.good_lost for j in every),
+            **counts_of(every),
             **screened,
             right_rejected_by_adjustment=sum(s.right_lost for s in screenings),
         )
 
 
-_COUNTS = ("found", "matched", "accepted", "wrong_found", "wrong_matched", "wrong_accepted")
 _SCREENED = ("entered", "left", "wrong_entered", "wrong_left", "check_entered", "check_left", "wrong_check_left")
 
 
 @dataclass(frozen=True)
-class MatchingNumbers:
+class MatchingNumbers(MatchCounts):
     """Points of one sort in the images of one line, over a field's patches; RMS of those that are not wrong."""
 
-    found: int
-    matched: int
-    accepted: int
-    wrong_found: int
-    wrong_matched: int
-    wrong_accepted: int
-    right_rejected_by_consensus: int
     rms_lines_px: float
     rms_pixels_px: float
     chi_square_ratio: float
@@ -72,8 +55,7 @@ class MatchingNumbers:
         square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
         rms = np.sqrt(square / max(degrees.sum(), 1))
         return cls(
-            **{name: sum(getattr(j, name) for j in parts) for name in _COUNTS},
-            right_rejected_by_consensus=sum(j.good_lost for j in parts),
+            **counts_of(parts),
             rms_lines_px=float(rms[0]),
             rms_pixels_px=float(rms[1]),
             chi_square_ratio=float(sum(j.chi_square for j in parts) / max(degrees.sum(), 1)),

@@ -23,6 +23,12 @@ def meets(errors: Mapping[str, CheckErrors], plan: float, height: float) -> bool
     return all(e.plan_rms <= plan and e.height_rms <= height for e in errors.values())
 
 
+def schemes_within(run: CalibrationRun) -> list[str]:
+    """Names of the schemes that meet the limits of the test's file."""
+    limits = run.setup.test.limits
+    return [name for name, errors in run.schemes.items() if meets(errors, limits.plan, limits.height)]
+
+
 @dataclass(frozen=True)
 class ErrorNumbers:
     """RMS errors at check points: east and north together, and up."""

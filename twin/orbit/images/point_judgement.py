@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.stats import chi2
@@ -14,19 +14,54 @@ from twin.orbit.images.patch import Patch
 
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
 """A match is wrong that lies more than 3 pixels off, or more than 5 of its sigmas and 1 pixel."""
+WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
+"""The same for readers."""
 
 
 @dataclass(frozen=True, eq=False)
-class LineJudgement:
+class MatchCounts:
+    """Places by what let them pass.
+
+    Attributes:
+        found, matched, accepted: how many places there are, before any is rejected, how many matching and how many
+            consensus let pass.
+        wrong_found, wrong_matched, wrong_accepted: how many of these are wrong.
+        right_rejected_by_consensus: right matches that consensus has rejected.
+    """
+
+    found: int
+    matched: int
+    accepted: int
+    wrong_found: int
+    wrong_matched: int
+    wrong_accepted: int
+    right_rejected_by_consensus: int
+
+    @property
+    def wrong_shares(self) -> tuple[str, str, str]:
+        """For readers: wrong of all that were found, that matching let pass, that consensus let pass."""
+        pairs = (
+            (self.wrong_found, self.found),
+            (self.wrong_matched, self.matched),
+            (self.wrong_accepted, self.accepted),
+        )
+        first, second, third = (f"{wrong} of {every}" for wrong, every in pairs)
+        return first, second, third
+
+
+def counts_of(parts: Iterable[MatchCounts]) -> dict[str, int]:
+    """Field of ``MatchCounts`` -> its sum over the parts."""
+    parts = tuple(parts)
+    return {field.name: sum(getattr(one, field.name) for one in parts) for field in fields(MatchCounts)}
+
+
+@dataclass(frozen=True, eq=False)
+class LineJudgement(MatchCounts):
     """One line's places against the truth.
 
     Attributes:
         error: (n, 2) found minus true, lines and pixels; NaN without a place.
         wrong: (n,) bool, of those with a place.
-        found, matched, accepted: how many places there are, before any is rejected, how many matching and how many
-            consensus let pass.
-        wrong_found, wrong_matched, wrong_accepted: how many of these are wrong.
-        good_lost: right matches that consensus has rejected.
         rms: (2,) of accepted places that are not wrong, lines and pixels.
         mean: (2,) of them.
         chi_square: of them over their covariance.
@@ -35,13 +70,6 @@ class LineJudgement:
 
     error: np.ndarray
     wrong: np.ndarray
-    found: int
-    matched: int
-    accepted: int
-    wrong_found: int
-    wrong_matched: int
-    wrong_accepted: int
-    good_lost: int
     rms: np.ndarray
     mean: np.ndarray
     chi_square: float
@@ -86,18 +114,18 @@ def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
         good = error[right]
         square = float(np.einsum("ni,nij,nj->", good, np.linalg.inv(line.covariance[right]), good))
         found[name] = LineJudgement(
-            error,
-            wrong,
-            int(np.isfinite(size).sum()),
-            int(line.matched.sum()),
-            int(line.accepted.sum()),
-            int(wrong.sum()),
-            int((wrong & line.matched).sum()),
-            int((wrong & line.accepted).sum()),
-            int((line.matched & ~line.accepted & ~wrong).sum()),
-            np.sqrt(np.mean(good**2, axis=0)) if len(good) else np.full(2, np.nan),
-            good.mean(axis=0) if len(good) else np.full(2, np.nan),
-            square,
-            2 * len(good),
+            found=int(np.isfinite(size).sum()),
+            matched=int(line.matched.sum()),
+            accepted=int(line.accepted.sum()),
+            wrong_found=int(wrong.sum()),
+            wrong_matched=int((wrong & line.matched).sum()),
+            wrong_accepted=int((wrong & line.accepted).sum()),
+            right_rejected_by_consensus=int((line.matched & ~line.accepted & ~wrong).sum()),
+            error=error,
+            wrong=wrong,
+            rms=np.sqrt(np.mean(good**2, axis=0)) if len(good) else np.full(2, np.nan),
+            mean=good.mean(axis=0) if len(good) else np.full(2, np.nan),
+            chi_square=square,
+            degrees_of_freedom=2 * len(good),
         )
     return FrozenMap(found)

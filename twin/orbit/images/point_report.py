@@ -14,7 +14,7 @@ from matplotlib.patheffects import Normal, Stroke
 from scenes.specs.orbit_scene import ImagePointsSpec
 from twin.orbit.images.image_points import CONSENSUS, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import LineImage, Patch
-from twin.orbit.images.point_judgement import WRONG_FLOOR, WRONG_PIXELS, WRONG_SIGMAS, judged
+from twin.orbit.images.point_judgement import WRONG, judged
 from twin.orbit.images.simulate_numbers import median_sigma, median_way, reasons
 from twin.run.artefact import Cell, Data, PngFigure, Table
 from twin.run.data_files import csv_table
@@ -164,14 +164,13 @@ def _true(patch: Patch, points: PatchPoints) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for sort, one in points.sorts.items():
         for name, j in judged(patch, one).items():
-            wrong = f"{j.wrong_found} of {j.found}", f"{j.wrong_matched} of {j.matched}"
             ratio = j.chi_square / max(j.degrees_of_freedom, 1)
-            after = f"{j.wrong_accepted} of {j.accepted}"
-            rows.append((_NAMES[sort], name, *wrong, after, j.good_lost, *_floats(j.rms), *_floats(j.mean), ratio))
+            numbers = (*_floats(j.rms), *_floats(j.mean), ratio)
+            rows.append((_NAMES[sort], name, *j.wrong_shares, j.right_rejected_by_consensus, *numbers))
     return Table(
         "points-truth",
         "Against the truth",
-        f"Wrong: more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px; of "
+        f"Wrong: {WRONG}; of "
         "all places that a fit gave, of those that matching let pass, of those that the neighbours agree with. RMS and "
         "mean error, px, and chi-square over degrees of freedom, of right places.",
         (

@@ -17,7 +17,7 @@ from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.images.image_points import MatchedPoints
 from twin.orbit.images.patch import Patch
-from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
+from twin.orbit.images.point_judgement import LineJudgement, MatchCounts, counts_of, judged, true_ground
 from twin.orbit.images.simulate_numbers import Georeference
 from twin.orbit.images.simulate_run import Simulation
 from twin.run.plain_data import plain_data
@@ -118,16 +118,9 @@ def georeference_data(run: Simulation) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class JudgedNumbers:
+class JudgedNumbers(MatchCounts):
     """Points of one sort in one line against the truth; RMS and mean of those that are not wrong."""
 
-    found: int
-    matched: int
-    accepted: int
-    wrong_found: int
-    wrong_matched: int
-    wrong_accepted: int
-    right_rejected_by_consensus: int
     rms_lines_px: float
     rms_pixels_px: float
     mean_lines_px: float
@@ -140,13 +133,7 @@ class JudgedNumbers:
     def of(cls, one: LineJudgement) -> Self:
         """Of one line."""
         return cls(
-            found=one.found,
-            matched=one.matched,
-            accepted=one.accepted,
-            wrong_found=one.wrong_found,
-            wrong_matched=one.wrong_matched,
-            wrong_accepted=one.wrong_accepted,
-            right_rejected_by_consensus=one.good_lost,
+            **counts_of([one]),
             rms_lines_px=float(one.rms[0]),
             rms_pixels_px=float(one.rms[1]),
             mean_lines_px=float(one.mean[0]),
