@@ -25,7 +25,7 @@ from twin.pictures.scene_file import write_scene
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings, run_command
 from twin.run.further_sections import further_sections
-from twin.run.page import place
+from twin.run.page import write_artefacts
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
 from twin.targets.edge_images import DIRECTIONS
@@ -123,12 +123,11 @@ def _write(run: RenderRun, session: Session, picture: bool) -> str:
     seconds, folder = session.seconds, session.folder
     session.advance(WRITE, 0, 1)
     write_data(run, folder)
-    folder.write_with("scene.glb", lambda place: write_scene(run.experiment, run.state, place))
+    folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
     sections = further_sections("render", run)
-    for artefact in (a for section in sections for a in section.artefacts):
-        folder.write_bytes(place(artefact), artefact.content())
+    write_artefacts((a for section in sections for a in section.artefacts), folder)
     folder.write_with("report.html", lambda file: write_report(run, file, sections))
-    folder.write_with("summary.png", lambda place: write_summary(run, place))
+    folder.write_with("summary.png", lambda file: write_summary(run, file))
     problem = ""
     if picture:
         instrument, write = run.experiment.instrument, folder.write_with

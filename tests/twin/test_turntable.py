@@ -183,7 +183,7 @@ def test_network_weights_stay_within_the_points(run: TurntableRun) -> None:
 
 
 def test_report(run: TurntableRun) -> None:
-    parts = sections(run)
+    parts = sections(run, turntable_numbers(run))
     artefacts = [artefact for part in parts for artefact in part.artefacts]
     assert len({artefact.name for artefact in artefacts}) == len(artefacts) == 5
     assert all(artefact.content() for artefact in artefacts)

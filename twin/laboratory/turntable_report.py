@@ -142,9 +142,8 @@ def _finish(*panels: Axes) -> None:
         plain_axes(axes)
 
 
-def sections(run: TurntableRun) -> tuple[Section, ...]:
-    """Comparison, and fits."""
-    result = turntable_numbers(run)
+def sections(run: TurntableRun, result: Mapping[str, Any]) -> tuple[Section, ...]:
+    """Comparison, and fits; result: the run's numbers."""
     return _comparison(run, result), _fits(run, result)
 
 
@@ -294,7 +293,7 @@ def turntable_report(run: TurntableRun) -> Report:
             ("RMS", "arcsec"),
             rows,
         ),
-        sections(run),
+        sections(run, data),
     )
 
 

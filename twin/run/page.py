@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
@@ -99,6 +99,12 @@ def place(artefact: Artefact) -> str:
     return f"artefacts/{artefact.name}.{artefact.kind}"
 
 
+def write_artefacts(artefacts: Iterable[Artefact], folder: RunFolder) -> None:
+    """Write artefacts to their places in an open run folder."""
+    for artefact in artefacts:
+        folder.write_bytes(place(artefact), artefact.content())
+
+
 def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
     """Sections as the templates want them."""
     return [
@@ -142,8 +148,7 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
     report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)
     folder.write_json(f"{kind}.json", described(kind, numbers))
-    for artefact in (report.summary, *(a for section in report.sections for a in section.artefacts)):
-        folder.write_bytes(place(artefact), artefact.content())
+    write_artefacts((report.summary, *(a for section in report.sections for a in section.artefacts)), folder)
     for name, frames in report.images.items():
         for file, content in frame_files(name, frames, stretch=None):
             folder.write_bytes(file, content)

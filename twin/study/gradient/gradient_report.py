@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from scenes.yaml.errors import key_text
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, plain, significant
-from twin.run.page import artefact_content, environment, place, reproduce
+from twin.run.page import artefact_content, environment, place, reproduce, write_artefacts
 from twin.run.run_folder import RunFolder
 from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
 from twin.run.versions import versions
@@ -49,8 +49,7 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder) -> None:
             ),
         ]
     tables: list[Artefact] = [response_table(found), factor_rows(found)]
-    for artefact in (*figures, *tables):
-        folder.write_bytes(place(artefact), artefact.content())
+    write_artefacts((*figures, *tables), folder)
     page = (
         environment(__package__)
         .get_template(TEMPLATE)
