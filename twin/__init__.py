@@ -1,1 +1,45 @@
-"""Perturb, render, detect: the commands of the twin and their reports."""
+"""Perturb, render, detect, recover: a digital twin of space mapping cameras and of their on-board monitor.
+
+    import twin
+
+    pair = twin.load("gf7_pair")
+    bent = pair.perturbed({"base/forward/M2": {"shift": "0 0 3 um"}})
+    shot = bent.render(frames=9, seed=1)
+    pair.recover(shot.before, shot.after).compare(shot.truth)
+
+Names below are imported when they are first used, so that a command starts no library that it does not need.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from scenes.yaml.errors import InputError
+    from twin.scripting.instrument import InstrumentTwin, load
+    from twin.scripting.results import Found, Shot
+    from twin.study.scripted import study
+
+__all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "load", "study"]
+
+_PLACES = {
+    "load": "twin.scripting.instrument",
+    "InstrumentTwin": "twin.scripting.instrument",
+    "Shot": "twin.scripting.results",
+    "Found": "twin.scripting.results",
+    "InputError": "scenes.yaml.errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "study":
+        # a package that can be called, see there
+        return importlib.import_module("twin.study")
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_PLACES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

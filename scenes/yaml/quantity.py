@@ -29,6 +29,8 @@ from scenes.yaml.units import (
     Kind,
     format_quantity,
     parse_quantity,
+    row_pattern,
+    split_row,
 )
 
 
@@ -98,7 +100,7 @@ class Quantity:
 @dataclass(frozen=True)
 class Vector:
     """Annotation that makes a tuple field a list of quantities of one sort and fixed length, in YAML `[0 um, 0 um, 3
-    um]`.
+    um]` or, with one unit for all, `0 0 3 um`.
     """
 
     of: Quantity
@@ -111,9 +113,13 @@ class Vector:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         item = self.of.__get_pydantic_json_schema__(schema, handler)
-        return {"type": "array", "items": item, "minItems": self.length, "maxItems": self.length}
+        listed = {"type": "array", "items": item, "minItems": self.length, "maxItems": self.length}
+        text = {"type": "string", "pattern": row_pattern(self.length), "description": item["description"]}
+        return {"anyOf": [listed, text]}
 
     def _check_length(self, value: object) -> object:
+        if isinstance(value, str):
+            value = split_row(value, self.length) or value
         if isinstance(value, list | tuple) and len(value) == self.length:
             return value
         example = ", ".join([self.of.kind.example] * self.length)

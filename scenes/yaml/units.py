@@ -134,6 +134,20 @@ def split_quantity(text: object) -> tuple[float, str] | None:
     return float(match[1]), match[2] or match[3]
 
 
+def split_row(text: str, length: int) -> list[str] | None:
+    """The quantities of a row of numbers with one unit after the last, `0 0 3 um`; None for anything else."""
+    words = text.split() if len(text) <= length * LONGEST_TEXT else []
+    numbers, unit = words[:length], " ".join(words[length:])
+    if len(numbers) == length and unit and all(_BARE.fullmatch(number) for number in numbers):
+        return [f"{number} {unit}" for number in numbers]
+    return None
+
+
+def row_pattern(length: int) -> str:
+    """Regular expression of a row of numbers with one unit, for editors."""
+    return rf"^(?:{_NUMBER}\s+){{{length}}}{_UNIT}$"
+
+
 def unit_ratio(unit: str, other: str) -> float:
     """What a number in ``unit`` is multiplied by to be one in ``other``; degrees Celsius are differences here.
 

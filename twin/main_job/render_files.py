@@ -34,7 +34,7 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             for file, content in frame_files(f"{channel.camera}_{channel.side}_{when}", frames):
                 folder.write_bytes(file, content)
-    folder.write_bytes("irradiance.nc", netcdf(_irradiance(run)))
+    folder.write_bytes("irradiance.nc", netcdf(irradiance(run)))
     if run.stray is not None:
         _write_numbers(folder, "stray", run.stray.to_dict())
     if run.course is not None:
@@ -69,7 +69,8 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
             folder.write_bytes(file, content)
 
 
-def _irradiance(run: RenderRun) -> xr.Dataset:
+def irradiance(run: RenderRun) -> xr.Dataset:
+    """Expected photons before and after, (state, channel, row, column), with stray light apart where it was traced."""
     photons = np.stack([run.photons_before, run.photons_after])
     images = _images(run, "state", ("state", ["before", "after"]), photons)
     if run.stray is not None:

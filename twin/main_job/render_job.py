@@ -69,6 +69,7 @@ def render_job(
     frames: int | None = None,
     seed: int | None = None,
     advance: Advance = silent,
+    experiment: MonitorExperiment | None = None,
 ) -> RenderRun:
     """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
 
@@ -79,6 +80,7 @@ def render_job(
         seed: of all noise; overrides the job's.
         advance: told of each of STAGES and of QUALITY when it begins and ends, and of the long parts COURSE, STRAY and
             TARGETS how many of how many times, paths or places are done.
+        experiment: the job's instrument where it has been built already; results are the same.
 
     Raises:
         InputError: an unknown node, or a perturbation so large that light misses the mirrors or a spot its CCD.
@@ -90,7 +92,7 @@ def render_job(
     check_targets(resolved)
     stage = _Stages(advance)
     stage.begin(0)
-    experiment = MonitorExperiment(resolved, backend)
+    experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
     check_nodes(resolved.job, experiment.instrument.nodes)
     stage.begin(1)
     course = resolved.job.course

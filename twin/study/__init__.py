@@ -1,1 +1,22 @@
-"""Design trade studies: a base job run many times with varied values, and what its results say."""
+"""Design trade studies: a base job run many times with varied values, and what its results say.
+
+In a script the package itself can be called, ``twin.study(pair, {...}, n=1000)``; see `twin.study.scripted.study`.
+"""
+
+import sys
+from types import ModuleType
+from typing import Any
+
+
+class _Study(ModuleType):
+    """The package, which is also a function: ``python -m twin.study`` and ``twin.study(...)`` have one name."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """See `twin.study.scripted.study`."""
+        # nothing of it is needed to import a part of the package
+        from twin.study.scripted import study
+
+        return study(*arguments, **options)
+
+
+sys.modules[__name__].__class__ = _Study

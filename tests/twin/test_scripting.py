@@ -1,0 +1,293 @@
+"""``import twin`` gives what the commands give, explains mistakes, and changes nothing behind one's back."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import twin
+from analysis.monitor.monitoring import PARAMETERS
+from analysis.monitor.recovery import ESTIMATORS
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import YamlFile, parse_yaml
+from twin.main_job.render_results import stated
+from twin.monitor.truth import trace_truth
+from twin.study.runs.setup import study_from_text
+from twin.study.scripted import config_text
+
+DESPACE = {"base/forward/M2": {"shift": "0 0 3 um"}}
+TURN = {"base/backward/focal_plane": {"rotate": "2 -1.5 10 arcsec", "pivot": "rear_node"}}
+
+
+@pytest.fixture(scope="module")
+def pair() -> twin.InstrumentTwin:
+    return twin.load("gf7_pair")
+
+
+@pytest.fixture(scope="module")
+def shot(pair: twin.InstrumentTwin) -> twin.Shot:
+    return pair.perturbed(DESPACE).perturbed(TURN).render(frames=9, seed=1)
+
+
+def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot, tmp_path: Path) -> None:
+    """The library's example is scenes/examples/perturb.yaml: frames to the byte, readings to what files state."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "twin.render", "scenes/examples/perturb.yaml", "--out", str(out), "--quiet"]
+    subprocess.run(command, check=True)
+    import tifffile
+
+    for when, frames in (("before", shot.before), ("after", shot.after)):
+        for key in frames.channel.values:
+            recorded = tifffile.imread(out / f"images/{key.replace('/', '_')}_{when}.tiff")
+            assert np.array_equal(recorded, frames.sel(channel=key))
+    recovered = json.loads((out / "recovered.json").read_text())
+    found = pair.recover(shot.before, shot.after)
+    for camera in pair.cameras:
+        for name in ESTIMATORS:
+            own = {key: float(found.values.sel(camera=camera, estimator=name, parameter=key)) for key in PARAMETERS}
+            own |= {
+                f"{key}_sigma": float(found.sigma.sel(camera=camera, estimator=name, parameter=key))
+                for key in PARAMETERS
+            }
+            assert stated(own) == {key: recovered["cameras"][camera][name][key] for key in own}
+    truth = json.loads((out / "truth.json").read_text())
+    for camera in pair.cameras:
+        for key in PARAMETERS:
+            assert float(shot.truth[key].sel(camera=camera)) == truth["cameras"][camera][key]
+    table = found.compare(shot.truth)
+    reading = recovered["cameras"]["forward"]["model"]["d_f_um"]
+    row = table.loc["forward", "d_f_um"]
+    assert row["model"] == pytest.approx(reading, rel=1e-5)
+    assert row["error"] == row["model"] - row["true"]
+    assert row["in_sigma"] == row["error"] / row["sigma"]
+    assert table.loc["both", "angle_change_arcsec"]["true"] == truth["intersection_angle"]["change_arcsec"]
+
+
+def test_a_file_loads_as_its_perturbations(pair: twin.InstrumentTwin, tmp_path: Path) -> None:
+    job = twin.load("scenes/examples/perturb.yaml")
+    same = pair.perturbed(TURN).perturbed(DESPACE)
+    assert job.perturbations == same.perturbations
+    # and back through the file that it writes
+    file = tmp_path / "config.yaml"
+    file.write_text(same.to_yaml())
+    assert twin.load(file).perturbations == same.perturbations
+    assert twin.load("scenes/library/instruments/gf7_pair.yaml").resolved.cameras == pair.resolved.cameras
+
+
+def test_what_a_state_is_does_not_depend_on_how_it_was_said(pair: twin.InstrumentTwin) -> None:
+    one, other = pair.perturbed(DESPACE).perturbed(TURN), pair.perturbed({**TURN, **DESPACE})
+    listed = pair.perturbed({"base/forward/M2": {"shift": ["0 mm", "0 nm", "0.003 mm"]}}).perturbed(TURN)
+    assert one.state == other.state == listed.state
+    # a node that is perturbed again has the new perturbation alone
+    assert pair.perturbed({"base/forward/M2": {"shift": "9 0 0 um"}}).perturbed(DESPACE).state == {
+        body: motion for body, motion in one.state.items() if body == "base/forward/M2"
+    }
+
+
+def test_values_are_immutable_and_the_instrument_is_built_once(pair: twin.InstrumentTwin) -> None:
+    bent = pair.perturbed(DESPACE)
+    assert not pair.perturbations
+    assert pair.state == {}
+    assert bent.experiment is pair.experiment
+    with pytest.raises(FrozenInstanceError):
+        bent.resolved = pair.resolved  # type: ignore[misc]
+
+
+def test_recover_takes_channels_by_name_and_refuses_other_frames(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
+    found = pair.recover(shot.before, shot.after)
+    turned = pair.recover(
+        shot.before.isel(channel=[3, 1, 0, 2]), shot.after.transpose("frame", "row", "column", "channel")
+    )
+    assert found.values.equals(turned.values)
+    assert found.covariance.equals(turned.covariance)
+    plain = pair.recover(shot.before.values, shot.after.values)
+    assert found.values.equals(plain.values)
+    with pytest.raises(ValueError, match=r"no frames of the channels forward/left"):
+        pair.recover(shot.before.isel(channel=[1, 2, 3]), shot.after)
+    with pytest.raises(ValueError, match=r"after: frames are .* = \(4, frames, 96, 96\), found \(4, 9, 96, 95\)"):
+        pair.recover(shot.before, shot.after.values[..., :-1])
+    with pytest.raises(ValueError, match="no centroid 'mean'"):
+        pair.recover(shot.before, shot.after, centroid="mean")
+
+
+def test_more_frames_never_hurt(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
+    few = pair.recover(shot.before[:, :3], shot.after[:, :3]).sigma
+    many = pair.recover(shot.before, shot.after).sigma
+    assert np.all(many < few)
+
+
+def test_the_jacobian_is_what_small_motions_do(pair: twin.InstrumentTwin) -> None:
+    """Central differences of the exact trace; the second order of half a unit is below 1e-3 of the largest entry."""
+    motions = {
+        "base/forward/M2 shift z": {"base/forward/M2": {"shift": "0 0 {} um"}},
+        "base/backward/focal_plane rotate x about rear_node": {
+            "base/backward/focal_plane": {"rotate": "{} 0 0 arcsec", "pivot": "rear_node"}
+        },
+        "base/backward scale": {"base/backward": {"scale": "{} ppm"}},
+        "base/forward/M1 figure Z5": {"base/forward/M1": {"figure": {"Z5": "{} nm"}}},
+    }
+    found = pair.jacobian(list(motions))
+    assert found.per.values.tolist() == ["um", "arcsec", "ppm", "nm"]
+    for name, perturb in motions.items():
+        states = [pair.perturbed(_with(perturb, amount)).state for amount in ("0.5", "-0.5")]
+        truth = trace_truth(pair.experiment.instrument, pair.experiment.backend, states)
+        for camera, change in truth.cameras.items():
+            vector = np.stack([change.d_alpha, change.d_beta, change.d_gamma]) * 648000 / np.pi
+            own = found.true.sel(camera=camera, motion=name)
+            assert own.values[:3] == pytest.approx(vector[:, 0] - vector[:, 1], abs=1e-6)
+            assert own.values[3] == pytest.approx(1e6 * (change.d_f[0] - change.d_f[1]), abs=1e-4)
+
+
+def _with(perturb: dict, amount: str) -> dict:
+    text = json.dumps(perturb).replace("{}", amount)
+    return json.loads(text)
+
+
+def test_the_jacobians_readings_are_those_of_the_crosstalk(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
+    table = shot.run.crosstalk["forward"]
+    found = pair.jacobian(["base/forward/M2 shift z about centre", "base/forward/M2 rotate y about centre"])
+    for k, label in enumerate(("M2 along Z", "M2 about Y")):
+        column = next(c for c, motion in enumerate(table.motions) if motion.label == label)
+        own = found.isel(motion=k)
+        assert own.spots.values[:2].ravel() == pytest.approx(table.spot_shift[:, column], rel=1e-12, abs=1e-15)
+        assert own.true.sel(camera="forward").values == pytest.approx(table.true[:, column], rel=1e-9, abs=1e-12)
+        for name in ESTIMATORS:
+            read = own.readings.sel(camera="forward", estimator=name).values
+            assert read == pytest.approx(table.readings[name][:, column], rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("motion", "found", "says"),
+    [
+        ("base/forward/M9 shift z", "'base/forward/M9'", "no such node"),
+        ("base/forward/M2 shfit z", "'shfit'", "did you mean 'shift'"),
+        ("base/forward/M2 shift w", "'base/forward/M2 shift w'", "not a motion of a node"),
+        ("base/forward/M2 shift", "'base/forward/M2 shift'", "not a motion of a node"),
+        ("base/forward/focal_plane figure Z5", "'figure'", "cannot be differentiated"),
+        ("base/forward/M2 figure Z0", "Z0", "not a Zernike term"),
+        ("base/forward/M2 rotate x about middle", "'middle'", "no such pivot"),
+        ("base temperature", "'temperature'", "cannot be differentiated"),
+        ("M2", "'M2'", "not a motion of a node"),
+    ],
+)
+def test_a_wrong_motion_is_explained(pair: twin.InstrumentTwin, motion: str, found: str, says: str) -> None:
+    with pytest.raises(twin.InputError) as error:
+        pair.jacobian([motion])
+    assert found in str(error.value)
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("perturb", "says"),
+    [
+        ({"base/forward/M9": {"shift": "0 0 3 um"}}, "did you mean 'base/forward/M3'"),
+        ({"base/forward/M2": {"shift": "0 3 um"}}, "not a list of 3 quantities"),
+        ({"base/forward/M2": {"shift": "0 0 3"}}, "not a list of 3 quantities"),
+        ({"base/forward/M2": {"shift": "0 0 3 arcsec"}}, "is a unit of an angle, not of a length"),
+        ({"base/forward/M2": {"shfit": "0 0 3 um"}}, "did you mean 'shift'"),
+        ({"base": {"shift": "0 0 3 um"}}, "does not allow shift"),
+    ],
+)
+def test_a_wrong_perturbation_is_explained(pair: twin.InstrumentTwin, perturb: dict, says: str) -> None:
+    with pytest.raises(twin.InputError, match=says):
+        pair.perturbed(perturb)
+
+
+def test_wrong_names_are_explained(pair: twin.InstrumentTwin) -> None:
+    with pytest.raises(twin.InputError, match="did you mean 'gf7_pair'"):
+        twin.load("gf7_par")
+    with pytest.raises(twin.InputError, match=r"no_such_file\.yaml"):
+        twin.load("no_such_file.yaml")
+    with pytest.raises(twin.InputError, match="did you mean 'frames'"):
+        pair.render(frame=3)
+    with pytest.raises(AttributeError, match="no attribute 'laod'"):
+        twin.laod  # noqa: B018
+
+
+def test_a_notebook_shows_values(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
+    found = pair.recover(shot.before, shot.after)
+    assert "base/forward/M2" in pair.perturbed(DESPACE)._repr_html_()
+    assert "not perturbed" in pair._repr_html_()
+    assert "paper_joint" in found._repr_html_()
+    assert "d_gamma_arcsec" in shot._repr_html_()
+    assert "rear_node" in pair.nodes.loc["base/backward/focal_plane"]["pivots"]
+
+
+def test_ranges_are_factors(pair: twin.InstrumentTwin) -> None:
+    vary = {
+        "base/forward/M2": {"shift": "0 1 (-5 .. 5) um", "figure": {"Z5": "(0 +- 20) nm"}},
+        "base/backward/focal_plane": {"rotate": ["(-2 .. 1) arcsec", "0 arcsec", "0 arcsec"], "pivot": "rear_node"},
+        "base": {"temperature": "(-1 .. 1) K"},
+    }
+    setup = study_from_text(config_text(pair, vary, 12, 3, "sobol"))
+    factors = {name: (factor.key, factor.kind, factor.numbers().values) for name, factor in setup.study.factors.items()}
+    place = ("job", "perturb")
+    assert factors == {
+        "forward_M2_shift_z": ((*place, "base/forward/M2", "shift", 2), "uniform", (-5.0, 5.0)),
+        "forward_M2_figure_Z5": ((*place, "base/forward/M2", "figure", "Z5"), "normal", (0.0, 20.0)),
+        "backward_focal_plane_rotate_x": ((*place, "base/backward/focal_plane", "rotate", 0), "uniform", (-2.0, 1.0)),
+        "base_temperature": ((*place, "base", "temperature", "change"), "uniform", (-1.0, 1.0)),
+    }
+    assert setup.study.design.runs == 12
+    assert setup.study.design.seed == 3
+    # what does not vary stays, and stands in the base
+    assert setup.tree["job"]["perturb"]["base/forward/M2"]["shift"][1] == "1 um"
+    assert setup.study.responses["forward_d_f"].units == "um"
+
+
+@pytest.mark.parametrize(
+    ("vary", "says"),
+    [
+        ({"base/forward/M2": {"shift": "0 0 3 um"}}, "nothing varies"),
+        ({"base/forward/M2": {"shift": "0 (3 . 4) 0 um"}}, "not a range"),
+        ({"base/forward/M2": {"shift": "0 0 (3 .. 4)"}}, "not a range"),
+        ({"base/forward/M2": {"shift": "0 0 (4 .. 3) um"}}, "the range is empty"),
+        ({"base/forward/M2": {"shft": "0 0 (3 .. 4) um"}}, "did you mean 'shift'"),
+        ({"base/forward/M9": {"shift": "0 0 (3 .. 4) um"}}, "no such node"),
+        ({"base/forward/M2": "(3 .. 4) um"}, "not a perturbation"),
+        ({"base/forward/M2": {"shift": "0 0 (3 .. 4) arcsec"}}, "unit of an angle"),
+    ],
+)
+def test_a_wrong_range_is_explained(pair: twin.InstrumentTwin, vary: dict, says: str) -> None:
+    with pytest.raises(twin.InputError, match=says):
+        config_text(pair, vary, 10, 0, "sobol")
+
+
+@pytest.mark.slow
+def test_a_study_runs_from_a_script_without_a_guard(tmp_path: Path) -> None:
+    """Its workers do not run the script again, and the first run is what rendering its values gives."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import twin\n"
+        "print('once')\n"
+        "pair = twin.load('gf7_pair')\n"
+        "found = twin.study(pair, {'base/forward/M2': {'shift': '0 0 (-5 .. 5) um'}}, n=4, quiet=True)\n"
+        f"found.to_netcdf({str(tmp_path / 'found.nc')!r}, engine='h5netcdf')\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(twin.__file__).parent.parent)}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["once"]
+    found = xr.open_dataset(tmp_path / "found.nc", engine="h5netcdf")
+    pair = twin.load("gf7_pair")
+    for run in range(4):
+        value = float(found.forward_M2_shift_z[run])
+        truth = pair.perturbed({"base/forward/M2": {"shift": f"0 0 {value!r} um"}}).render(frames=1).truth
+        assert float(found.forward_d_f_true[run]) == pytest.approx(float(truth.d_f_um.sel(camera="forward")), rel=1e-9)
+
+
+def test_a_row_with_one_unit_is_a_list() -> None:
+    from scenes.specs.job import PerturbationSpec
+
+    text = "shift: 0 -1.5 3e1 um\nrotate: 1 2 3 arcsec"
+    one = validate(PerturbationSpec, parse_yaml(text))
+    other = validate(
+        PerturbationSpec,
+        YamlFile("", {"shift": ["0 um", "-1.5 um", "30 um"], "rotate": ["1 arcsec", "2 arcsec", "3 arcsec"]}, {}),
+    )
+    assert one == other

@@ -1,0 +1,1 @@
+"""The twin as a library: what ``import twin`` offers."""

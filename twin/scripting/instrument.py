@@ -1,0 +1,263 @@
+"""An instrument in a script: load it, perturb it, render it, recover what happened from the images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.recovery import CENTROIDS, ESTIMATORS, recover
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend, load_backend
+from scenes.specs.job import JobSpec, NodeInfo, check_nodes
+from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.main_job.render_job import render_job
+from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import truth_jacobian
+from twin.scripting.motion_names import motion_named
+from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
+from twin.scripting.results import shot_of as _shot_of
+
+
+class _Bench:
+    """An instrument that is built once, whatever is then done to it."""
+
+    def __init__(self, resolved: ResolvedJob, backend: str) -> None:
+        self._resolved, self._name = resolved, backend
+
+    @cached_property
+    def backend(self) -> Backend:
+        return load_backend(self._name)
+
+    @cached_property
+    def experiment(self) -> MonitorExperiment:
+        return MonitorExperiment(self._resolved, self.backend)
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentTwin:
+    """An instrument with its cameras, detectors and autocollimation monitor, perturbed or not. Immutable.
+
+    Made by `load` and by `perturbed`. Copies share what was built and calibrated, so that a loop over perturbations
+    pays for the instrument once.
+
+    Attributes:
+        resolved: the job that it stands for, with everything that it names.
+    """
+
+    resolved: ResolvedJob
+    _bench: _Bench = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """Of the instrument."""
+        return self.resolved.instrument.name
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of its cameras."""
+        return tuple(self.resolved.instrument.cameras)
+
+    @property
+    def perturbations(self) -> Mapping[str, Any]:
+        """Node -> what happens to it, with the keys and unit strings of the YAML."""
+        plain = self.resolved.job.plain().get("perturb", {})
+        return {
+            node: {key: plain[node][key] for key in (*what.uses(), *_pivot(what.uses(), plain[node]))}
+            for node, what in self.resolved.job.perturb.items()
+        }
+
+    @property
+    def nodes(self) -> pd.DataFrame:
+        """Every body that can be perturbed: what may be done to it, and its pivots."""
+        rows = {
+            path: {"allows": ", ".join(sorted(info.allows)), "pivots": ", ".join(info.pivots)}
+            for path, info in self._nodes.items()
+        }
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("node")
+
+    @property
+    def _nodes(self) -> Mapping[str, NodeInfo]:
+        return self._bench.experiment.instrument.nodes
+
+    @property
+    def experiment(self) -> MonitorExperiment:
+        """The modelled instrument itself, for what this class does not offer."""
+        return self._bench.experiment
+
+    @cached_property
+    def state(self) -> State:
+        """Body -> motion, SI: what the perturbations come to, deformations by heat included.
+
+        Raises:
+            InputError: a temperature for which the materials have no data.
+        """
+        return self._bench.experiment.state(self.resolved.job)
+
+    def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> InstrumentTwin:
+        """The same instrument with these bodies perturbed.
+
+        Args:
+            perturb: node -> keys and unit strings of `perturb:` in a job's YAML, such as ``{"shift": "0 0 3 um"}``.
+                A node that is perturbed already gets this in place of what it had; others keep theirs.
+
+        Raises:
+            InputError: no such node, or nothing that can be done to it.
+        """
+        plain = self.resolved.job.plain()
+        plain["perturb"] = {**plain.get("perturb", {}), **perturb}
+        twin = self._with_job(plain)
+        check_nodes(twin.resolved.job, self._nodes)
+        return twin
+
+    def render(self, frames: int | None = None, seed: int | None = None, **render: Any) -> Shot:
+        """Render the nominal and the perturbed instrument, and expose its detectors.
+
+        Args:
+            frames: of each exposure; the job's or the instrument's own number if not given.
+            seed: of all noise; the job's (1 unless it says otherwise) if not given.
+            render: further keys of `render:` in a job's YAML, such as ``stray=True``, ``quality=True`` or
+                ``images=["spots", "knife_edge"]``.
+
+        Raises:
+            InputError: a wrong key, or a perturbation so large that light misses the mirrors or a spot its CCD.
+        """
+        plain = self.resolved.job.plain()
+        given = {"frames": frames, "seed": seed}
+        plain["render"] = {
+            **plain.get("render", {}),
+            **{key: value for key, value in given.items() if value is not None},
+            **render,
+        }
+        job = self._with_job(plain).resolved
+        return _shot_of(render_job(job, self._bench.backend, experiment=self._bench.experiment))
+
+    def recover(self, before: Any, after: Any, centroid: str | None = None) -> Found:
+        """What every estimator reads from images, given the calibration of the unperturbed instrument alone.
+
+        Args:
+            before: frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
+                ``shot.before.channel``; a DataArray or an array.
+            after: of the perturbed one.
+            centroid: ``ml`` (the calibrated shape of the spot), ``gaussian`` or ``energy``; the job's if not given.
+
+        Raises:
+            ValueError: frames of another shape, or no such centroid.
+            SpotError: a spot cannot be measured.
+        """
+        method = self.resolved.job.analysis.centroid if centroid is None else centroid
+        if method not in CENTROIDS:
+            raise ValueError(f"no centroid {method!r}; there are {', '.join(CENTROIDS)}")
+        experiment = self._bench.experiment
+        path = experiment.path
+        keys = [channel.key for channel in path.channels]
+        first = as_frames(before, "before", keys, path.shape)
+        second = as_frames(after, "after", keys, path.shape)
+        recovery = recover(first, second[None], experiment.calibration, method)
+        return found_table(recovery, list(self.cameras), keys)
+
+    def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
+        """Exact derivatives by elementary motions, about the unperturbed instrument.
+
+        Args:
+            motions: such as ``base/forward/M2 shift z``, ``base/backward/focal_plane rotate x about rear_node``,
+                ``base/forward scale`` or ``base/forward/M1 figure Z5``.
+
+        Returns:
+            Per um, arcsec, ppm or nm of each motion (coordinate ``per``): ``spots`` (channel, axis, motion), px;
+            ``true`` (camera, parameter, motion), the traced change; ``readings`` (camera, estimator, parameter,
+            motion), what each estimator makes of the spots. Parameters are in arcsec and um, as their names end.
+
+        Raises:
+            InputError: no such node, pivot or motion.
+        """
+        experiment = self._bench.experiment
+        names = list(self.cameras)
+        keys = [channel.key for channel in experiment.path.channels]
+        chosen = [motion_named(text, self._nodes) for text in motions]
+        size = np.array([motion.unit_size for motion in chosen])
+        spots = spot_jacobian(experiment.path, chosen)
+        truth = truth_jacobian(experiment.instrument, self._bench.backend, chosen)
+        readings = [
+            [
+                PER_SI[:, None]
+                * (estimator.coefficients(experiment.cameras[name]) @ spots[2 * k : 2 * k + 2].reshape(4, -1))
+                * size
+                for estimator in ESTIMATORS.values()
+            ]
+            for k, name in enumerate(names)
+        ]
+        true = np.stack([PER_SI[:, None] * truth[name] * size for name in names])
+        return xr.Dataset(
+            {
+                "spots": (("channel", "axis", "motion"), spots * size, {"units": "px"}),
+                "true": (("camera", "parameter", "motion"), true),
+                "readings": (("camera", "estimator", "parameter", "motion"), np.array(readings)),
+            },
+            coords={
+                "motion": list(motions),
+                "per": ("motion", [motion.unit for motion in chosen]),
+                "channel": keys,
+                "axis": ["row", "column"],
+                "camera": names,
+                "parameter": list(PARAMETERS),
+                "estimator": list(ESTIMATORS),
+            },
+        )
+
+    def to_yaml(self) -> str:
+        """A job file that stands for this instrument and needs no other file; `load` and the commands read it."""
+        return self.resolved.to_yaml()
+
+    def _with_job(self, plain: Mapping[str, Any]) -> InstrumentTwin:
+        source = self.resolved.job.source
+        job = validate(JobSpec, YamlFile("", dict(plain), {})).with_source(source)
+        assert isinstance(job, JobSpec)
+        if job.render.target_images and self.resolved.line_detectors is None:
+            return InstrumentTwin(resolve_job(job), self._bench)
+        return InstrumentTwin(self.resolved.model_copy(update={"job": job}), self._bench)
+
+    def __repr__(self) -> str:
+        moved = ", ".join(self.resolved.job.perturb) or "nothing"
+        return f"<{self.name}: cameras {', '.join(self.cameras)}; perturbed: {moved}>"
+
+    def _repr_html_(self) -> str:
+        return name_html(self.name, self.cameras, self.perturbations)
+
+
+def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
+    return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
+
+
+def load(what: str | Path, backend: str = "llvm") -> InstrumentTwin:
+    """An instrument to work with.
+
+    Args:
+        what: name of an instrument in the library (``gf7_pair``), or path of an instrument's file, of a job, or of the
+            config.yaml of a run; a job's perturbations come with it.
+        backend: where to trace, ``llvm`` or ``cuda``.
+
+    Raises:
+        InputError: no such name, or a file that cannot be read or is not valid, with line and key.
+        BackendUnavailable: this machine does not have it.
+    """
+    text = str(what)
+    if text not in library_names(INSTRUMENTS) or isinstance(what, Path):
+        data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}
+        if isinstance(data, dict) and ("job" in data or "instrument" in data):
+            resolved = resolve(what)
+            return InstrumentTwin(resolved, _Bench(resolved, backend))
+        text = str(Path(what).resolve()) if data else text
+    resolved = resolve_job(validate(JobSpec, YamlFile("", {"instrument": text}, {})))
+    return InstrumentTwin(resolved, _Bench(resolved, backend))

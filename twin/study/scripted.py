@@ -1,0 +1,196 @@
+"""A study from a script: ranges in place of numbers in what perturbs an instrument."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, Protocol
+
+import xarray as xr
+
+from analysis.monitor.monitoring import PARAMETERS
+from scenes.specs.resolved import ResolvedJob
+from scenes.specs.study import StudySpec
+from scenes.yaml.errors import InputError, Issue, KeyPath, shown
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import YamlFile, dump_yaml
+from twin.study.runs.config_tree import Tree
+
+_NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+_RANGE = re.compile(rf"\(\s*({_NUMBER})\s*(\.\.|±|\+-)\s*({_NUMBER})\s*\)")
+_FORMS = "'(-5 .. 5) um' for an even spread, '(0 +- 2) um' for a normal one, also in a row: '0 0 (-5 .. 5) um'"
+
+
+class Perturbed(Protocol):
+    """What can be varied: an instrument as `twin.load` gives it."""
+
+    @property
+    def resolved(self) -> ResolvedJob:
+        """The job that it stands for."""
+
+    def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
+        """The same with these bodies perturbed; InputError where that cannot be."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A number that varies.
+
+    Attributes:
+        key: where it stands below ``perturb``.
+        factor: how it varies, as a study's file says it.
+    """
+
+    key: KeyPath
+    factor: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Of the factor: ``forward_M2_shift_z``."""
+        node, *rest = (str(part) for part in self.key)
+        parts = [node.removeprefix("base/").replace("/", "_"), *rest]
+        if self.key[1] in ("shift", "rotate") or parts[-2:-1] == ["gradient"]:
+            parts[-1] = "xyz"[int(parts[-1])]
+        return "_".join(part for part in parts if part != "change")[:60]
+
+
+def study(
+    instrument: Perturbed,
+    vary: Mapping[str, Mapping[str, Any]],
+    n: int = 100,
+    *,
+    seed: int = 0,
+    design: str = "latin_hypercube",
+    responses: Mapping[str, Mapping[str, Any]] | None = None,
+    workers: int | None = None,
+    out: str | Path | None = None,
+    quiet: bool = False,
+) -> xr.Dataset:
+    """Perturb, render and recover an instrument many times, on all cores.
+
+    Args:
+        instrument: as it is at the beginning; its other perturbations stay.
+        vary: node -> keys of a perturbation with ranges in place of numbers, ``{"shift": "0 0 (-5 .. 5) um"}``: an even
+            spread from -5 to 5; ``(0 +- 2)`` is a normal one with sigma 2.
+        n: number of runs.
+        seed: of the design; the noise of each run has a stream of its own.
+        design: ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
+        responses: name -> ``{"key": [...], "sigma": [...]}`` as in a study's file; by default readings of the model and
+            true values of every camera's parameters and of the angle between two cameras.
+        workers: number of processes; one for each core if not given.
+        out: folder of the study, with its report, which stays; none is kept if not given.
+        quiet: show no progress.
+
+    Returns:
+        A value of every factor and response for each ``run``; runs whose light is lost are ``failed``, with a
+        ``message``.
+
+    Raises:
+        InputError: nothing varies, a range of another form, or what a job's file would not be allowed to say.
+        RuntimeError: the study could not be completed; the message says why.
+    """
+    config = config_text(instrument, vary, n, seed, design, responses)
+    with tempfile.TemporaryDirectory(prefix="twin-study-") as place:
+        file, target = Path(place) / "config.yaml", Path(place) / "study" if out is None else Path(out)
+        file.write_text(config, "utf-8")
+        # A process of its own: workers started from here would run the caller's script once more, each of them.
+        command = [sys.executable, "-m", "twin.study", str(file), "--out", str(target), "--yes", "--json"]
+        command += [] if workers is None else ["--workers", str(workers)]
+        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE if quiet else None, text=True)
+        if done.returncode:
+            why = f": {done.stderr.strip()}" if quiet else "; see above"
+            raise RuntimeError(f"the study ended with exit code {done.returncode}{why}")
+        with xr.open_dataset(target / "study.nc", engine="h5netcdf") as data:
+            return data.load()
+
+
+def config_text(
+    instrument: Perturbed,
+    vary: Mapping[str, Mapping[str, Any]],
+    n: int,
+    seed: int,
+    design: str,
+    responses: Mapping[str, Mapping[str, Any]] | None = None,
+) -> str:
+    """The config.yaml of the study; arguments and errors as `study`."""
+    spreads: list[Spread] = []
+    middle: dict[str, Any] = {}
+    for node, what in vary.items():
+        if not isinstance(what, Mapping):
+            raise _wrong("not a perturbation", (node,), shown(what))
+        middle[node] = {key: _taken(value, (node, key), spreads) for key, value in what.items()}
+    if not spreads:
+        raise InputError(Issue("nothing varies", key=("vary",), allowed=_FORMS))
+    resolved = instrument.perturbed(middle).resolved
+    named = {"factors": {s.name: {"key": ["job", "perturb", *s.key], **s.factor} for s in spreads}}
+    about = {
+        "name": resolved.instrument.name,
+        "base": {"command": "render", "file": "config.yaml"},
+        **named,
+        "design": {"kind": design, "runs": n, "seed": seed},
+        "responses": _responses(resolved) if responses is None else {k: dict(v) for k, v in responses.items()},
+    }
+    spec = validate(StudySpec, YamlFile("", about, {}))
+    return dump_yaml({"study": spec.plain(), "base": resolved.plain()})
+
+
+def _responses(resolved: ResolvedJob) -> Tree:
+    """Of every camera what the model reads, with its sigma, and what is true."""
+    out: Tree = {}
+    for camera in resolved.instrument.cameras:
+        for key in PARAMETERS:
+            short = key.rpartition("_")[0]
+            read = ["recovered", "cameras", camera, "model", key]
+            out[f"{camera}_{short}"] = {"key": read, "sigma": [*read[:-1], f"{key}_sigma"]}
+            out[f"{camera}_{short}_true"] = {"key": ["truth", "cameras", camera, key]}
+    if len(resolved.instrument.cameras) == 2:
+        read = ["recovered", "intersection_angle", "model"]
+        out["angle_change"] = {"key": [*read, "change_arcsec"], "sigma": [*read, "change_arcsec_sigma"]}
+        out["angle_change_true"] = {"key": ["truth", "intersection_angle", "change_arcsec"]}
+    return out
+
+
+def _taken(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
+    """The value with the middle of each range in its place; the ranges go to ``spreads``."""
+    if isinstance(value, Mapping):
+        return {name: _taken(part, (*key, name), spreads) for name, part in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_taken(part, (*key, k), spreads) for k, part in enumerate(value)]
+    if not isinstance(value, str) or "(" not in value:
+        return value
+    place = (*key, "change") if key[-1] == "temperature" else key
+    ranges = {f"@{k}": match for k, match in enumerate(_RANGE.finditer(value))}
+    names = iter(ranges)
+    words = _RANGE.sub(lambda match: f" {next(names)} ", value).split()
+    numbers = list(takewhile(lambda word: word in ranges or re.fullmatch(_NUMBER, word), words))
+    unit = " ".join(words[len(numbers) :])
+    if not unit or "(" in unit or not set(ranges) <= set(numbers):
+        raise _wrong("not a range", key, shown(value))
+    row = len(numbers) > 1
+    for k, word in enumerate(numbers):
+        if word in ranges:
+            spreads.append(Spread((*place, k) if row else place, _factor(ranges[word], unit)))
+    middle = [f"{_middle(ranges[word])}" if word in ranges else word for word in numbers]
+    return [f"{number} {unit}" for number in middle] if row else f"{middle[0]} {unit}"
+
+
+def _middle(match: re.Match[str]) -> float:
+    first, second = float(match[1]), float(match[3])
+    return 0.5 * (first + second) if match[2] == ".." else first
+
+
+def _factor(match: re.Match[str], unit: str) -> Mapping[str, Any]:
+    first, second = f"{match[1]} {unit}", f"{match[3]} {unit}"
+    if match[2] == "..":
+        return {"uniform": [first, second]}
+    return {"normal": {"mean": first, "sigma": second}}
+
+
+def _wrong(problem: str, key: KeyPath, found: str) -> InputError:
+    return InputError(Issue(problem, key=("vary", *key), found=found, allowed=_FORMS))
