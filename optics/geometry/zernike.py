@@ -30,6 +30,30 @@ def noll_to_nm(index: int) -> tuple[int, int]:
     return n, (m if index % 2 == 0 else -m) if m else 0
 
 
+_FAMILIES = ("spherical aberration", "coma", "astigmatism", "trefoil", "tetrafoil", "pentafoil", "hexafoil")
+_RANKS = ("", "secondary ", "tertiary ", "quaternary ", "fifth ")
+
+
+def name(index: int) -> str:
+    """What a Noll index is called: ``defocus``, ``coma x``, ``secondary astigmatism 45 deg``.
+
+    The direction is that in which the term is largest at the edge: x and y of tilt and coma, else an angle from x.
+    """
+    n, signed = noll_to_nm(index)
+    m = abs(signed)
+    if n == 0:
+        return "piston"
+    if n == 2 and m == 0:
+        return "defocus"
+    rank = _RANKS[n // 2 - 2] if m == 0 else _RANKS[(n - m) // 2 - (m == 1)] if n > 1 else ""
+    family = "tilt" if n == 1 else _FAMILIES[m] if m < len(_FAMILIES) else f"{m}-foil"
+    if m == 0:
+        return f"{rank}{family}"
+    if m == 1:
+        return f"{rank}{family} {'x' if signed > 0 else 'y'}"
+    return f"{rank}{family} {0.0 if signed > 0 else 90.0 / m:g} deg"
+
+
 @cache
 def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
     """Terms (a, b, c) of Z_j(x, y) = sum c x^a y^b on the unit disk."""

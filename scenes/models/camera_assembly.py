@@ -73,6 +73,12 @@ def camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]
 ROOT = "camera"
 
 
+def camera_alone(model: CameraModel) -> Assembly:
+    """The camera by itself: bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ..."""
+    tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
+    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model))
+
+
 @dataclass(frozen=True, eq=False)
 class CameraUnderTest:
     """A camera ready to be traced.
@@ -95,15 +101,13 @@ def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backe
         InputError: ``as_built`` names what the camera does not have.
     """
     model = derive_camera(camera, backend)
-    elements = camera_elements(ROOT, ROOT, model)
-    tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
-    assembly = Assembly(tree, elements, camera_sequences(ROOT, model))
-    shaped = {e.body for e in elements.values() if e.interaction is Interaction.REFLECT}
+    assembly = camera_alone(model)
+    shaped = {e.body for e in assembly.elements.values() if e.interaction is Interaction.REFLECT}
     nodes = {
         body.path.removeprefix(f"{ROOT}/"): NodeInfo(
             tuple(body.pivots), frozenset({"rotate", "shift", *(("figure",) if body.path in shaped else ())})
         )
-        for body in tree.bodies
+        for body in assembly.tree.bodies
         if body.path != ROOT
     }
     issues = [

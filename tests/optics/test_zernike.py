@@ -79,3 +79,24 @@ def test_monomials_are_the_same_polynomial() -> None:
     )
     want = sum(a * zernike.zernike(j, x / radius, y / radius) for j, a in terms.items())
     np.testing.assert_allclose(got, want, atol=1e-19)
+
+
+def test_names_say_where_a_term_is_largest() -> None:
+    angle = np.deg2rad(np.arange(0.0, 180.0, 0.5))
+    for index in range(2, zernike.MAX_NOLL + 1):
+        _, m = zernike.noll_to_nm(index)
+        name = zernike.name(index)
+        edge = zernike.zernike(index, np.cos(angle), np.sin(angle))
+        if m:
+            where = {"x": 0.0, "y": 90.0}.get(name.split()[-1])
+            where = float(name.split()[-2]) if where is None else where
+            there = zernike.zernike(index, np.cos(np.deg2rad(where)), np.sin(np.deg2rad(where)))
+            assert np.isclose(there, np.max(edge), rtol=1e-3), name  # steps of half a degree miss the largest by that
+            assert not np.any(edge[angle < 0.9 * np.deg2rad(where)] > 0.999 * there), name  # and it is the first
+    names = [zernike.name(index) for index in range(1, zernike.MAX_NOLL + 1)]
+    assert len(set(names)) == len(names)
+    noll = {1: "piston", 2: "tilt x", 3: "tilt y", 4: "defocus", 5: "astigmatism 45 deg", 6: "astigmatism 0 deg"}
+    noll |= {7: "coma y", 8: "coma x", 9: "trefoil 30 deg", 11: "spherical aberration", 17: "secondary coma y"}
+    noll |= {12: "secondary astigmatism 0 deg", 14: "tetrafoil 0 deg", 22: "secondary spherical aberration"}
+    noll |= {37: "tertiary spherical aberration", 35: "7-foil 12.8571 deg", 30: "tertiary coma x"}
+    assert {index: zernike.name(index) for index in noll} == noll

@@ -60,6 +60,24 @@ class LocalMap:
         return np.asarray(self.coefficients[1:3].T / self.scale)
 
 
+@dataclass(frozen=True, eq=False)
+class LineRays:
+    """Rays of F beams, N each, where they meet the line CCD, in its own frame: X' along the track, Y' along the line.
+
+    Attributes:
+        position, direction: (F, N, 3), metres and unit.
+        path: optical path from the incoming plane wavefront, (F, N), metres.
+        valid: False where an aperture stops the ray, (F, N).
+        size: of the line CCD relative to nominal.
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    valid: np.ndarray
+    size: float
+
+
 def _monomials(q: np.ndarray) -> np.ndarray:
     powers = [(a - b, b) for a in range(MAP_ORDER + 1) for b in range(a + 1)]
     return np.stack([q[..., 0] ** a * q[..., 1] ** b for a, b in powers], axis=-1)
@@ -134,12 +152,23 @@ class TargetPath:
         Raises:
             BeamMissedError: a chief ray does not reach the line CCD.
         """
+        rays = self.rays(state, directions, np.zeros((1, 2)))
+        return np.asarray(rays.position[:, 0, 1::-1] / rays.size)
+
+    def rays(self, state: State, directions: np.ndarray, points: np.ndarray) -> LineRays:
+        """Rays of beams of directions (F, 3), world, through points (N, 2) of the stop in units of its radius.
+
+        Raises:
+            AimError: a beam does not reach the stop.
+            BeamMissedError: nothing of one reaches the line CCD.
+        """
         systems, to_stop = self._systems(state, len(directions))
-        launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), self._stop_centre)
+        target = self.stop.radius * points + np.array(self.stop.centre)
+        launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), target)
         traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]))
-        position, _, _, valid = traced.numpy()
+        position, leaving, path, valid = traced.numpy()
         require_some(valid, "the imaging path")
-        return np.asarray(position[:, 0, 1::-1] / systems.size[:, None])
+        return LineRays(position, leaving, path, valid, float(systems.size[0]))
 
     def pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, target_shift: float = 0.0
@@ -208,10 +237,6 @@ class TargetPath:
         """Points of the beams before the first mirror, world, (F, 3)."""
         first = self.assembly.nominal_pose(f"{self.root}/{self.model.mirrors[0]}").translation
         return np.asarray(first - LAUNCH_DISTANCE * directions)
-
-    @property
-    def _stop_centre(self) -> np.ndarray:
-        return np.array(self.stop.centre)[None]
 
     def _systems(self, state: State, count: int, placed: PlacedBodies | None = None) -> tuple[SystemBatch, SystemBatch]:
         """The way to the line CCD and the way to the stop, once for every direction."""

@@ -1,0 +1,126 @@
+"""One camera as designers look at it: wavefront, spot and MTF at fields, against other ways to the same numbers."""
+
+import numpy as np
+import pytest
+
+from optics.geometry.tree import Motion
+from optics.waves.diffraction import airy
+from optics.waves.pupil_function import circular_pupil
+from optics.waves.transfer import transfer
+from scenes.models.camera_model import field_direction
+from scenes.specs.load import load_camera
+from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_view import CameraView
+from twin.monitor.image_quality import image_quality
+from twin.sensors.line_ccd import band_factors, band_wavelengths
+
+FIELDS = [(0.0, 0.0), (1.0, 0.0), (0.3, -1.0)]
+MOVED = {"base/forward/M2": Motion(shift=(20e-6, -10e-6, 30e-6), rotate=(0.0, 2e-5, 0.0))}
+
+
+@pytest.fixture(scope="module")
+def gf7_alone(backend, gf7) -> CameraOptics:
+    return CameraOptics.alone(gf7, backend)
+
+
+def test_wavefronts_and_spots_of_rays_traced_in_the_prescription_frame(backend, gf7, gf7_alone) -> None:
+    """Other launch points, another frame, another rule over the pupil: the same numbers."""
+    for wave, spot in zip(gf7_alone.wavefronts(FIELDS), gf7_alone.spots(FIELDS), strict=True):
+        x, y = wave.field[0] * gf7.spec.field.x, wave.field[1] * gf7.spec.field.y
+        rays = bundle(backend, gf7, x, y)
+        assert wave.rms == pytest.approx(wavefront_error(gf7, rays), rel=1e-6)
+        assert spot.rms == pytest.approx(rms_spot(rays[0]), rel=1e-6)
+        # prescription x is along the line, y along the track; the focal plane's centre is that of the field
+        assert wave.place[0] == pytest.approx(rays[0][0, 0], abs=1e-12)
+        assert wave.place[1] == pytest.approx(rays[0][0, 1] - gf7.focal_plane.translation[1], abs=1e-12)
+
+
+def test_zernike_terms_make_the_map_and_its_rms(gf7_alone) -> None:
+    wave = gf7_alone.wavefront((1.0, 1.0))
+    assert np.sqrt(np.sum(wave.coefficients[3:] ** 2)) == pytest.approx(wave.rms, rel=1e-6)
+    np.testing.assert_allclose(wave.coefficients[:3], 0.0, atol=1e-9)  # piston and tilt are out
+    assert wave.residual < 1e-6
+    assert wave.peak_to_valley == pytest.approx(np.nanmax(wave.map) - np.nanmin(wave.map), rel=0.02)
+    # Marechal's series is right to its next term
+    assert wave.strehl == pytest.approx(np.exp(-((2 * np.pi * wave.rms) ** 2)), abs=(2 * np.pi * wave.rms) ** 4)
+
+
+def test_a_defocused_focal_plane_is_the_term_of_defocus(gf7_alone) -> None:
+    """dz along the light changes the path by dz (cos - 1): dz NA^2 / (4 sqrt 3) rms of Z4."""
+    dz = 50e-6
+    f_number = gf7_alone.spot().airy / 1.22 / 650e-9
+    # the light comes along the focal plane's +Z
+    downstream = gf7_alone.perturbed({"camera/focal_plane": Motion(shift=(0.0, 0.0, dz))})
+    change = downstream.wavefront().coefficients - gf7_alone.wavefront().coefficients
+    size = dz / (2 * f_number) ** 2 / (4 * np.sqrt(3)) / 650e-9
+    # positive: an image before the detector has a wavefront that is bent too much, ahead at the edge
+    assert change[3] == pytest.approx(size, rel=0.01)  # the beam is 2 % elliptic
+    assert np.max(np.abs(np.delete(change, 3))) < 0.05 * size
+    assert downstream.spot().rms == pytest.approx(gf7_alone.spot(defocus=dz).rms, rel=1e-9)
+
+
+def test_mtf_of_a_nearly_perfect_camera_is_that_of_a_round_pupil(gf7_alone) -> None:
+    """The hand formula 2/pi (acos s - s sqrt(1 - s^2)) with the beam's own F-number."""
+    mtf = gf7_alone.mtf()
+    f_number = gf7_alone.spot().airy / 1.22 / 650e-9
+    s = np.minimum(mtf.frequency * 650e-9 * f_number, 1.0)
+    hand = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s**2))
+    # the beam is 2 % wider in one direction than in the other, about the round one
+    np.testing.assert_allclose(np.sqrt(mtf.limit[0] * mtf.limit[1])[:-1], hand[:-1], atol=2e-3)
+    assert np.all(mtf.values <= mtf.limit + 1e-6)
+    # the phase between two points of the pupil has at most 4 times the variance of one, and half of it is lost
+    assert 0.0 < np.max(mtf.limit - mtf.values) < 2.0 * (2.0 * np.pi * gf7_alone.wavefront().rms) ** 2
+    ideal = transfer(circular_pupil(f_number), mtf.frequency[:, None] * [1.0, 0.0], 650e-9, np.zeros(1))[0]
+    np.testing.assert_allclose(np.abs(ideal), hand, atol=1e-4)
+    assert airy(np.array([gf7_alone.spot().airy]), 650e-9, f_number)[0] < 1e-5  # the first dark ring
+
+
+@pytest.mark.parametrize("obstruction", [False, True])
+def test_the_same_as_image_quality_says_in_an_instrument(backend, gf7_pair, obstruction: bool) -> None:
+    """It looks at the pixel, this at the direction, whose image has moved by some micrometres."""
+    quality = image_quality(gf7_pair, backend, [MOVED], fields=(0.0,), obstruction=obstruction).cameras["forward"]
+    view = CameraOptics.within(gf7_pair, "forward", backend, MOVED, obstruction)
+    if not obstruction:  # there the rms is over the free part of the stop
+        assert view.wavefront().rms == pytest.approx(quality.wfe[0, 0], rel=1e-4)
+    band = view.model.spec.bands["P"]
+    frequency = np.array([0.0, view.nyquist])
+    mtf = view.mtfs([(0.0, 0.0)], frequency, *band_wavelengths(band))[0].values[:, 1]
+    for k, pair in enumerate(((view.nyquist, 0.0), (0.0, view.nyquist))):
+        factor = np.prod(list(band_factors(band, *map(np.array, pair)).values()))
+        wanted = (quality.mtf_along_line, quality.mtf_along_track)[k][0, 0]
+        assert mtf[k] * factor == pytest.approx(wanted, abs=2e-4)
+
+
+def test_where_the_camera_stands_changes_nothing(backend, gf7_pair, gf7_alone) -> None:
+    """Neither the look angle nor a motion of the whole camera."""
+    turned = {"base/forward": Motion(rotate=(0.01, -0.02, 0.03), shift=(0.1, 0.0, 0.2))}
+    for state in ({}, turned):
+        other = CameraOptics.within(gf7_pair, "forward", backend, state, obstruction=False)
+        for one, two in zip(gf7_alone.wavefronts(FIELDS), other.wavefronts(FIELDS), strict=True):
+            # paths of some metres to 1e-15 each, in waves
+            np.testing.assert_allclose(two.map, one.map, atol=2e-8)
+
+
+def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:
+    light = gf7_alone.directions([(0.5, -1.0)])[0]
+    own = field_direction(gf7.spec, 0.5 * gf7.spec.field.x, -gf7.spec.field.y)
+    np.testing.assert_allclose(light, gf7.camera_frame.rotation.T @ own, atol=1e-15)
+    with pytest.raises(ValueError, match="from -1 to 1"):
+        gf7_alone.wavefront((1.2, 0.0))
+    with pytest.raises(ValueError, match="pairs"):
+        gf7_alone.wavefronts([0.0, 1.0])  # type: ignore[list-item]
+
+
+def test_views_can_be_drawn_and_put_into_tables(backend) -> None:
+    camera = CameraView.alone(load_camera("gf7"), backend)
+    wave, spot, mtf = camera.wavefront(field=(0, 0)), camera.spot(), camera.perturbed({}).mtf((1, 0))
+    for shown in (wave, spot, mtf):
+        (axes, *_) = shown.plot().axes
+        assert axes.get_xlabel()
+    table = wave.to_xarray()
+    assert float(np.sqrt(np.sum(table["zernike"] ** 2))) == pytest.approx(wave.rms, rel=1e-6)
+    assert str(table["term"][3].values) == "defocus"
+    assert table["wavefront"].attrs["units"] == "waves"
+    assert mtf.to_xarray().sel(direction="along line")["mtf"][0] == pytest.approx(1.0)
+    assert spot.to_xarray().attrs["rms_m"] == spot.rms

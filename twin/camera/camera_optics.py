@@ -1,0 +1,433 @@
+"""Wavefront, spot and MTF of one camera in one state, at places of its field.
+
+A **field** is a pair (along the line, along the track) of shares of the camera's half angles of view, each from -1 to
+1: (1, 0) is the direction that the unperturbed camera images to the left end (+Y') of its line CCD. It turns with the
+camera, so that a look angle or a motion of the whole camera changes nothing of its image quality.
+
+Wavefront errors count from the sphere about the image of the chief ray, with the radius of the nominal exit pupil;
+positive where the wavefront is ahead. Piston and tilt, which move an image and do not blur it, are taken out over the
+light that comes through; defocus stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+import xarray as xr
+
+from optics.geometry import zernike
+from optics.geometry.tree import State
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Assembly
+from optics.waves.pupil_function import PupilFunction
+from optics.waves.transfer import polychromatic_transfer
+from optics.waves.wavefront import fit_wavefront, path_to_sphere
+from scenes.models.camera_assembly import ROOT, camera_alone
+from scenes.models.camera_model import CameraModel, derive_camera, field_direction
+from scenes.models.instrument_model import Instrument
+from scenes.models.shadow import ImagingShadows, imaging_shadows
+from scenes.specs.camera import CameraSpec
+from scenes.specs.channel import BASE
+from twin.targets.target_path import LineRays, TargetPath
+
+Field = tuple[float, float]
+"""Shares of the half angles of view: along the line, along the track."""
+
+TERMS = 37
+"""Zernike terms (Noll's order) that are told of a wavefront: all to seventh order, and the spherical of eighth."""
+
+RINGS = 12
+"""Of the quadrature over the stop: exact for squares of wavefronts up to order 23."""
+
+MAP_POINTS = 65
+"""Of a wavefront's map on each axis."""
+
+SPOT_RINGS = 8
+"""Rings of a spot diagram's rays about the chief ray, six more rays on each."""
+
+INSIDE = 1.0 - 1e-9
+"""Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wavefront:
+    """Wavefront error at one field.
+
+    Attributes:
+        field: where.
+        wavelength: metres; waves are of this.
+        x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
+            line, y along the track.
+        map: waves, (n, n); NaN where no light is.
+        coefficients: Zernike terms in Noll's order, waves rms, (TERMS,); their names are ``optics.geometry.zernike``'s.
+        rms: waves, exact for smooth wavefronts.
+        peak_to_valley: waves, over the map and the edge.
+        residual: rms that the Zernike terms leave, waves.
+        strehl: Strehl ratio, from the mean phasor over the stop.
+        vignetted: share of the stop's area whose light other apertures stop.
+        place: of the chief ray on the line CCD, (along the line, along the track), metres.
+    """
+
+    field: Field
+    wavelength: float
+    x: np.ndarray
+    y: np.ndarray
+    map: np.ndarray
+    coefficients: np.ndarray
+    rms: float
+    peak_to_valley: float
+    residual: float
+    strehl: float
+    vignetted: float
+    place: tuple[float, float]
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Name of each Zernike term -> waves rms."""
+        return {zernike.name(j): float(c) for j, c in enumerate(self.coefficients, start=1)}
+
+    def to_xarray(self) -> xr.Dataset:
+        """``wavefront`` over pupil coordinates and ``zernike`` over Noll's index, with units and names."""
+        index = np.arange(1, len(self.coefficients) + 1)
+        names = [zernike.name(int(j)) for j in index]
+        along = "{} on the stop over its radius"
+        return xr.Dataset(
+            {
+                "wavefront": (("y", "x"), self.map, {"units": "waves", "long_name": "wavefront error"}),
+                "zernike": ("noll", self.coefficients, {"units": "waves rms"}),
+            },
+            {
+                "x": ("x", self.x, {"long_name": along.format("along the line")}),
+                "y": ("y", self.y, {"long_name": along.format("along the track")}),
+                "noll": ("noll", index, {"long_name": "Noll's index"}),
+                "term": ("noll", names),
+            },
+            {"field": self.field, "wavelength_m": self.wavelength, "rms_waves": self.rms, "strehl": self.strehl},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """Where the rays of one field meet the line CCD.
+
+    Attributes:
+        field: where.
+        rays: from the chief ray, (along the line, along the track), metres, (N, 2); hexapolar on the stop, the chief
+            ray first; those that an aperture stops are left out.
+        centroid: of all light from the chief ray, metres, (2,).
+        rms: rms distance from the centroid, metres, exact for smooth wavefronts.
+        rms_along: the same along the line and along the track, metres, (2,).
+        farthest: of the rays from the centroid, metres.
+        airy: radius of the Airy disk of the same numerical aperture, metres.
+        place: of the chief ray on the line CCD, (along the line, along the track), metres.
+    """
+
+    field: Field
+    rays: np.ndarray
+    centroid: np.ndarray
+    rms: float
+    rms_along: np.ndarray
+    farthest: float
+    airy: float
+    place: tuple[float, float]
+
+    def to_xarray(self) -> xr.Dataset:
+        """The rays, metres from the chief ray."""
+        names = {"along_line": self.rays[:, 0], "along_track": self.rays[:, 1]}
+        data = {name: ("ray", values, {"units": "m"}) for name, values in names.items()}
+        return xr.Dataset(data, attrs={"field": self.field, "rms_m": self.rms, "airy_m": self.airy})
+
+
+@dataclass(frozen=True, eq=False)
+class Mtf:
+    """Modulation transfer at one field, of the optics alone.
+
+    Attributes:
+        field: where.
+        frequency: cycles/m, (M,).
+        values: along the line and along the track, (2, M).
+        limit: the same pupil without wavefront error, (2, M).
+        wavelengths: of the light, metres, (K,); equal weights if evenly spaced over a band.
+        nyquist: of the pixels, cycles/m.
+    """
+
+    field: Field
+    frequency: np.ndarray
+    values: np.ndarray
+    limit: np.ndarray
+    wavelengths: np.ndarray
+    nyquist: float
+
+    def at(self, frequency: float) -> np.ndarray:
+        """Along the line and along the track at a frequency among the table's, cycles/m, (2,)."""
+        return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
+
+    def to_xarray(self) -> xr.Dataset:
+        """``mtf`` and ``limit`` over direction and frequency."""
+        return xr.Dataset(
+            {"mtf": (("direction", "frequency"), self.values), "limit": (("direction", "frequency"), self.limit)},
+            {
+                "direction": ["along line", "along track"],
+                "frequency": ("frequency", self.frequency, {"units": "1/m", "long_name": "spatial frequency"}),
+            },
+            {"field": self.field, "nyquist_per_m": self.nyquist},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CameraOptics:
+    """One camera in one state, ready to be looked at.
+
+    ``CameraOptics.alone`` makes it of a camera's prescription, ``CameraOptics.within`` of a camera of an instrument.
+
+    Attributes:
+        path: its way from the scene to the line CCD.
+        state: motions of bodies, with heat; empty as designed.
+    """
+
+    path: TargetPath
+    state: State = field(default_factory=FrozenMap)
+
+    @classmethod
+    def alone(cls, camera: CameraSpec | CameraModel, backend: Backend, state: State | None = None) -> Self:
+        """A camera by itself; its bodies are ``camera/M1`` ... ``camera/focal_plane``.
+
+        Raises:
+            InputError: the prescription does not bring the light of its field through the stop to the image.
+        """
+        model = camera if isinstance(camera, CameraModel) else derive_camera(camera, backend)
+        return cls(TargetPath(camera_alone(model), ROOT, ROOT, model, backend), FrozenMap(state or {}))
+
+    @classmethod
+    def within(
+        cls, instrument: Instrument, name: str, backend: Backend, state: State | None = None, obstruction: bool = True
+    ) -> Self:
+        """A camera of an instrument, in a state of the whole instrument.
+
+        Args:
+            instrument: with the camera.
+            name: of the camera there.
+            backend: where to trace.
+            state: for example ``MonitorExperiment.state(job)``: motions and what heat does.
+            obstruction: whether what prisms and other bodies take of the beam is missing in the MTF.
+
+        Raises:
+            KeyError: no camera of that name.
+        """
+        shadows: ImagingShadows | None = imaging_shadows(instrument, name, backend) if obstruction else None
+        path = TargetPath(
+            instrument.assembly, name, f"{BASE}/{name}", instrument.cameras[name], backend, shadows=shadows
+        )
+        return cls(path, FrozenMap(state or {}))
+
+    def perturbed(self, state: State) -> Self:
+        """The same camera in another state."""
+        return replace(self, state=FrozenMap(state))
+
+    @property
+    def model(self) -> CameraModel:
+        """Derived numbers of the prescription."""
+        return self.path.model
+
+    @property
+    def assembly(self) -> Assembly:
+        """That holds the camera."""
+        return self.path.assembly
+
+    @cached_property
+    def nyquist(self) -> float:
+        """Nyquist frequency of the line CCD's pixels, cycles/m."""
+        return float(0.5 / self.model.spec.line.pitch)
+
+    def directions(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
+        """Directions of the light of fields (F, 2), world, (F, 3).
+
+        Raises:
+            ValueError: a field beyond the camera's, for which it has no clear apertures.
+        """
+        shares = np.asarray(fields, dtype=np.float64)
+        if shares.ndim != 2 or shares.shape[1] != 2 or not np.all(np.abs(shares) <= 1.0):
+            raise ValueError(
+                f"fields are pairs (along the line, along the track) of shares of half the field, from -1 to 1; "
+                f"got {shares.tolist()}"
+            )
+        spec = self.model.spec
+        light = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in shares])
+        root = self.assembly.place([self.state]).pose(self.path.root)
+        return np.asarray(light @ self.model.camera_frame.rotation @ root.rotation.T)
+
+    def rays(self, fields: Sequence[Field] | np.ndarray, points: np.ndarray) -> LineRays:
+        """Rays of fields (F, 2) through points (N, 2) of the stop, in units of its radius, at the line CCD.
+
+        Raises:
+            AimError, BeamMissedError: the state brings the light off the stop or off the line CCD's plane.
+        """
+        return self.path.rays(self.state, self.directions(fields), points)
+
+    def wavefronts(
+        self, fields: Sequence[Field] | np.ndarray, points: int = MAP_POINTS, terms: int = TERMS
+    ) -> tuple[Wavefront, ...]:
+        """Wavefront errors at fields (F, 2); ``points`` of the map on each axis. Raises as ``rays``."""
+        nodes = quadrature.disk(RINGS)
+        axis = np.linspace(-1.0, 1.0, points)
+        x, y = np.meshgrid(axis, axis)
+        inside = np.hypot(x, y) <= 1.0
+        angle = 2.0 * np.pi * np.arange(4 * RINGS) / (4 * RINGS)
+        parts = [np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]
+        parts += [INSIDE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
+        parts += [INSIDE * np.stack([x[inside], y[inside]], axis=-1)]
+        stop = np.concatenate(parts)
+        rays = self.rays(fields, stop)
+        wavelength = self.model.spec.wavelength
+        error = -self._path(rays) / wavelength
+        out = []
+        own = slice(1, 1 + nodes.count)
+        for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
+            lit = rays.valid[k]
+            weight = nodes.weight * lit[own]
+            level = zernike.fit(3, nodes.x, nodes.y, error[k, own], weight)
+            flat = error[k] - zernike.basis(3, *stop.T) @ level
+            fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
+            table = np.full(inside.shape, np.nan)
+            table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(angle) :]
+            phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
+            out.append(
+                Wavefront(
+                    field=(float(where[0]), float(where[1])),
+                    wavelength=wavelength,
+                    x=axis,
+                    y=axis,
+                    map=table,
+                    coefficients=fit.coefficients,
+                    rms=float(fit.rms),
+                    peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
+                    residual=float(fit.residual_rms),
+                    strehl=float(np.abs(phasor) ** 2),
+                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)),
+                    place=self._place(rays, k),
+                )
+            )
+        return tuple(out)
+
+    def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
+        """Wavefront error at one field, as ``wavefronts``."""
+        return self.wavefronts([field], points)[0]
+
+    def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
+        """Spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream. Raises as ``rays``."""
+        nodes = quadrature.disk(RINGS)
+        rings = [
+            INSIDE * r / SPOT_RINGS * np.stack([np.cos(a), np.sin(a)], axis=-1)
+            for r in range(1, SPOT_RINGS + 1)
+            for a in [2.0 * np.pi * np.arange(6 * r) / (6 * r)]
+        ]
+        stop = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1), *rings])
+        rays = self.rays(fields, stop)
+        leaving = rays.direction
+        # the light travels along -Z of the line CCD or along +Z: downstream is its own way
+        place = rays.position[..., 1::-1] + defocus * leaving[..., 1::-1] / np.abs(leaving[..., 2:])
+        place = place / rays.size
+        out = []
+        for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
+            lit = rays.valid[k]
+            share = nodes.weight * lit[1 : 1 + nodes.count]
+            share = share / np.sum(share)
+            offset = place[k] - place[k, 0]
+            own = offset[1 : 1 + nodes.count]
+            centroid = share @ own
+            spread = share @ (own - centroid) ** 2
+            hexapolar = np.concatenate([offset[:1], offset[1 + nodes.count :][lit[1 + nodes.count :]]])
+            out.append(
+                Spot(
+                    field=(float(where[0]), float(where[1])),
+                    rays=hexapolar,
+                    centroid=centroid,
+                    rms=float(np.sqrt(np.sum(spread))),
+                    rms_along=np.sqrt(spread),
+                    farthest=float(np.max(np.linalg.norm(hexapolar - centroid, axis=-1))),
+                    airy=1.22 * self.model.spec.wavelength * self._f_number(leaving[k, 1 + nodes.count :], rings),
+                    place=self._place(rays, k),
+                )
+            )
+        return tuple(out)
+
+    def spot(self, field: Field = (0.0, 0.0), defocus: float = 0.0) -> Spot:
+        """Spot at one field, as ``spots``."""
+        return self.spots([field], defocus)[0]
+
+    def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
+        """Exit pupils as the images of fields (F, 2) see them, axes along the line and along the track.
+
+        Raises:
+            AimError, BeamMissedError: as ``rays``.
+            ValueError: a pupil that another aperture than the stop cuts, or a wavefront too rough for its polynomials.
+        """
+        light = self.directions(fields)
+        places = self.path.places(self.state, light)
+        return self.path.pupils(self.state, light, places)
+
+    def mtfs(
+        self,
+        fields: Sequence[Field] | np.ndarray,
+        frequency: np.ndarray | None = None,
+        wavelengths: np.ndarray | None = None,
+        weights: np.ndarray | None = None,
+    ) -> tuple[Mtf, ...]:
+        """MTF at fields (F, 2).
+
+        Args:
+            fields: where.
+            frequency: cycles/m, (M,); by default 65 from 0 to the cut-off or twice Nyquist, whichever is less.
+            wavelengths: of the light, metres, (K,); default the design wavelength.
+            weights: of the wavelengths, (K,); default all alike.
+
+        Raises:
+            AimError, BeamMissedError, ValueError: as ``pupils``.
+        """
+        colours = np.array([self.model.spec.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
+        shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
+        pupils = self.pupils(fields)
+        if frequency is None:
+            cutoff = max(float(np.max(pupil.cutoff(np.eye(2), float(np.min(colours))))) for pupil in pupils)
+            frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), 65)
+        both = np.concatenate([frequency[:, None] * axis for axis in np.eye(2)])
+        out = []
+        for where, pupil in zip(np.asarray(fields, dtype=np.float64), pupils, strict=True):
+            perfect = replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms))
+            values, limit = (
+                np.abs(polychromatic_transfer(one, both, colours, shares, np.zeros(1))[0]).reshape(2, -1)
+                for one in (pupil, perfect)
+            )
+            own = (float(where[0]), float(where[1]))
+            out.append(Mtf(own, frequency, values, limit, colours, self.nyquist))
+        return tuple(out)
+
+    def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> Mtf:
+        """MTF at one field and the design wavelength, as ``mtfs``."""
+        return self.mtfs([field], frequency)[0]
+
+    def _path(self, rays: LineRays) -> np.ndarray:
+        """Optical paths to the reference spheres about the chief rays, the first of each beam, (F, N), metres."""
+        radius = float(self.model.first_order.exit_pupil_distance[0])
+        path = path_to_sphere(rays.position, rays.direction, rays.path, rays.position[:, :1], radius)
+        return path - path[:, :1]
+
+    def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
+        x, y = rays.position[k, 0, :2] / rays.size
+        return float(y), float(x)
+
+    def _f_number(self, leaving: np.ndarray, rings: list[np.ndarray]) -> float:
+        """Of the round beam with the solid angle of the outermost ring's rays (N, 3)."""
+        u, v = leaving[-len(rings[-1]) :, :2].T
+        after_u, after_v = np.roll(u, -1), np.roll(v, -1)
+        sides = len(u)
+        # of the circle that has the polygon's corners on it
+        polygon = 0.5 * abs(float(np.sum(u * after_v - v * after_u)))
+        circle = polygon * np.pi / (0.5 * sides * np.sin(2.0 * np.pi / sides))
+        return float(0.5 / np.sqrt(circle / np.pi))
