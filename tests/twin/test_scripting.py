@@ -291,3 +291,41 @@ def test_a_row_with_one_unit_is_a_list() -> None:
         YamlFile("", {"shift": ["0 um", "-1.5 um", "30 um"], "rotate": ["1 arcsec", "2 arcsec", "3 arcsec"]}, {}),
     )
     assert one == other
+
+
+def test_a_test_of_the_orbit_is_what_the_command_gives(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    own = twin.perform("orbit angle", "angle", seed=7, passes=20)
+    command = [sys.executable, "-m", "twin.orbit", "angle", str(own.save(tmp_path / "own") / "config.yaml")]
+    subprocess.run([*command, "--out", str(out), "--quiet"], check=True)
+    for name in ("angle.json", "config.yaml"):
+        assert (out / name).read_bytes() == (tmp_path / "own" / name).read_bytes()
+    assert own.numbers["seed"] == 7
+    assert own.setup.test.passes == 20
+    assert "resection" in own.summary.to_string()
+    assert "resection" in own._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "says"),
+    [
+        ("orbit angel", {}, "did you mean 'orbit angle'"),
+        ("orbit angle", {"pases": 20}, "did you mean 'passes'"),
+        ("orbit angle", {"passes": "many"}, "test.passes"),
+    ],
+)
+def test_a_wrong_test_is_explained(name: str, changes: dict, says: str) -> None:
+    with pytest.raises(twin.InputError, match=says):
+        twin.perform(name, "angle", **changes)
+
+
+def test_a_camera_is_in_the_state_of_its_instrument(pair: twin.InstrumentTwin) -> None:
+    """A despace of M2 shows in the camera that has it and nowhere else; a look of the whole camera is none."""
+    bent = pair.perturbed({"base/forward/M2": {"shift": "0 0 30 um"}, "base/backward": {"rotate": "5 5 5 arcsec"}})
+    nominal, moved = (one.camera("forward").wavefront(field=(0, 0)) for one in (pair, bent))
+    assert moved.rms > 2.0 * nominal.rms
+    waves = [one.camera("backward").wavefront(field=(0, 0)).rms for one in (pair, bent)]
+    assert waves[1] == pytest.approx(waves[0], abs=1e-6)
+    assert moved.plot().axes
+    with pytest.raises(twin.InputError, match="did you mean 'forward'"):
+        pair.camera("forwards")

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ from optics.numerics.backend import Backend, load_backend
 from scenes.specs.job import JobSpec, NodeInfo, check_nodes
 from scenes.specs.load import INSTRUMENTS, library_names
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
+from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.main_job.render_job import render_job
@@ -28,6 +29,9 @@ from twin.monitor.truth import truth_jacobian
 from twin.scripting.motion_names import motion_named
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
+
+if TYPE_CHECKING:
+    from twin.camera.camera_view import CameraView
 
 
 class _Bench:
@@ -215,6 +219,27 @@ class InstrumentTwin:
                 "estimator": list(ESTIMATORS),
             },
         )
+
+    def camera(self, name: str, obstruction: bool = True) -> CameraView:
+        """One of its cameras as optical designers look at it, in this state.
+
+        Args:
+            name: of the camera.
+            obstruction: whether what prisms and other bodies take of its beam is missing.
+
+        Raises:
+            InputError: no camera of that name.
+        """
+        # it draws
+        from twin.camera.camera_view import CameraView
+
+        if name not in self.cameras:
+            known = names_text(self.cameras)
+            raise InputError(
+                Issue("no such camera", found=repr(name), allowed=known, suggestion=nearest(name, self.cameras))
+            )
+        experiment = self._bench.experiment
+        return CameraView.within(experiment.instrument, name, self._bench.backend, self.state, obstruction)
 
     def to_yaml(self) -> str:
         """A job file that stands for this instrument and needs no other file; `load` and the commands read it."""

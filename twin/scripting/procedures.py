@@ -1,0 +1,183 @@
+"""Tests of the laboratory and of the orbit in a script: the same runs as the commands', with their numbers at hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from optics.numerics.backend import load_backend
+from scenes.specs.test_setup import ExperimentSetup
+from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.spec import Source
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import YamlFile
+from twin.run.page import RunFacts, cell_text, write_test
+from twin.run.procedure import BenchError, Procedure, silent
+from twin.run.report import Report
+from twin.run.run_folder import RunFolder
+
+
+@dataclass(frozen=True, eq=False)
+class Test:
+    """A finished test.
+
+    Attributes:
+        name: as it was called, ``lab focus``.
+        numbers: what KIND.json of a run folder holds, keys ending in their unit.
+        report: verdict, tables and figures, for a reader.
+        setup: the test with all it refers to.
+        run: everything that was computed; its class depends on the test.
+    """
+
+    name: str
+    numbers: Mapping[str, Any]
+    report: Report = field(repr=False)
+    setup: ExperimentSetup[Any] = field(repr=False)
+    run: Any = field(repr=False)
+    _facts: RunFacts = field(repr=False)
+    _kind: str = field(repr=False)
+
+    __test__ = False  # for pytest, which looks for tests by this name
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """The main table of the report."""
+        table = self.report.summary
+        return pd.DataFrame([[cell_text(cell) for cell in row] for row in table.shown()], columns=list(table.heads))
+
+    def save(self, folder: str | Path, force: bool = False) -> Path:
+        """Write the run folder that the command would write.
+
+        Args:
+            folder: to be made.
+            force: replace it if it is a run folder.
+
+        Raises:
+            RunFolderError: it is there already, or cannot be written.
+        """
+        with RunFolder(Path(folder), force) as target:
+            write_test(self._kind, self.numbers, self.report, self._facts, target)
+        return target.target
+
+    def _repr_html_(self) -> str:
+        lead = "".join(f"<p>{escape(line)}</p>" for line in self.report.lead)
+        notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.report.warnings)
+        return f"<h4>{escape(self.report.title)}</h4>{lead}{self.summary.to_html(index=False)}{notes}"
+
+
+def perform(name: str, file: str | Path, *, seed: int | None = None, backend: str = "llvm", **changes: Any) -> Test:
+    """Run a test of the laboratory or of the orbit.
+
+    Args:
+        name: ``lab focus``, ``lab distortion``, ``lab turntable``, ``orbit angle``, ``orbit calibrate``,
+            ``orbit monitor`` or ``orbit simulate``.
+        file: of the test, or its name in scenes/lab or scenes/orbit.
+        seed: of all that is drawn; the file's own if not given.
+        backend: where to trace, ``llvm`` or ``cuda``.
+        changes: keys of the test's file with other values; a mapping replaces single keys of a mapping.
+
+    Raises:
+        InputError: no such test, file or key; or the test failed on its bench, with the key to be changed.
+    """
+    if name not in TESTS:
+        raise InputError(
+            Issue("no such test", found=repr(name), allowed=names_text(TESTS), suggestion=nearest(name, TESTS))
+        )
+    procedure, report = TESTS[name]()
+    setup = procedure.resolve(file)
+    if changes:
+        tree = setup.plain()
+        tree["test"] = _merged(tree["test"], changes)
+        source = setup.test.source
+        setup = validate(procedure.setup, YamlFile("", tree, {}))
+        setup = setup.model_copy(update={"test": setup.test.with_source(Source(source.file))})
+    number = setup.test.seed if seed is None else seed
+    started, clock = time.time(), time.monotonic()
+    try:
+        run = procedure.run(setup, load_backend(backend), number, silent)
+    except BenchError as error:
+        raise setup.test.error(str(error), error.key, allowed=error.remedy) from error
+    program, command = name.split()
+    config = setup.with_seed(number).to_yaml()
+    facts = RunFacts(config, str(file), backend, number, started, time.monotonic() - clock, f"twin.{program}", command)
+    return Test(name, procedure.numbers(run), report(run), setup, run, facts, procedure.kind)
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in changes.items():
+        inner = out.get(key)
+        both = isinstance(value, Mapping) and isinstance(inner, Mapping)
+        out[key] = _merged(inner, value) if both and isinstance(inner, Mapping) else value
+    return out
+
+
+Parts = tuple[Procedure[Any, Any], Callable[[Any], Report]]
+
+
+# Only the test that is asked for is imported.
+def _focus() -> Parts:
+    from twin.laboratory.focus_numbers import FOCUS
+    from twin.laboratory.focus_report import focus_report
+
+    return FOCUS, focus_report
+
+
+def _distortion() -> Parts:
+    from twin.laboratory.distortion_numbers import DISTORTION
+    from twin.laboratory.distortion_report import distortion_report
+
+    return DISTORTION, distortion_report
+
+
+def _turntable() -> Parts:
+    from twin.laboratory.turntable_numbers import TURNTABLE
+    from twin.laboratory.turntable_report import turntable_report
+
+    return TURNTABLE, turntable_report
+
+
+def _angle() -> Parts:
+    from twin.orbit.angle.angle_numbers import ANGLE
+    from twin.orbit.angle.angle_report import angle_report
+
+    return ANGLE, angle_report
+
+
+def _calibrate() -> Parts:
+    from twin.orbit.calibration.calibration_numbers import CALIBRATION
+    from twin.orbit.calibration.calibration_report import calibration_report
+
+    return CALIBRATION, calibration_report
+
+
+def _monitor() -> Parts:
+    from twin.orbit.monitoring.monitoring_numbers import MONITOR
+    from twin.orbit.monitoring.monitoring_report import monitor_report
+
+    return MONITOR, monitor_report
+
+
+def _simulate() -> Parts:
+    from twin.orbit.images.simulate_numbers import SIMULATE
+    from twin.orbit.images.simulate_report import simulation_report
+
+    return SIMULATE, simulation_report
+
+
+TESTS: dict[str, Callable[[], Parts]] = {
+    "lab focus": _focus,
+    "lab distortion": _distortion,
+    "lab turntable": _turntable,
+    "orbit angle": _angle,
+    "orbit calibrate": _calibrate,
+    "orbit monitor": _monitor,
+    "orbit simulate": _simulate,
+}
+"""As the commands are called -> what runs a test and what shows it."""
