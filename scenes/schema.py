@@ -4,6 +4,11 @@ An editor that knows them completes keys, shows what they mean and marks mistake
 server, the first line of a file names its schema: `# yaml-language-server: $schema=schemas/job.schema.json`.
 """
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
 import json
 import re
 import sys

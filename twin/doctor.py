@@ -5,6 +5,11 @@ and a small render in child processes, so that an unsuitable LLVM, which aborts 
 the doctor with it. Exit code 0 if the twin can run, 1 if not.
 """
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
 import importlib.metadata
 import json
 import os

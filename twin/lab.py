@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from typing import Any
+
 import typer
 
-from twin.laboratory.distortion_numbers import DISTORTION
-from twin.laboratory.distortion_report import distortion_report
-from twin.laboratory.focus_numbers import FOCUS
-from twin.laboratory.focus_report import focus_report
-from twin.laboratory.turntable_numbers import TURNTABLE
-from twin.laboratory.turntable_report import turntable_report
-from twin.run.command import add_test
+from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
+from twin.run.command import Test, add_test
 
 PROGRAM = "twin.lab"
 
@@ -31,12 +33,33 @@ def main() -> None:
     """
 
 
+def _focus() -> Test[Any]:
+    from twin.laboratory.focus_numbers import FOCUS
+    from twin.laboratory.focus_report import focus_report
+
+    return FOCUS, focus_report
+
+
+def _distortion() -> Test[Any]:
+    from twin.laboratory.distortion_numbers import DISTORTION
+    from twin.laboratory.distortion_report import distortion_report
+
+    return DISTORTION, distortion_report
+
+
+def _turntable() -> Test[Any]:
+    from twin.laboratory.turntable_numbers import TURNTABLE
+    from twin.laboratory.turntable_report import turntable_report
+
+    return TURNTABLE, turntable_report
+
+
 add_test(
     app,
     PROGRAM,
     "focus",
-    FOCUS,
-    focus_report,
+    resolve_focus,
+    _focus,
     """Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
     shims, and the same again.
 
@@ -49,8 +72,8 @@ add_test(
     app,
     PROGRAM,
     "distortion",
-    DISTORTION,
-    distortion_report,
+    resolve_distortion,
+    _distortion,
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
 
@@ -64,8 +87,8 @@ add_test(
     app,
     PROGRAM,
     "turntable",
-    TURNTABLE,
-    turntable_report,
+    resolve_turntable,
+    _turntable,
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.""",
 )
 

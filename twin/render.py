@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
-from analysis.monitor.recovery import ESTIMATORS
-from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob, resolve
-from twin.main_job.render_files import write_data
-from twin.main_job.render_job import render_job
-from twin.main_job.render_report import write_report
-from twin.main_job.render_results import PROGRAM, RenderRun, stated
-from twin.main_job.summary_plot import write_summary
-from twin.pictures.picture import write_pictures
-from twin.pictures.picture_light import PictureError
-from twin.pictures.scene_file import write_scene
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, print_whole, result_table
-from twin.run.command import WRITE, Result, Session, print_warnings, run_command
-from twin.run.further_sections import further_sections
-from twin.run.page import write_artefacts
-from twin.run.reference_frames import described
-from twin.run.run_folder import write_manifest
-from twin.targets.edge_images import DIRECTIONS
-from twin.targets.target_images import PLACES
-from twin.targets.target_result import EdgeReading, TargetRun
-
-LABELS = {
-    "d_alpha_arcsec": ('d_alpha "', 4),
-    "d_beta_arcsec": ('d_beta "', 4),
-    "d_gamma_arcsec": ('d_gamma "', 3),
-    "d_f_um": ("d_f um", 2),
-}
-"""How the terminal's table names a parameter, and its decimals."""
-
-_ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
-"""How the terminal names the direction in which the MTF is measured."""
+from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
+from twin.run.command import Result, Session, run_command
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -107,127 +80,11 @@ def main(
     """
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
-        run = render_job(resolved, session.backend, frames, seed, session.advance)
-        problem = _write(run, session, picture)
-        return Result(_numbers(run), lambda console: _print_result(run, console), problem)
+        from twin.main_job.render_command import run_render
+
+        return run_render(resolved, session, frames, seed, picture)
 
     run_command(job.stem, Options(out, seed, backend, force, as_json, quiet), lambda: resolve(job), work)
-
-
-def _write(run: RenderRun, session: Session, picture: bool) -> str:
-    """Write all files of a run: its data, then what they look like.
-
-    Returns:
-        Why the pictures are not complete, empty when they are or nobody asked for them.
-    """
-    seconds, folder = session.seconds, session.folder
-    session.advance(WRITE, 0, 1)
-    write_data(run, folder)
-    folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
-    sections = further_sections("render", run)
-    write_artefacts((a for section in sections for a in section.artefacts), folder)
-    folder.write_with("report.html", lambda file: write_report(run, file, sections))
-    folder.write_with("summary.png", lambda file: write_summary(run, file))
-    problem = ""
-    if picture:
-        instrument, write = run.experiment.instrument, folder.write_with
-        try:
-            write_pictures(instrument, session.backend, run.state, write, run.seed, session.advance)
-        except PictureError as error:  # what took minutes to compute is not thrown away for a picture
-            problem = f"the pictures are not complete: {error}"
-    told = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": list(run.warnings)}
-    write_manifest(folder, PROGRAM, session.started, seconds, **told)
-    return problem
-
-
-def _numbers(run: RenderRun) -> dict[str, Any]:
-    """What ``--json`` prints: contents of the files with the main results, by their kind."""
-    parts = {"truth": run.truth_dict(), "recovered": stated(run.recovered_dict())}
-    if run.course is not None:
-        parts["course"] = run.course.to_dict()
-    if run.targets is not None:
-        parts["mtf"] = run.targets.to_dict()
-    return {kind: described(kind, data) for kind, data in parts.items()}
-
-
-def _print_result(run: RenderRun, console: Console) -> None:
-    """Result table and what to bear in mind."""
-    print_whole(console, _table(run))
-    if run.targets is not None:
-        lines = _mtf_table(run.targets)
-        if lines is not None:
-            console.print(lines)
-    console.print(
-        "The model assumes that only the line CCD moves and the optics scale; other motions read as these: "
-        "see crosstalk in the report.",
-        style="dim",
-    )
-    if run.course is not None:
-        count, ends = len(run.course.times), [moment(float(run.course.times[k])) for k in (0, -1)]
-        console.print(
-            f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
-            highlight=False,
-        )
-    print_warnings(console, run.warnings)
-
-
-def _mtf_table(targets: TargetRun) -> Table | None:
-    """MTF at the Nyquist frequency from the knife edges, before -> after (true); None if there are none."""
-    title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
-    title += "\nbefore -> after, below it the true one"
-    table = result_table(title)
-    for head in ("", *PLACES):
-        table.add_column(head, no_wrap=True)
-    for name, camera in targets.cameras.items():
-        for direction in DIRECTIONS:
-            pairs = [
-                (place.before.edges[direction], place.after.edges[direction])
-                for place in camera.places.values()
-                if direction in place.before.edges
-            ]
-            if not pairs:
-                return None
-            cells = [
-                f"{_value(before)} -> {_value(after)}\n[dim]{before.true_nyquist:.3f} -> {after.true_nyquist:.3f}[/]"
-                for before, after in pairs
-            ]
-            table.add_row(f"[bold]{escape(name)}[/] {escape(camera.band)}, {_ALONG[direction]}", *cells)
-    return table
-
-
-def _value(edge: EdgeReading) -> str:
-    return "none" if edge.nyquist is None else f"{edge.nyquist[0]:.3f}"
-
-
-def _table(run: RenderRun) -> Table:
-    """What every estimator recovered, beside the truth."""
-    truth, recovered = run.truth_dict(), run.recovered_dict()
-    title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
-    if run.course is not None:
-        title += f"\nat {moment(float(run.course.times[run.course.shown]))} of the course"
-    table = result_table(title)
-    table.add_column("", no_wrap=True)
-    names = (name.replace("_", "\n") for name in ESTIMATORS)
-    heads = ("true", *names, "sigma", "model\n- true", "in\nsigma")
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
-
-    def add(label: str, key: str, decimals: int, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
-        model, sigma = estimators["model"][key], estimators["model"][f"{key}_sigma"]
-        values = [true, *(estimators[name][key] for name in ESTIMATORS), sigma]
-        # adding 0.0 after rounding leaves no minus before a zero
-        cells = [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in values]
-        table.add_row(label, *cells, f"{model - true:+.{decimals}f}", f"{(model - true) / sigma:+.1f}")
-
-    for camera, estimators in recovered["cameras"].items():
-        table.add_row(f"[bold]{escape(camera)}[/]")
-        for key, (label, decimals) in LABELS.items():
-            add(label, key, decimals, truth["cameras"][camera][key], estimators)
-    if "intersection_angle" in truth:
-        true = truth["intersection_angle"]["change_arcsec"]
-        table.add_row("[bold]both[/]")
-        add('angle "', "change_arcsec", 4, true, recovered["intersection_angle"])
-    return table
 
 
 if __name__ == "__main__":

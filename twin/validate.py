@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -26,7 +31,6 @@ from twin.run.cli import (
     result_table,
 )
 from twin.run.run_folder import RunFolder
-from twin.validation import registry
 from twin.validation.checks.check import (
     CONFIRMED,
     CONSISTENT,
@@ -39,9 +43,10 @@ from twin.validation.checks.check import (
     VERDICTS,
     Verdict,
 )
-from twin.validation.registry import Selection, UnknownCheck, select
-from twin.validation.runner import Validation, rough_seconds, run_checks
-from twin.validation.validation_report import claim_text, measured_text, sigma_text, write_validation
+
+if TYPE_CHECKING:  # all that the checks compute with is imported when one is asked for
+    from twin.validation.registry import Selection
+    from twin.validation.runner import Validation
 
 STYLES: dict[Verdict, str] = {
     CONFIRMED: "green",
@@ -115,6 +120,9 @@ def main(
     errors = Console(stderr=True)
     with explained(errors):
         check_backend(backend)
+        from twin.validation import registry
+        from twin.validation.registry import UnknownCheck, select
+
         try:
             selections = select(registry.GROUPS, only)
         except UnknownCheck as error:
@@ -149,6 +157,9 @@ def _run(
     folder: RunFolder | None,
     errors: Console,
 ) -> Validation:
+    from twin.validation.runner import rough_seconds, run_checks
+    from twin.validation.validation_report import write_validation
+
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
@@ -228,6 +239,8 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
+    from twin.validation.validation_report import claim_text, measured_text, sigma_text
+
     table = result_table()
     table.add_column("check", no_wrap=True)
     table.add_column("claim", justify="right", no_wrap=True)

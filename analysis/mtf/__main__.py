@@ -2,6 +2,18 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    import sys
+
+    def _interrupted(kind: Any, error: Any, trace: Any) -> None:
+        """Ctrl-C during the imports is no fault that needs a traceback."""
+        if issubclass(kind, KeyboardInterrupt):
+            sys.stderr.write("interrupted\n")
+        else:
+            sys.__excepthook__(kind, error, trace)
+
+    sys.excepthook = _interrupted
+
 import csv
 import json
 import math

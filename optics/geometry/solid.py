@@ -17,12 +17,15 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations, pairwise
 from math import ldexp
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from optics.geometry.pose import Pose
 from optics.geometry.tree import PlacedBodies
+
+if TYPE_CHECKING:  # takes a third of a second
+    import trimesh
 
 REACH = 100.0
 """A body that reaches farther from the origin counts as open, metres."""
@@ -284,6 +287,8 @@ def solid_mesh(solid: Solid, placed: PlacedBodies, state: int = 0) -> SolidMesh:
         SolidError: the faces leave no room, leave the body open, or cut off one of them that is more than a ground
             surface.
     """
+    import trimesh
+
     own = placed.pose(solid.path, state).inverse()
     planes = [face_plane(face, placed, state) for face in solid.faces]
     normals = np.array([own.rotation @ n for _, n in planes])

@@ -24,7 +24,6 @@ from math import log as real_log
 from typing import Any
 
 import numpy as np
-from scipy.integrate import quad
 
 from optics.numerics.array_math import exp, log, select
 
@@ -73,7 +72,7 @@ class ABg:
         """Check the numbers and the total."""
         if not (self.a > 0.0 and self.b > 0.0 and self.g >= 0.0):
             raise ValueError(f"an ABg lobe needs A > 0, B > 0 and g >= 0, found {self.a}, {self.b}, {self.g}")
-        _check_total(self)
+        _check_total(self, self._upper(1.0))
 
     def bsdf(self, distance: Any) -> Any:
         """BSDF f at distances d (NumPy arrays), per steradian."""
@@ -86,9 +85,16 @@ class ABg:
         Raises:
             ValueError: the upper bound holds more than all of the light.
         """
-        scale = self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
+        return _checked(Lobe(self._upper(WIDEST), self._scale, self.g, self.g > 0.0))
+
+    @property
+    def _scale(self) -> float:
+        return self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
+
+    def _upper(self, reach: float) -> float:
+        """Integral of the upper bound over d < ``reach``."""
         bound = self.a / self.b * _largest_ratio(self.g) if self.g > 0.0 else self.a / (1.0 + self.b)
-        return _checked(Lobe(bound * _harvey_integral(scale, self.g, WIDEST), scale, self.g, self.g > 0.0))
+        return bound * _harvey_integral(self._scale, self.g, reach)
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,7 @@ class HarveyShack:
         """Check the numbers and the total."""
         if not (self.b0 > 0.0 and self.l > 0.0 and self.s <= 0.0):
             raise ValueError(f"a Harvey-Shack lobe needs b0 > 0, l > 0 and s <= 0, found {self.b0}, {self.l}, {self.s}")
-        _check_total(self)
+        _check_total(self, self._upper(1.0))
 
     def bsdf(self, distance: Any) -> Any:
         """BSDF f at distances d (NumPy arrays), per steradian."""
@@ -116,7 +122,11 @@ class HarveyShack:
     @property
     def lobe(self) -> Lobe:
         """What the sampler uses."""
-        return _checked(Lobe(self.b0 * _harvey_integral(self.l, -self.s, WIDEST), self.l, -self.s, False))
+        return _checked(Lobe(self._upper(WIDEST), self.l, -self.s, False))
+
+    def _upper(self, reach: float) -> float:
+        """Integral over d < ``reach``; the function is its own upper bound."""
+        return self.b0 * _harvey_integral(self.l, -self.s, reach)
 
 
 Scatter = ABg | HarveyShack
@@ -124,6 +134,8 @@ Scatter = ABg | HarveyShack
 
 def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
     """Total integrated scatter by quadrature, for light that arrives with |beta0| = ``sine`` (0 to 1)."""
+    # takes a quarter of a second, and every command reads the names of finishes
+    from scipy.integrate import quad
 
     def ring(log_distance: float) -> float:
         d = float(np.exp(log_distance))
@@ -187,7 +199,9 @@ def _checked(lobe: Lobe) -> Lobe:
     return lobe
 
 
-def _check_total(scatter: Scatter) -> None:
+def _check_total(scatter: Scatter, upper: float) -> None:
+    if upper <= 1.0:  # the bound, which is not below the total, is enough for all but the strongest
+        return
     total = total_scatter(scatter)  # a lobe that falls off scatters most at normal incidence
     if total > 1.0:
         raise ValueError(f"{scatter} would scatter {total:.4g} of the light; no surface scatters more than 1")

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import trimesh
 from scipy.spatial import ConvexHull
 
 from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mesh
@@ -54,6 +53,8 @@ def separation(first: np.ndarray, second: np.ndarray) -> float:
     deepest = float(np.max(difference.equations[:, 3]))  # of the origin, relative to every face
     if deepest <= 0.0:
         return deepest
+    import trimesh
+
     faces = difference.points[difference.simplices]
     nearest = trimesh.triangles.closest_point(faces, np.zeros((len(faces), 3)))
     return float(np.min(np.linalg.norm(nearest, axis=-1)))

@@ -5,14 +5,16 @@ Prescriptions say nothing about substrates; these have a thickness that is usual
 
 from __future__ import annotations
 
-from typing import assert_never
+from typing import TYPE_CHECKING, assert_never
 
 import numpy as np
-import trimesh
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
 from scenes.models.camera_model import CameraModel
+
+if TYPE_CHECKING:
+    import trimesh
 
 GRID = 24
 """Cells across a mirror: the mesh departs from the surface by less than a millimetre."""
@@ -39,6 +41,8 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
         back: +1 when the substrate is on the surface's +z side, -1 when on its -z side.
         cells: across the mirror.
     """
+    import trimesh
+
     x0, x1, y0, y1 = aperture.bounds
     s = np.linspace(-1.0, 1.0, cells + 1)
     u, v = np.meshgrid(s, s)

@@ -76,6 +76,56 @@ KINDS = (
     *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
 )
 
+_PI = Decimal("3.14159265358979323846264338327950288419716939937511")
+_DEGREE = _PI / 180
+_KNOWN: dict[str, tuple[Decimal, str]] = {
+    "rad": (Decimal(1), "rad"),
+    "mrad": (Decimal("1e-3"), "rad"),
+    "urad": (Decimal("1e-6"), "rad"),
+    "deg": (_DEGREE, "rad"),
+    "arcmin": (_DEGREE / 60, "rad"),
+    "arcsec": (_DEGREE / 3600, "rad"),
+    "mas": (_DEGREE / 3_600_000, "rad"),
+    "km": (Decimal(1000), "m"),
+    "m": (Decimal(1), "m"),
+    "mm": (Decimal("1e-3"), "m"),
+    "um": (Decimal("1e-6"), "m"),
+    "nm": (Decimal("1e-9"), "m"),
+    "pm": (Decimal("1e-12"), "m"),
+    "ppm": (Decimal("1e-6"), ""),
+    "percent": (Decimal("1e-2"), ""),
+    "um/m": (Decimal("1e-6"), ""),
+    "h": (Decimal(3600), "s"),
+    "min": (Decimal(60), "s"),
+    "s": (Decimal(1), "s"),
+    "ms": (Decimal("1e-3"), "s"),
+    "us": (Decimal("1e-6"), "s"),
+    "km/s": (Decimal(1000), "m/s"),
+    "m/s": (Decimal(1), "m/s"),
+    "mm/s": (Decimal("1e-3"), "m/s"),
+    "W": (Decimal(1), "kg*m**2/s**3"),
+    "mW": (Decimal("1e-3"), "kg*m**2/s**3"),
+    "uW": (Decimal("1e-6"), "kg*m**2/s**3"),
+    "nW": (Decimal("1e-9"), "kg*m**2/s**3"),
+    "K": (Decimal(1), "K"),
+    "mK": (Decimal("1e-3"), "K"),
+    "K/m": (Decimal(1), "K/m"),
+    "mK/m": (Decimal("1e-3"), "K/m"),
+    "1/m": (Decimal(1), "1/m"),
+    "1/mm": (Decimal(1000), "1/m"),
+    "1/m^2": (Decimal(1), "1/m**2"),
+    "1/mm^2": (Decimal("1e6"), "1/m**2"),
+    "1/m^3": (Decimal(1), "1/m**3"),
+    "1/mm^3": (Decimal("1e9"), "1/m**3"),
+    "1/m^4": (Decimal(1), "1/m**4"),
+    "1/mm^4": (Decimal("1e12"), "1/m**4"),
+    "1/m^5": (Decimal(1), "1/m**5"),
+    "1/mm^5": (Decimal("1e15"), "1/m**5"),
+    "1/m^7": (Decimal(1), "1/m**7"),
+    "1/mm^7": (Decimal("1e21"), "1/m**7"),
+}
+"""The units that are suggested, as `_look_up` gives them: to ask pint for one takes it half a second to start."""
+
 _CELSIUS = ("degC", "celsius", "°C")
 _ZERO_CELSIUS = Decimal("273.15")
 
@@ -230,7 +280,7 @@ def _base(kind: Kind) -> str:
 
 @cache
 def _registry() -> Any:
-    # Importing pint and reading its table of units takes half a second, so it waits until a quantity is read.
+    # Importing pint and reading its table of units takes half a second, so it waits until a rare unit is read.
     import pint
 
     return pint.UnitRegistry(non_int_type=Decimal, cache_folder=None)
@@ -242,12 +292,17 @@ def _look_up(unit: str) -> tuple[Decimal, str] | None:
 
     Angles and pure numbers have the same dimension; they differ in base units, where angles keep their radian.
     """
-    import pint
-
     if not unit:
         return Decimal(1), ""
     if unit in _CELSIUS:
         return Decimal(1), "K"
+    return _KNOWN.get(unit) or _asked(unit)
+
+
+def _asked(unit: str) -> tuple[Decimal, str] | None:
+    """`_look_up` of a unit by pint."""
+    import pint
+
     registry = _registry()
     try:
         parsed = registry.parse_units("percent" if unit == "%" else unit)

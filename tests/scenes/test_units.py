@@ -1,10 +1,12 @@
 """Quantities: exact values, exact round trips, and refusals that say what is allowed."""
 
+import gc
 import math
 import random
 
 import pytest
 
+from scenes.yaml import units
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import (
     ANGLE,
@@ -141,3 +143,17 @@ def test_text_comes_out_as_it_went_in(text: str, kind: Kind) -> None:
 def test_no_text_for_what_is_not_finite(value: float) -> None:
     with pytest.raises(ValueError, match="has no text"):
         format_quantity(value, LENGTH)
+
+
+def test_the_units_that_are_suggested_are_those_of_pint() -> None:
+    """They are kept in a table, since asking pint takes half a second; factors to the last digits of its arithmetic."""
+    import scenes.schema  # noqa: F401 - all specifications, and with them all kinds
+
+    kinds = [item for item in gc.get_objects() if isinstance(item, Kind)]
+    suggested = {unit for kind in kinds for unit in (*kind.units, *kind.writes, kind.si)} - {"", "degC"}
+    assert suggested <= set(units._KNOWN)
+    for unit, (factor, base) in units._KNOWN.items():
+        asked = units._asked(unit)
+        assert asked is not None
+        assert asked[1] == base
+        assert abs(asked[0] / factor - 1) < 1e-26

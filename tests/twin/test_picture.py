@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import twin.main_job.render_command
 import twin.pictures.picture_light as picture_light
 import twin.render as command
 from scenes.specs.load import EXAMPLES
@@ -220,8 +221,10 @@ def done(backend):
 @pytest.fixture
 def ready(done, monkeypatch):
     """The computation is replaced by one that is done already, and pictures are small."""
-    monkeypatch.setattr(command, "render_job", lambda *arguments: done)
-    monkeypatch.setattr(command, "write_pictures", lambda *arguments: write_pictures(*arguments, shots=SMALL))
+    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments: done)
+    monkeypatch.setattr(
+        twin.main_job.render_command, "write_pictures", lambda *arguments: write_pictures(*arguments, shots=SMALL)
+    )
 
 
 def test_the_command_writes_them(ready, tmp_path):

@@ -101,7 +101,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
     def main() -> None:
         """Instruments of one's own."""
 
-    add_test(app, "own.bench", "level", LEVEL, report, "Read a level.")
+    add_test(app, "own.bench", "level", resolve, lambda: (LEVEL, report), "Read a level.")
     return lambda *arguments: invoke(app, *arguments)
 
 

@@ -19,6 +19,7 @@ import pytest
 import tifffile
 import xarray as xr
 
+import twin.main_job.render_command
 import twin.render as command
 from scenes.specs.load import EXAMPLES
 from tests.twin.commands import files, invoke
@@ -88,7 +89,7 @@ def stored(tmp_path_factory):
 
     def repeat(config: Path):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(command, "render_job", keep)
+            patch.setattr(twin.main_job.render_command, "render_job", keep)
             again = run(config, "--out", place / "again", "--quiet")
             other = run(EXAMPLE, "--out", place / "other", "--frames", FRAMES, "--seed", 6)
         return place, again, other, kept
@@ -107,9 +108,11 @@ def ready(repeated, monkeypatch):
     what comes before and after it.
     """
     _, _, _, kept = repeated
-    monkeypatch.setattr(command, "render_job", lambda *arguments, **options: kept[0])
+    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept[0])
     for writer in ("write_report", "write_scene", "write_summary"):
-        monkeypatch.setattr(command, writer, lambda *drawn: next(d for d in drawn if isinstance(d, Path)).touch())
+        monkeypatch.setattr(
+            twin.main_job.render_command, writer, lambda *drawn: next(d for d in drawn if isinstance(d, Path)).touch()
+        )
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------

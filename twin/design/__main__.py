@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from typing import Any
+
 import typer
 
-from twin.design.design_report import design_report
-from twin.design.design_run import DESIGN
+from scenes.models.camera_design import resolve_design
 from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet
-from twin.run.command import run_test
+from twin.run.command import Test, run_test
 
 PROGRAM = "twin.design"
 
@@ -31,7 +37,14 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    run_test(PROGRAM, "", file, DESIGN, design_report, Options(out, None, backend, force, as_json, quiet))
+    run_test(PROGRAM, "", file, resolve_design, _design, Options(out, None, backend, force, as_json, quiet))
+
+
+def _design() -> Test[Any]:
+    from twin.design.design_report import design_report
+    from twin.design.design_run import DESIGN
+
+    return DESIGN, design_report
 
 
 if __name__ == "__main__":

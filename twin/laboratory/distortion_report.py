@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from analysis.spots.centroid import mean_frames
@@ -19,6 +18,9 @@ from twin.laboratory.turntable_report import FIT_NAMES
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 RAW, COMPENSATED = "angles as read", "compensated angles"
 

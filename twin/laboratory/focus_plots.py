@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from analysis.mtf.slanted_edge import measure_edge
 from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment, State
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FIELD_COLOURS = (BLUE, GREEN, ORANGE, VERMILION, PURPLE)
 EDGE_COLOURS = {ALONG: BLUE, TRACK: VERMILION}

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, format_quantity
@@ -16,6 +14,10 @@ from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import SvgFigure, Table
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FIT_NAMES = {
     "piecewise_linear": "piecewise linear",

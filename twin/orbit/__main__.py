@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from typing import Any
+
 import typer
 
-from twin.orbit.angle.angle_numbers import ANGLE
-from twin.orbit.angle.angle_report import angle_report
-from twin.orbit.calibration.calibration_numbers import CALIBRATION
-from twin.orbit.calibration.calibration_report import calibration_report
-from twin.orbit.images.simulate_numbers import SIMULATE
-from twin.orbit.images.simulate_report import simulation_report
-from twin.orbit.monitoring.monitoring_numbers import MONITOR
-from twin.orbit.monitoring.monitoring_report import monitor_report
-from twin.run.command import add_test
+from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+from twin.run.command import Test, add_test
 
 PROGRAM = "twin.orbit"
 
@@ -32,12 +32,40 @@ def main() -> None:
     """
 
 
+def _angle() -> Test[Any]:
+    from twin.orbit.angle.angle_numbers import ANGLE
+    from twin.orbit.angle.angle_report import angle_report
+
+    return ANGLE, angle_report
+
+
+def _calibration() -> Test[Any]:
+    from twin.orbit.calibration.calibration_numbers import CALIBRATION
+    from twin.orbit.calibration.calibration_report import calibration_report
+
+    return CALIBRATION, calibration_report
+
+
+def _monitor() -> Test[Any]:
+    from twin.orbit.monitoring.monitoring_numbers import MONITOR
+    from twin.orbit.monitoring.monitoring_report import monitor_report
+
+    return MONITOR, monitor_report
+
+
+def _simulate() -> Test[Any]:
+    from twin.orbit.images.simulate_numbers import SIMULATE
+    from twin.orbit.images.simulate_report import simulation_report
+
+    return SIMULATE, simulation_report
+
+
 add_test(
     app,
     PROGRAM,
     "angle",
-    ANGLE,
-    angle_report,
+    resolve_angle,
+    _angle,
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
 
@@ -50,8 +78,8 @@ add_test(
     app,
     PROGRAM,
     "calibrate",
-    CALIBRATION,
-    calibration_report,
+    resolve_calibration,
+    _calibration,
     """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
     parameters tested on all fields without ground control (paper 003).
 
@@ -64,8 +92,8 @@ add_test(
     app,
     PROGRAM,
     "monitor",
-    MONITOR,
-    monitor_report,
+    resolve_monitor,
+    _monitor,
     """Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
     monitor, heights as in papers 000 and 003).
 
@@ -78,8 +106,8 @@ add_test(
     app,
     PROGRAM,
     "simulate",
-    SIMULATE,
-    simulation_report,
+    resolve_simulate,
+    _simulate,
     """Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import typer
 from rich.console import Console
@@ -32,11 +32,12 @@ from twin.run.cli import (
     progress_columns,
     result_table,
 )
-from twin.run.page import RunFacts, cell_text, write_test
 from twin.run.procedure import Advance, BenchError, Procedure, Run
 from twin.run.reference_frames import described
-from twin.run.report import Report
 from twin.run.run_folder import RunFolder, chosen
+
+if TYPE_CHECKING:
+    from twin.run.report import Report
 
 WRITE = "write the run folder"
 """Name of the work in the progress display."""
@@ -82,6 +83,11 @@ class Result:
 
 
 Given = TypeVar("Given")
+
+Test: TypeAlias = "tuple[Procedure[Any, Run], Callable[[Run], Report]]"
+"""A test, and what makes the report of its run. A command imports them when it has read the file: its help and what is
+wrong with a file wait for neither.
+"""
 
 
 def run_command(
@@ -140,8 +146,8 @@ def add_test(
     app: typer.Typer,
     program: str,
     command: str,
-    procedure: Procedure[Any, Run],
-    report: Callable[[Run], Report],
+    resolve: Callable[[Path], Any],
+    load: Callable[[], Test[Run]],
     about: str,
 ) -> None:
     """Add a test to a program as a subcommand with the options that all tests have.
@@ -150,8 +156,8 @@ def add_test(
         app: of the program.
         program: as the user calls it, ``twin.lab``.
         command: the subcommand, ``focus``.
-        procedure: the test.
-        report: of its run.
+        resolve: reads the test's file, as its procedure does.
+        load: imports the test and its report.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
     """
 
@@ -165,15 +171,15 @@ def add_test(
         as_json: AsJson = False,
         quiet: Quiet = False,
     ) -> None:
-        run_test(program, command, file, procedure, report, Options(out, seed, backend, force, as_json, quiet))
+        run_test(program, command, file, resolve, load, Options(out, seed, backend, force, as_json, quiet))
 
 
 def run_test(
     program: str,
     command: str,
     file: Path,
-    procedure: Procedure[Any, Run],
-    report: Callable[[Run], Report],
+    resolve: Callable[[Path], Any],
+    load: Callable[[], Test[Run]],
     options: Options,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
@@ -182,8 +188,8 @@ def run_test(
         program: as the user calls it, ``twin.lab``.
         command: its subcommand, ``focus``.
         file: of the test.
-        procedure: the test; ``test`` of its set-up has a ``seed``.
-        report: of its run.
+        resolve: reads it, as the test's procedure does; ``test`` of the set-up has a ``seed``.
+        load: imports the test and its report.
         options: what the user chose.
 
     Raises:
@@ -191,6 +197,9 @@ def run_test(
     """
 
     def work(setup: Any, session: Session) -> Result:
+        from twin.run.page import RunFacts, write_test
+
+        procedure, report = load()
         number = setup.test.seed if options.seed is None else options.seed
         try:
             run = procedure.run(setup, session.backend, number, session.advance)
@@ -202,7 +211,7 @@ def run_test(
         write_test(procedure.kind, numbers, shown, facts, session.folder)
         return Result(described(procedure.kind, numbers), lambda console: _print_report(shown, console))
 
-    run_command(file.stem, options, lambda: procedure.resolve(file), work)
+    run_command(file.stem, options, lambda: resolve(file), work)
 
 
 def _explained_at(test: Any, error: BenchError) -> InputError:
@@ -213,6 +222,8 @@ def _explained_at(test: Any, error: BenchError) -> InputError:
 
 
 def _print_report(report: Report, console: Console) -> None:
+    from twin.run.page import cell_text
+
     summary = report.summary
     table = result_table(report.title)
     for k, head in enumerate(summary.heads):

@@ -8,12 +8,14 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import tifffile
-import xarray as xr
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def netcdf(data: xr.Dataset) -> bytes:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from contextlib import AbstractContextManager
 from io import BytesIO, StringIO
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
+if TYPE_CHECKING:  # who only names colours does not wait for what draws
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette: told apart with any colour vision.
 BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, YELLOW = (
@@ -51,11 +50,16 @@ WIDTH = 10.6
 
 def new_figure(height: float, pads: dict[str, Any] | None = None) -> Figure:
     """An empty figure, ``height`` inches high, arranged without overlap; ``pads``: of ``ConstrainedLayoutEngine``."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     return Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(**(pads or {"h_pad": 0.08})))
 
 
 def look(name: str) -> AbstractContextManager[None]:
     """Context in which figures are drawn; ``name`` makes an SVG's identifiers its own, and the same in every run."""
+    import matplotlib
+
     style: Any = {**STYLE, "svg.hashsalt": name}
     return matplotlib.rc_context(style)
 

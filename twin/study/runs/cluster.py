@@ -13,16 +13,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import dask
-from distributed import Client, LocalCluster
-from distributed.scheduler import KilledWorker
-from distributed.security import Security
+from typing import TYPE_CHECKING, Any
 
 from twin.run.cli import InputErrorText
 from twin.run.versions import source_digest, versions
 from twin.study.runs.task import ONE_THREAD
+
+if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started
+    from distributed import Client
 
 REACH_SECONDS = 5.0
 """How long a scheduler may take to answer before the user is told that it does not."""
@@ -95,6 +93,8 @@ class Workers:
 
 def killed(error: BaseException) -> bool:
     """Whether a task failed because the workers that had it died."""
+    from distributed.scheduler import KilledWorker
+
     return isinstance(error, KilledWorker)
 
 
@@ -105,6 +105,10 @@ def local_workers(count: int) -> Iterator[Workers]:
     Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
     So all speak TLS with a key that is made for the study and kept in memory, and a peer without it is refused.
     """
+    import dask
+    from distributed import Client, LocalCluster
+    from distributed.security import Security
+
     place = Path(tempfile.mkdtemp(prefix="twin-study-"))
     settings = {
         # set before the processes start: NumPy reads them when it is imported
@@ -178,6 +182,9 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
     """
     if not address.startswith(SCHEMES):
         raise InputErrorText(f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786")
+    import dask
+    from distributed import Client
+
     _silence()
     settings = {
         "distributed.comm.timeouts.connect": f"{REACH_SECONDS}s",

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from math import hypot, log, sqrt
 
-from matplotlib.ticker import FuncFormatter
-
 from analysis.units import ARCSEC
 from twin.monitor.simulated_budget import BudgetLine
 from twin.run.artefact import Cell, Data, SvgFigure, Table
@@ -85,7 +83,7 @@ def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:
             axes.plot([simulated], [row], "o", color=BLUE, ms=6.0, label="simulated" if row == 0 else None)
         axes.set_xscale("log")
         axes.set_xlim(1e-3, 0.3)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.set_yticks(range(len(lines)), list(lines))
         axes.set_ylim(len(lines) - 0.5, -0.6)
         axes.set_xlabel("error of one spot, 3σ [arcsec]")

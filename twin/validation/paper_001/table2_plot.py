@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from analysis.units import ARCSEC
 from optics.numerics.quadrature import PupilNodes
@@ -17,6 +14,9 @@ from twin.laboratory.autocollimator_bench import Reader, ReadingTable
 from twin.laboratory.autocollimator_images import AutocollimatorPath
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
 from twin.validation.checks.printed import load_printed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 DPI = 130
 _ACROSS = PupilNodes(np.array([0.0, 0.0, 0.0]), np.array([-1.0, 0.0, 1.0]), np.full(3, 1.0 / 3.0))
@@ -34,6 +34,8 @@ def bench_png(reader: Reader, tables: Sequence[ReadingTable]) -> bytes:
         reader: of the experiment.
         tables: rendered benches, each with the series of Table 2.
     """
+    from matplotlib.figure import Figure
+
     with look("principle"):
         figure = Figure(figsize=(13.0, 7.4), layout="constrained", facecolor="white")
         grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1.0))
@@ -50,6 +52,8 @@ def _plan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bench(axes: Axes, path: AutocollimatorPath) -> None:
+    from matplotlib.patches import Circle
+
     bench, spec = path.bench, path.bench.spec
     placed = bench.assembly.place()
     for n, unit in enumerate(UNITS):

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from analysis.units import ARCSEC
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, JOINT, PRINTED, Curves
 from twin.validation.paper_001.ranges.defocus import FieldPoint, PupilStudy
 from twin.validation.paper_001.ranges.turns import CLAIMED, EQUATIONS, FINE, NAMES, Corners, Range, key
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _COLOURS = {PRINTED: VERMILION, JOINT: ORANGE, CORRECTED: BLUE, CALIBRATED: GREEN}
 _MARKS = {PRINTED: "o", JOINT: "D", CORRECTED: "s", CALIBRATED: "^"}

@@ -1,0 +1,62 @@
+"""How commands start: their help, and what is wrong with a file, wait for nothing that computes or draws; Ctrl-C ends
+them without a traceback from the first moment on.
+"""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.twin.study_bench import ROOT
+
+HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
+"""What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
+READ = (("twin.render",), ("twin.study",), ("twin.design",), ("twin.lab", "focus"), ("twin.orbit", "angle"))
+"""Commands that read a YAML file; all tests of a program do it in the same way."""
+PROGRAMS = (
+    *("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.doctor"),
+    *("scenes.schema", "analysis.mtf"),
+)
+BAD = "seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n"
+
+
+def run(*words: object, **options) -> subprocess.CompletedProcess:
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, **options)
+
+
+def heavy(words: tuple) -> tuple[int, set[str]]:
+    """Exit code of a command, and what it imported of HEAVY."""
+    done = run("-X", "importtime", "-m", *words)
+    names = set(re.findall(r"^import time:.*\| +([\w.]+)$", done.stderr, re.M))
+    assert len(names) > 100
+    return done.returncode, {name.split(".")[0] for name in names} & HEAVY
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_help_imports_nothing_that_computes(program: str) -> None:
+    assert heavy((program, "--help")) == (0, set())
+
+
+@pytest.mark.parametrize("words", READ, ids=" ".join)
+def test_a_bad_file_is_told_before_anything_that_computes_is_imported(words: tuple, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(BAD, "utf-8")
+    assert heavy((*words, path)) == (2, set())
+
+
+def test_a_wrong_option_of_the_mtf_is_told_before_anything_is_drawn() -> None:
+    assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pixel-size", "7 um")) == (2, set())
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_ctrl_c_during_imports_leaves_no_traceback(program: str, tmp_path: Path) -> None:
+    """One module stands for all: while it is imported, the signal comes."""
+    (tmp_path / "typer.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n", "utf-8"
+    )
+    done = run("-m", program, "--help", env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"})
+    assert done.returncode in (130, -2)  # by the signal, which a shell shows as 130
+    assert done.stderr == "interrupted\n"
