@@ -17,14 +17,15 @@ from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.spec import Source
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
+from twin.run.command import Test
 from twin.run.page import RunFacts, cell_text, write_test
-from twin.run.procedure import BenchError, Procedure, silent
+from twin.run.procedure import BenchError, silent
 from twin.run.report import Report
 from twin.run.run_folder import RunFolder
 
 
 @dataclass(frozen=True, eq=False)
-class Test:
+class TestResult:
     """A finished test.
 
     Attributes:
@@ -71,7 +72,9 @@ class Test:
         return f"<h4>{escape(self.report.title)}</h4>{lead}{self.summary.to_html(index=False)}{notes}"
 
 
-def perform(name: str, file: str | Path, *, seed: int | None = None, backend: str = "llvm", **changes: Any) -> Test:
+def perform(
+    name: str, file: str | Path, *, seed: int | None = None, backend: str = "llvm", **changes: Any
+) -> TestResult:
     """Run a test of the laboratory or of the orbit.
 
     Args:
@@ -106,7 +109,7 @@ def perform(name: str, file: str | Path, *, seed: int | None = None, backend: st
     program, command = name.split()
     config = setup.with_seed(number).to_yaml()
     facts = RunFacts(config, str(file), backend, number, started, time.monotonic() - clock, f"twin.{program}", command)
-    return Test(name, procedure.numbers(run), report(run), setup, run, facts, procedure.kind)
+    return TestResult(name, procedure.numbers(run), report(run), setup, run, facts, procedure.kind)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -118,60 +121,57 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
     return out
 
 
-Parts = tuple[Procedure[Any, Any], Callable[[Any], Report]]
-
-
 # Only the test that is asked for is imported.
-def _focus() -> Parts:
+def _focus() -> Test[Any]:
     from twin.laboratory.focus_numbers import FOCUS
     from twin.laboratory.focus_report import focus_report
 
     return FOCUS, focus_report
 
 
-def _distortion() -> Parts:
+def _distortion() -> Test[Any]:
     from twin.laboratory.distortion_numbers import DISTORTION
     from twin.laboratory.distortion_report import distortion_report
 
     return DISTORTION, distortion_report
 
 
-def _turntable() -> Parts:
+def _turntable() -> Test[Any]:
     from twin.laboratory.turntable_numbers import TURNTABLE
     from twin.laboratory.turntable_report import turntable_report
 
     return TURNTABLE, turntable_report
 
 
-def _angle() -> Parts:
+def _angle() -> Test[Any]:
     from twin.orbit.angle.angle_numbers import ANGLE
     from twin.orbit.angle.angle_report import angle_report
 
     return ANGLE, angle_report
 
 
-def _calibrate() -> Parts:
+def _calibrate() -> Test[Any]:
     from twin.orbit.calibration.calibration_numbers import CALIBRATION
     from twin.orbit.calibration.calibration_report import calibration_report
 
     return CALIBRATION, calibration_report
 
 
-def _monitor() -> Parts:
+def _monitor() -> Test[Any]:
     from twin.orbit.monitoring.monitoring_numbers import MONITOR
     from twin.orbit.monitoring.monitoring_report import monitor_report
 
     return MONITOR, monitor_report
 
 
-def _simulate() -> Parts:
+def _simulate() -> Test[Any]:
     from twin.orbit.images.simulate_numbers import SIMULATE
     from twin.orbit.images.simulate_report import simulation_report
 
     return SIMULATE, simulation_report
 
 
-TESTS: dict[str, Callable[[], Parts]] = {
+TESTS: dict[str, Callable[[], Test[Any]]] = {
     "lab focus": _focus,
     "lab distortion": _distortion,
     "lab turntable": _turntable,
