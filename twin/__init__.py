@@ -17,15 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from scenes.yaml.errors import InputError
-    from twin.scripting.instrument import InstrumentTwin, load
+    from twin.scripting.instrument import InstrumentTwin, load, load_camera
     from twin.scripting.procedures import TestResult, perform
     from twin.scripting.results import Found, Shot
     from twin.study.scripted import study
 
-__all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "TestResult", "load", "perform", "study"]
+__all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "TestResult", "load", "load_camera", "perform", "study"]
 
 _PLACES = {
     "load": "twin.scripting.instrument",
+    "load_camera": "twin.scripting.instrument",
     "InstrumentTwin": "twin.scripting.instrument",
     "Shot": "twin.scripting.results",
     "Found": "twin.scripting.results",

@@ -329,3 +329,15 @@ def test_a_camera_is_in_the_state_of_its_instrument(pair: twin.InstrumentTwin) -
     assert moved.plot().axes
     with pytest.raises(twin.InputError, match="did you mean 'forward'"):
         pair.camera("forwards")
+
+
+def test_mtf_of_targets_is_a_table(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
+    """30 um of M2 cost 9 to 16 % of the MTF; readings keep within 5 sigma of the true ones (12 of them: 1e-5)."""
+    assert shot.mtf.empty
+    table = pair.perturbed({"base/forward/M2": {"shift": "0 0 30 um"}}).render(images=["knife_edge"], frames=4).mtf
+    forward, backward = table.loc["forward"], table.loc["backward"]
+    assert np.all(forward["after_true"] < 0.95 * forward["before_true"])
+    assert np.allclose(backward["after_true"], backward["before_true"], rtol=1e-6)
+    for when in ("before", "after"):
+        assert np.all(np.abs(table[when] - table[f"{when}_true"]) < 5.0 * table[f"{when}_sigma"])
+    assert len(table) == 12

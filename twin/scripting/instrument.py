@@ -18,6 +18,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend, load_backend
 from scenes.specs.job import JobSpec, NodeInfo, check_nodes
 from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.load import load_camera as read_camera
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.translate import validate
@@ -286,3 +287,19 @@ def load(what: str | Path, backend: str = "llvm") -> InstrumentTwin:
         text = str(Path(what).resolve()) if data else text
     resolved = resolve_job(validate(JobSpec, YamlFile("", {"instrument": text}, {})))
     return InstrumentTwin(resolved, _Bench(resolved, backend))
+
+
+def load_camera(what: str | Path, backend: str = "llvm") -> CameraView:
+    """A camera by itself, as optical designers look at it.
+
+    Args:
+        what: name of a camera in the library (``gf7``), or path of a camera's file.
+        backend: where to trace, ``llvm`` or ``cuda``.
+
+    Raises:
+        InputError: no such name, a file that cannot be read or is not valid, or a prescription that brings no light
+            through the stop to the image.
+    """
+    from twin.camera.camera_view import CameraView
+
+    return CameraView.alone(read_camera(what), load_backend(backend))

@@ -37,7 +37,7 @@ class TestResult:
     """
 
     name: str
-    numbers: Mapping[str, Any]
+    numbers: Mapping[str, Any] = field(repr=False)
     report: Report = field(repr=False)
     setup: ExperimentSetup[Any] = field(repr=False)
     run: Any = field(repr=False)

@@ -16,6 +16,7 @@ from analysis.monitor.recovery import ESTIMATORS, Recovery
 from analysis.units import ARCSEC
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import RenderRun
+from twin.targets.target_result import PlaceTargets
 
 ANGLE = "angle_change_arcsec"
 """Name of the change of the angle between two cameras' lines of sight."""
@@ -40,6 +41,23 @@ class Shot:
     truth: xr.Dataset
     warnings: tuple[str, ...]
     run: RenderRun = field(repr=False)
+
+    @property
+    def mtf(self) -> pd.DataFrame:
+        """MTF at the Nyquist frequency from the images of knife edges, before and after, with sigma and beside it the
+        true one; a row for every camera, place and direction. Empty unless ``knife_edge`` was among the images.
+        """
+        cameras = self.run.targets.cameras if self.run.targets is not None else {}
+        rows = {
+            (camera, name, direction): _edge_row(place, direction)
+            for camera, found in cameras.items()
+            for name, place in found.places.items()
+            for direction in place.before.edges
+        }
+        table = pd.DataFrame.from_dict(rows, orient="index")
+        if rows:
+            table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "place", "direction"])
+        return table
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
@@ -98,6 +116,15 @@ class Found:
 
     def __repr__(self) -> str:
         return reading_frame(self).to_string()
+
+
+def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
+    out = {}
+    for when, shots in place.shots.items():
+        edge = shots.edges[direction]
+        value, sigma = edge.nyquist or (np.nan, np.nan)
+        out |= {when: value, f"{when}_sigma": sigma, f"{when}_true": edge.true_nyquist}
+    return out
 
 
 def _row(true: float, readings: xr.DataArray, sigma: xr.DataArray) -> dict[str, float]:
