@@ -75,11 +75,13 @@ class Result:
         numbers: plain data, for ``--json``.
         show: prints the result for a reader.
         problem: why something asked for is not in the run folder, empty for nothing; the exit code is then 1.
+        code: exit code that the result itself asks for, of a command whose answer it is.
     """
 
     numbers: Mapping[str, Any]
     show: Callable[[Console], None]
     problem: str = ""
+    code: int = 0
 
 
 Given = TypeVar("Given")
@@ -128,6 +130,8 @@ def run_command(
     if result.problem:
         print_error(errors, f"{result.problem}; all else is in {folder.target}")
         raise typer.Exit(FAILURE)
+    if result.code:
+        raise typer.Exit(result.code)
 
 
 def _advance(bar: Progress) -> Advance:
@@ -209,7 +213,7 @@ def run_test(
         config, name = setup.with_seed(number).to_yaml(), session.backend.name
         facts = RunFacts(config, str(file), name, number, session.started, session.seconds, program, command)
         write_test(procedure.kind, numbers, shown, facts, session.folder)
-        return Result(described(procedure.kind, numbers), lambda console: _print_report(shown, console))
+        return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console))
 
     run_command(file.stem, options, lambda: resolve(file), work)
 
@@ -221,7 +225,8 @@ def _explained_at(test: Any, error: BenchError) -> InputError:
     return result
 
 
-def _print_report(report: Report, console: Console) -> None:
+def print_report(report: Report, console: Console) -> None:
+    """The main table of a report, and what was found."""
     from twin.run.page import cell_text
 
     summary = report.summary

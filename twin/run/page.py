@@ -82,6 +82,7 @@ class RunFacts:
         seconds: that it took.
         program: that ran it, as the user calls it.
         command: its subcommand.
+        again: the command that runs it again, where it is not the test with the run's own config.yaml.
     """
 
     config: str
@@ -92,6 +93,7 @@ class RunFacts:
     seconds: float
     program: str
     command: str
+    again: str = ""
 
 
 def place(artefact: Artefact) -> str:
@@ -129,7 +131,7 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
             summary=artefact_content(report.summary, place(report.summary)),
             sections=section_contents(report.sections),
             facts=facts,
-            command=reproduce(facts.program, facts.command, "config.yaml", options),
+            command=facts.again or reproduce(facts.program, facts.command, "config.yaml", options),
             versions=versions(),
         )
     )

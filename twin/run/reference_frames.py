@@ -115,6 +115,7 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "east_m, north_m": "local horizon at the middle of the patch",
         },
         "study": {"truth, recovered": f"{_CAMERA}; {_ANGLE}", "responses": "as in the base's file that the key names"},
+        "compare": {"numbers, arrays": "as in the compared files, each of which states its own"},
         "gradient": {"responses": f"{_CAMERA}; {_ANGLE}", "factors": "motions in the moved body's own nominal axes"},
     }
 )

@@ -27,6 +27,7 @@ from twin.main_job.render_job import render_job
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import truth_jacobian
+from twin.run.reference_frames import frames_text
 from twin.scripting.motion_names import motion_named
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
@@ -219,6 +220,7 @@ class InstrumentTwin:
                 "parameter": list(PARAMETERS),
                 "estimator": list(ESTIMATORS),
             },
+            attrs={"reference_frames": frames_text("crosstalk")},
         )
 
     def camera(self, name: str, obstruction: bool = True) -> CameraView:

@@ -16,6 +16,7 @@ from analysis.monitor.recovery import ESTIMATORS, Recovery
 from analysis.units import ARCSEC
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import RenderRun
+from twin.run.reference_frames import frames_text
 from twin.targets.target_result import PlaceTargets
 
 ANGLE = "angle_change_arcsec"
@@ -119,7 +120,7 @@ class Found:
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
-    out = {}
+    out: dict[str, float] = {}
     for when, shots in place.shots.items():
         edge = shots.edges[direction]
         value, sigma = edge.nyquist or (np.nan, np.nan)
@@ -180,7 +181,8 @@ def _truth(run: RenderRun) -> xr.Dataset:
     if "intersection_angle" in true:
         data[ANGLE] = true["intersection_angle"]["change_arcsec"]
         data["angle_nominal_deg"] = true["intersection_angle"]["nominal_deg"]
-    return xr.Dataset(data, coords={"camera": list(cameras)})
+    about = {"reference_frames": frames_text("truth")}
+    return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=about)
 
 
 def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[str]) -> Found:
@@ -201,15 +203,17 @@ def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[s
         "before_sigma": recovery.sigma_before[0],
         "after_sigma": recovery.sigma_after[0],
     }
+    about = {"reference_frames": frames_text("recovered")}
     return Found(
-        values=xr.DataArray(np.array(values), dims=dims, coords=coords, name="reading"),
+        values=xr.DataArray(np.array(values), dims=dims, coords=coords, name="reading", attrs=about),
         covariance=xr.DataArray(
             np.array(spread), dims=(*dims, "parameter_2"), coords={**coords, "parameter_2": list(PARAMETERS)}
         ),
-        angle=xr.Dataset(angle, coords={"estimator": list(ESTIMATORS)} if angle else {}),
+        angle=xr.Dataset(angle, coords={"estimator": list(ESTIMATORS)} if angle else {}, attrs=about),
         spots=xr.Dataset(
             {name: (("channel", "axis"), value, {"units": "px"}) for name, value in spots.items()},
             coords={"channel": list(channels), "axis": ["row", "column"]},
+            attrs=about,
         ),
     )
 

@@ -1,0 +1,164 @@
+"""`python -m twin.compare`: what differs is found, what does not is not, and the exit code says which."""
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from scenes.yaml.errors import InputError
+from twin.compare.__main__ import app
+from twin.compare.comparison import compare, numbers, verdict
+from twin.compare.run_differences import read_run
+from twin.main_job.render_job import render_job
+from twin.run.run_folder import RunFolder, write_manifest
+from twin.scripting.instrument import load
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data of three small jobs: a, b with another despace, and a once more, written as the command writes them."""
+    from twin.main_job.render_files import write_data
+
+    folder = tmp_path_factory.mktemp("runs")
+    pair = load("monitor_pair")
+    for name, shift, seed in (("a", 3, 1), ("b", 4, 1), ("again", 3, 1), ("seed", 3, 2)):
+        twin = pair.perturbed({"base/forward/M2": {"shift": f"0 0 {shift} um"}})
+        with RunFolder(folder / name) as target:
+            write_data(render_job(twin.resolved, pair.experiment.backend, 2, seed), target)
+            write_manifest(target, "twin.render", 0.0, 1.0, seed=seed, warnings=[])
+    return folder
+
+
+def run(*words: object) -> tuple[int, str]:
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    return done.exit_code, done.output
+
+
+def test_a_run_is_the_same_as_itself_again(runs: Path, tmp_path: Path) -> None:
+    code, text = run(runs / "a", runs / "again", "--out", tmp_path / "out")
+    assert code == 0
+    assert "again gave the same as a (no input changed" in text
+    found = json.loads((tmp_path / "out/compare.json").read_text())
+    assert found["same"]
+    assert found["others"][0]["compared"] > 1000
+
+
+def test_what_differs_is_found(runs: Path, tmp_path: Path) -> None:
+    code, text = run(runs / "a", runs / "b", "--out", tmp_path / "out", "--json")
+    assert code == 1
+    found = json.loads(text)["others"][0]
+    assert found["inputs"] == [{"key": "job.perturb.base/forward/M2.shift[2]", "reference": "3 um", "other": "4 um"}]
+    changed = {(one["file"], one["key"]): one for one in found["numbers"]}
+    true = changed["truth.json", "cameras.forward.d_f_um"]
+    a, b = (json.loads((runs / name / "truth.json").read_text())["cameras"]["forward"]["d_f_um"] for name in "ab")
+    assert (true["reference"], true["other"], true["difference"]) == (a, b, b - a)
+    assert true["in_sigma"] is None
+    read = changed["recovered.json", "cameras.forward.model.d_f_um"]
+    sigmas = [
+        json.loads((runs / name / "recovered.json").read_text())["cameras"]["forward"]["model"]["d_f_um_sigma"]
+        for name in "ab"
+    ]
+    assert read["sigma"] == pytest.approx(np.hypot(*sigmas), rel=1e-12)
+    assert read["in_sigma"] == pytest.approx(read["difference"] / read["sigma"], rel=1e-12)
+    # the other camera keeps its truth, and its frames to the byte
+    assert not any("backward.d_" in key for file, key in changed if file == "truth.json")
+    images = {one["file"] for one in found["arrays"]}
+    assert images == {"irradiance.nc", "images/forward_left_after.tiff", "images/forward_right_after.tiff"}
+    largest = next(one["largest"] for one in found["arrays"] if one["file"] == "images/forward_left_after.tiff")
+    frames = [tifffile.imread(runs / name / "images/forward_left_after.tiff").astype(float) for name in "ab"]
+    assert largest == np.max(np.abs(frames[1] - frames[0]))
+    page = (tmp_path / "out/report.html").read_text("utf-8")
+    assert "python -m twin.compare" in page
+    assert page.count("data:image/png") == 4
+
+
+def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
+    """Another seed: every reading moves, none by more than 5 sigma (some 70 of them: 4e-5)."""
+    folders = [runs / "a", runs / "seed"]
+    strict, loose = compare(folders, 1e-9, None), compare(folders, 1e-9, 5.0)
+    readings = [one for one in strict.found[0].numbers if one.in_sigma is not None]
+    assert len(readings) > 40
+    assert loose.same
+    assert loose.found[0].compared > 500
+    assert "no input" not in verdict(strict)  # the seed stands in config.yaml
+
+
+def test_order_of_runs_only_turns_signs(runs: Path) -> None:
+    there, back = compare([runs / "a", runs / "b"], 1e-9, None), compare([runs / "b", runs / "a"], 1e-9, None)
+    forward = {(one.file, one.key): one.difference for one in there.found[0].numbers}
+    backward = {(one.file, one.key): one.difference for one in back.found[0].numbers}
+    assert forward.keys() == backward.keys()
+    assert all(value is None or value == -backward[key] for key, value in forward.items())
+
+
+def test_several_runs_are_held_against_the_first(runs: Path) -> None:
+    found = numbers(compare([runs / "a", runs / "again", runs / "b"], 1e-9, None))
+    assert [other["same"] for other in found["others"]] == [True, False]
+    assert not found["same"]
+
+
+def test_small_differences_count_by_the_tolerance(runs: Path, tmp_path: Path) -> None:
+    """A truth that is 1e-7 off, and a pixel of an image: found, and not found with a wider tolerance."""
+    copy = tmp_path / "copy"
+    shutil.copytree(runs / "a", copy)
+    truth = json.loads((copy / "truth.json").read_text())
+    truth["cameras"]["forward"]["d_f_um"] *= 1.0 + 1e-7
+    (copy / "truth.json").write_text(json.dumps(truth))
+    with h5py.File(copy / "irradiance.nc", "r+") as data:
+        data["photons"][0, 0, 5, 5] += 1e-7 * data["photons"][...].max()
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["sha256"]["irradiance.nc"] = "0" * 64
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    fine, wide = (compare([runs / "a", copy], rtol, None).found[0] for rtol in (1e-9, 1e-6))
+    assert [one.key for one in fine.numbers] == ["cameras.forward.d_f_um"]
+    assert [(one.name, round(one.share * 4 * 2 * 96 * 96)) for one in fine.arrays] == [("photons", 1)]
+    assert wide.same
+
+
+def test_keys_that_only_one_has_are_told(runs: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(runs / "a", copy)
+    truth = json.loads((copy / "truth.json").read_text())
+    del truth["intersection_angle"]["nominal_deg"]
+    (copy / "truth.json").write_text(json.dumps(truth))
+    (found,) = compare([runs / "a", copy], 1e-9, None).found
+    assert [(one.key, one.other) for one in found.numbers] == [("intersection_angle.nominal_deg", None)]
+
+
+def test_units_do_not_matter(runs: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(runs / "a", copy)
+    text = (copy / "config.yaml").read_text()
+    assert "3 um" in text
+    (copy / "config.yaml").write_text(text.replace("3 um", "0.003 mm"))
+    assert not compare([runs / "a", copy], 1e-9, None).found[0].inputs
+
+
+@pytest.mark.parametrize("other", ["missing", "empty", "kind", "one"])
+def test_bad_input_is_explained(runs: Path, tmp_path: Path, other: str) -> None:
+    folder = tmp_path / "folder"
+    if other == "empty":
+        folder.mkdir()
+    if other == "kind":
+        shutil.copytree(runs / "a", folder)
+        text = (folder / "manifest.json").read_text()
+        (folder / "manifest.json").write_text(text.replace("twin.render", "twin.orbit"))
+    words = [runs / "a"] if other == "one" else [runs / "a", folder]
+    code, text = run(*words, "--out", tmp_path / "out")
+    says = {"missing": "no such folder", "empty": "not a run folder", "kind": "runs of two kinds", "one": "two runs"}
+    assert code == 2
+    assert says[other] in text
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_file_is_named(runs: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(runs / "a", copy)
+    (copy / "truth.json").write_text("{")
+    with pytest.raises(InputError, match=r"truth\.json: cannot be read"):
+        read_run(copy)

@@ -1,0 +1,78 @@
+"""``python -m twin.compare``: what differs between run folders."""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenes.yaml.yaml_file import dump_yaml
+from twin.run.cli import AsJson, Force, Options, Out, Quiet
+from twin.run.command import Result, Session, print_report, run_command
+from twin.run.reference_frames import described
+
+DIFFERENT = 1
+"""Exit code where results differ, as that of diff."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    runs: Annotated[list[Path], typer.Argument(readable=False, help="Run folders; the first is the reference.")],
+    rtol: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Numbers that agree to this part of the larger are the same.")
+    ] = 1e-9,
+    sigmas: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Numbers with a sigma are the same within so many of them, and recorded frames do not count. Default: "
+            "all to --rtol.",
+        ),
+    ] = None,
+    out: Out = None,
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare run folders of one kind: what went in, what came out, and the images.
+
+    Any run folders of one command can be compared: two jobs that differ in one perturbation, one job before and after
+    a change of the program, the same study with other seeds. Times and durations are left out.
+
+    For example:
+
+        python -m twin.compare runs/perturb-001 runs/perturb-002 --sigmas 3
+
+    The folder gets compare.json, tables as CSV, and a report with the images side by side.
+
+    Exit codes: 0 no result differs, 1 results differ, 2 bad input.
+    """
+
+    def work(given: None, session: Session) -> Result:
+        from twin.compare.compare_report import compare_report
+        from twin.compare.comparison import KIND, PROGRAM, compare, numbers
+        from twin.run.page import RunFacts, write_test
+
+        comparison = compare(runs, rtol, sigmas)
+        found, report = numbers(comparison), compare_report(comparison)
+        limits = ["--rtol", f"{rtol:g}"] + ([] if sigmas is None else ["--sigmas", f"{sigmas:g}"])
+        config = {"runs": [str(run) for run in runs], "rtol": rtol, "sigmas": sigmas}
+        again = " ".join(["python -m", PROGRAM, *map(str, runs), *limits, "--out again"])
+        facts = RunFacts(dump_yaml(config), "", "", 0, session.started, session.seconds, PROGRAM, "", again)
+        write_test(KIND, found, report, facts, session.folder)
+        code = 0 if comparison.same else DIFFERENT
+        return Result(described(KIND, found), lambda console: print_report(report, console), code=code)
+
+    run_command("compare", Options(out, None, "llvm", force, as_json, quiet), lambda: None, work)
+
+
+if __name__ == "__main__":
+    app()

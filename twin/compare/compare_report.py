@@ -1,0 +1,190 @@
+"""What differs between runs, for a reader: tables of inputs and results, the images side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.compare.comparison import Comparison, verdict
+from twin.compare.run_differences import ArrayDifference, Differences, Leaf, RunResults, images_of, is_sigma
+from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
+from twin.run.report import Report, Section
+from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, to_png, to_svg
+
+MOST_BARS = 30
+"""Changes of a figure: the largest for their sigma."""
+MOST_IMAGES = 8
+"""Images that are shown."""
+
+
+def compare_report(comparison: Comparison) -> Report:
+    """Report of a comparison."""
+    names = comparison.names
+    summary = Table(
+        "summary",
+        "What differs",
+        f"Against {names[0]}. A number counts where it differs by more than {comparison.rtol:g} of itself"
+        + (
+            "."
+            if comparison.sigmas is None
+            else f" and, where it has a sigma, by more than {comparison.sigmas:g} sigma."
+        ),
+        ("run", "inputs", "numbers", "images", "compared", "largest, sigma"),
+        [_row(name, found) for name, found in zip(names[1:], comparison.found, strict=True)],
+    )
+    sections = []
+    for k, (name, run, found) in enumerate(zip(names[1:], comparison.runs[1:], comparison.found, strict=True), start=1):
+        artefacts = _artefacts(comparison.runs[0], run, found, (names[0], name), k)
+        if artefacts:
+            sections.append(Section(name, (), artefacts))
+    return Report(
+        title=f"{', '.join(names[1:])} against {names[0]}",
+        lead=(verdict(comparison),),
+        facts=tuple((name, str(run.folder)) for name, run in zip(names, comparison.runs, strict=True)),
+        summary=summary,
+        sections=tuple(sections),
+        warnings=_warnings(comparison),
+    )
+
+
+def _row(name: str, found: Differences) -> list[Cell]:
+    far = max((abs(one.in_sigma) for one in found.numbers if one.in_sigma is not None), default=None)
+    return [name, len(found.inputs), len(found.numbers), len(found.arrays), found.compared, far]
+
+
+def _warnings(comparison: Comparison) -> tuple[str, ...]:
+    """Of what makes a comparison doubtful: other versions, other warnings of the runs themselves."""
+    first = comparison.runs[0]
+    out = []
+    for name, run in zip(comparison.names[1:], comparison.runs[1:], strict=True):
+        other = {
+            package: (first.manifest.versions.get(package, "none"), version)
+            for package, version in run.manifest.versions.items()
+            if first.manifest.versions.get(package) != version
+        }
+        if other:
+            told = ", ".join(f"{package} {here} and {there}" for package, (here, there) in other.items())
+            out.append(f"{name} was made with other versions: {told}")
+        out += [f"{name}: {text}" for text in run.manifest.warnings if text not in first.manifest.warnings]
+        missing = [text for text in first.manifest.warnings if text not in run.manifest.warnings]
+        out += [f"{comparison.names[0]} only: {text}" for text in missing]
+    return tuple(dict.fromkeys(out))
+
+
+def _artefacts(
+    reference: RunResults, run: RunResults, found: Differences, names: tuple[str, str], k: int
+) -> tuple[Artefact, ...]:
+    out: list[Artefact] = []
+    if found.inputs:
+        rows: list[list[Cell]] = [[one.key, _text(one.reference), _text(one.other)] for one in found.inputs]
+        out.append(Table(f"inputs-{k}", "Inputs", "Keys of config.yaml.", ("key", *names), rows))
+    figure = _changes(found, names, k)
+    if figure is not None:
+        out.append(figure)
+    if found.numbers:
+        rows = [
+            [one.file, one.key, _value(one.reference), _value(one.other), one.difference, one.sigma, one.in_sigma]
+            for one in sorted(found.numbers, key=lambda one: one.file != "truth.json")
+            if not is_sigma(one.key)
+        ]
+        heads = ("file", "key", *names, "difference", "sigma", "in sigma")
+        about = "Units are the keys' endings; sigma is that of the difference of independent measurements. Runs of one "
+        about += "seed share their noise, and differ by less."
+        left = len(found.numbers) - len(rows)
+        about += f" {left} sigmas that changed are in compare.json." if left else ""
+        out.append(Table(f"numbers-{k}", "Results", about, heads, rows, (None,) * 6 + (1,)))
+    if found.arrays:
+        heads = ("file", "variable", "shape", "largest", "rms", "peak", "share that differs")
+        rows = [[a.file, a.name, _shape(a), a.largest, a.rms, a.peak, a.share] for a in found.arrays]
+        about = f"Differences, and the peak of {names[0]}; in the file's own units."
+        out.append(Table(f"images-{k}", "Images", about, heads, rows))
+        out += _pictures(reference, run, found, names, k)
+    return tuple(out)
+
+
+def _text(value: Leaf) -> str:
+    return "\N{EM DASH}" if value is None else str(value)
+
+
+def _value(value: Leaf) -> Cell:
+    return str(value) if isinstance(value, bool) else value
+
+
+def _shape(array: ArrayDifference) -> str:
+    here, there = ("none" if s is None else " x ".join(map(str, s)) for s in (array.shape, array.other_shape))
+    return here if here == there else f"{here}, {there}"
+
+
+def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
+    """The changes that are largest for their sigma."""
+    known = [one for one in found.numbers if one.in_sigma is not None]
+    chosen = sorted(known, key=lambda one: -abs(one.in_sigma or 0.0))[:MOST_BARS]
+    if not chosen:
+        return None
+    with look(f"changes-{k}"):
+        figure = new_figure(0.9 + 0.19 * len(chosen))
+        axes = figure.subplots()
+        places = np.arange(len(chosen))[::-1]
+        axes.barh(places, [one.in_sigma or 0.0 for one in chosen], color=BLUE, height=0.6)
+        axes.axvline(0.0, color=GREY, lw=0.7)
+        axes.set_xscale("symlog", linthresh=10.0)
+        axes.set_yticks(places, [one.key for one in chosen])
+        axes.set_xlabel("change in sigma, logarithmic beyond 10")
+        axes.margins(y=0.02)
+        plain_axes(axes)
+    caption = f"{names[1]} minus {names[0]}, over the sigma of the difference of independent measurements."
+    if len(known) > len(chosen):
+        caption += f" The {len(chosen)} largest of {len(known)}."
+    return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, to_svg(figure))
+
+
+def _pictures(
+    reference: RunResults, run: RunResults, found: Differences, names: tuple[str, str], k: int
+) -> list[Artefact]:
+    """Images of both runs and their difference: the mean over all but the last two axes."""
+    out: list[Artefact] = []
+    for array in found.arrays:
+        if array.largest is None or array.shape is None or len(array.shape) < 2 or min(array.shape[-2:]) < 8:
+            continue
+        if len(out) == MOST_IMAGES:
+            break
+        pair = [images_of(one, array) for one in (reference, run)]
+        if any(one is None for one in pair):
+            continue
+        for label, first, second in _views(array, *(np.asarray(one, dtype=np.float64) for one in pair)):
+            if len(out) == MOST_IMAGES:
+                break
+            title = " ".join(filter(None, (array.file, array.name, label)))
+            png = _picture(first, second, names, title)
+            where = f"{len(out) + 1}"
+            caption = f"Differences up to {significant(float(np.max(np.abs(second - first))), 3, floor=0.0)}."
+            out.append(PngFigure(f"image-{k}-{where}", title, caption, png))
+    return out
+
+
+def _views(array: ArrayDifference, first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Means of frames; of further axes (state, channel) each place by itself that differs."""
+    if first.ndim <= 3:
+        axes = tuple(range(first.ndim - 2))
+        return [("", first.mean(axis=axes), second.mean(axis=axes))]
+    places = [p for p in np.ndindex(*first.shape[:-2]) if not np.array_equal(first[p], second[p])]
+    return [(str(list(p)), first[p], second[p]) for p in places]
+
+
+def _picture(first: np.ndarray, second: np.ndarray, names: tuple[str, str], title: str) -> bytes:
+    with look("image"):
+        figure = new_figure(3.6)
+        axes = figure.subplots(1, 3)
+        low, high = min(first.min(), second.min()), max(first.max(), second.max())
+        for axis, image, name in zip(axes[:2], (first, second), names, strict=True):
+            shown = axis.imshow(image, cmap="magma", vmin=low, vmax=high, interpolation="nearest")
+            axis.set_title(name)
+        figure.colorbar(shown, ax=axes[:2], shrink=0.8)
+        delta = second - first
+        end = float(np.max(np.abs(delta))) or 1.0
+        shown = axes[2].imshow(delta, cmap="RdBu_r", vmin=-end, vmax=end, interpolation="nearest")
+        axes[2].set_title("difference")
+        figure.colorbar(shown, ax=axes[2], shrink=0.8)
+        for axis in axes:
+            axis.set_xticks([])
+            axis.set_yticks([])
+        return to_png(figure, 100)
