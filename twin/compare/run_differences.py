@@ -253,7 +253,7 @@ def differences(reference: RunResults, other: RunResults, rtol: float, sigmas: f
         for place in dict.fromkeys((*reference.series, *other.series))
     ]
     count = len(reference.numbers.keys() & other.numbers.keys())
-    arrays = [found for pair in pairs if (found := _array_difference(*pair, rtol)) is not None]
+    arrays = [one for one in (_array_difference(*pair, rtol) for pair in pairs) if one is not None]
     count += sum(here is not None and there is not None for _, _, here, there in pairs)
     for file in dict.fromkeys((*reference.array_files(), *other.array_files())):
         if sigmas is not None and file.endswith(".tiff"):
