@@ -9,11 +9,12 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import drjit as dr
 import numpy as np
 import pytest
 import tifffile
@@ -28,10 +29,20 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.monitoring import PARAMETERS, MonitorGeometry
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
+from optics.geometry.aperture import Circle
+from optics.geometry.sag_terms import SAG_TERMS, XYPolynomial, grown
+from optics.geometry.surface import plane
+from optics.geometry.tree import Motion
 from optics.geometry.vector_shape import Polygon
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.derivatives import jvp
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
 from optics.targets.target_shapes import Target
 from optics.waves.pupil_function import circular_pupil
+from scenes.models.camera_model import surface_of
 from scenes.schema import json_schema
+from scenes.specs.camera import MirrorSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit_spec import OrbitSpec
@@ -39,11 +50,16 @@ from scenes.specs.study import DesignSpec, Sampler
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
+from tests.twin import test_path_figure as path_figure
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study as write_study_file
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
+from twin.path_tracing.families import nominal_codes
+from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.source import RaySource
+from twin.path_tracing.tracer import PathTracer
 from twin.run.artefact import Table
 from twin.run.page import RunFacts, write_test
 from twin.run.report import Report, Section
@@ -443,6 +459,141 @@ def test_all_of_them_in_one_run_of_the_main_job(tmp_path: Path, monkeypatch: pyt
     for path in tiffs:
         np.testing.assert_array_equal(np.load(path.with_suffix(".npy")), tifffile.imread(path))
         assert f"images/{path.stem}.npy" in checksums
+
+
+# --- surfaces ---------------------------------------------------------------------------------------------------------
+
+SAGS = "optics.geometry.sag_terms.SAG_TERMS"
+PLACES = np.linspace(-0.2, 0.2, 9)
+RADIUS, ACROSS = 2.5, 4.0
+"""Of the sphere and of the cylinder on it, metres: 5 mm of sag at the edge."""
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A circular cylinder about the y axis, z = c x^2 / (1 + sqrt(1 - c^2 x^2)); ``step`` is a slope, to have a number
+    without unit.
+    """
+
+    POWERS: ClassVar[Mapping[str, int]] = FrozenMap(curvature=-1, step=0)
+    curvature: Any = 0.0
+    step: Any = 0.0
+
+    def sag(self, x: Any, y: Any) -> Any:
+        c = self.curvature
+        return c * x * x / (1.0 + np.sqrt(1.0 - (c * x) ** 2)) + self.step * y
+
+    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        c = self.curvature
+        root = dr.sqrt(dr.maximum(1.0 - (c * x) ** 2, 1e-6))
+        return c * x * x / (1.0 + root) + self.step * y, c * x / root, self.step + 0.0 * y
+
+
+def astigmatic(x: np.ndarray, y: np.ndarray, size: float = 1.0) -> np.ndarray:
+    """The same surface by its centres of curvature: a sphere that light of +z meets hollow, a cylinder, a slope."""
+    sphere, cylinder = RADIUS * size, ACROSS * size
+    return np.sqrt(sphere**2 - x**2 - y**2) - sphere + cylinder - np.sqrt(cylinder**2 - x**2) + 1e-3 * y
+
+
+@extends(SAGS)
+def test_a_surface(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read from a file, met by the sequential trace, its derivatives and the path tracer; beside it in one scene a
+    mirror without it, and a figure, heat and a term of another kind on top of it.
+    """
+    text = f"{{z: 0 m, radius: -{RADIUS} m, sag: {{cylinder: {{curvature: {1 / ACROSS} 1/m, step: 0.001}}}}}}"
+    with pytest.raises(InputError, match=r"sag.cylinder: no such term of a sag; found 'cylinder', allowed: polynomial"):
+        validate(MirrorSpec, parse_yaml(text))
+    add(monkeypatch, SAGS, "cylinder", Cylinder)
+    mirror = validate(MirrorSpec, parse_yaml(text))
+    assert mirror.plain()["sag"] == {"cylinder": {"curvature": "0.25 1/m", "step": 0.001}}
+    for wrong, said in (
+        ("step: 1 m", "sag.cylinder.step: not a number; found '1 m', allowed: a plain number, without a unit"),
+        ("curvature: 1 m", "sag.cylinder.curvature: 'm' is a unit of a length, not of an inverse length; found m"),
+        ("curvatur: 1 1/m", "unknown key; found 'curvatur', allowed: curvature, step; did you mean 'curvature'?"),
+    ):
+        with pytest.raises(InputError, match=re.escape(said)):
+            validate(MirrorSpec, parse_yaml(f"{{z: 0 m, radius: 1 m, sag: {{cylinder: {{{wrong}}}}}}}"))
+    schema = json_schema("camera")["$defs"]["MirrorSpec"]["properties"]["sag"]["anyOf"][0]["properties"]
+    assert schema["cylinder"]["properties"]["step"] == {"type": "number"}
+
+    # the sequential trace: on the surface, and off it by the law of reflection, on a mirror that has grown
+    surface, state = surface_of(mirror), {"mirror": Motion(scale=2e-3)}
+    np.testing.assert_allclose(surface.sag(0.1, PLACES), astigmatic(0.1, PLACES), rtol=0, atol=1e-15)
+    assembly = path_figure.bench(surface, Circle(0.2))
+    position, direction = path_figure.rays(500)
+    systems = assemble(assembly, ["all"], [state])
+    traced = trace(backend, systems, make_rays(backend, position, direction), keep=[0])
+    x, y, z = traced.hit(0)[0].T
+    place, out, length, valid = (a[0] for a in traced.numpy())
+    assert 0.5 < valid.mean() < 1.0
+    # rounding of metres
+    np.testing.assert_allclose(z[valid], astigmatic(x, y, 1.002)[valid], rtol=0, atol=1e-14)
+    met = np.stack([x, y, z + 0.8], axis=-1)
+    assert np.max(np.linalg.norm(np.cross(met - position, direction), axis=-1)[valid]) < 1e-14
+    h = 1e-3
+    # central differences of fourth order: h^4/30 of a fifth derivative below 0.1 /m^4, and rounding of 4 m over h
+    weights, at = np.array([1.0, -8.0, 8.0, -1.0]) / (12.0 * h), h * np.array([-2.0, -1.0, 1.0, 2.0])[:, None]
+    slopes = [weights @ astigmatic(x + at, y, 1.002), weights @ astigmatic(x, y + at, 1.002)]
+    normal = np.stack([-slopes[0], -slopes[1], np.ones_like(x)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1)[:, None]
+    mirrored = direction - 2.0 * np.sum(direction * normal, axis=-1)[:, None] * normal
+    np.testing.assert_allclose(out[valid], mirrored[valid], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(length, np.linalg.norm(met - position, axis=1) + np.linalg.norm(place - met, axis=1))
+
+    # derivatives: by the mirror's size, against a difference over 2e-6 whose third derivative shows at 1e-12
+    step = assemble(assembly, ["all"], [state], [("mirror", "scale", 0)])
+    start = np.broadcast_to(position, (1, *position.shape)), np.broadcast_to(direction, (1, *direction.shape))
+    slope = jvp(backend, step, *start).position[0]
+    ends = []
+    for scale in (2e-3 - 1e-6, 2e-3 + 1e-6):
+        moved = assemble(assembly, ["all"], [{"mirror": Motion(scale=scale)}])
+        ends.append(trace(backend, moved, make_rays(backend, position, direction)).numpy()[0][0])
+    np.testing.assert_allclose(slope[valid], (ends[1] - ends[0])[valid] / 2e-6, rtol=0, atol=1e-8)
+    assert np.max(np.abs(slope[valid])) > 1e-2
+
+    # the path tracer
+    polynomial = XYPolynomial(x2y=1e-3, y4=2e-3)
+    for case, heat in (
+        (surface, state),
+        (surface.with_figure(path_figure.ASTIGMATIC), path_figure.HEAT),
+        (surface.with_figure(path_figure.WAVY), {}),
+        (replace(surface, even=(1e-3,), terms=(*surface.terms, polynomial)), {}),
+        (replace(plane(), terms=(polynomial,)), {}),
+    ):
+        assembly = path_figure.bench(case, Circle(0.2))
+        traced = trace(backend, assemble(assembly, ["all"], [heat]), make_rays(backend, position, direction))
+        place, _, length, valid = (a[0] for a in traced.numpy())
+        scenery = path_figure.scene(assembly, heat)
+        tracer = PathTracer(backend, scenery, {"screen": nominal_codes(scenery, assembly, "all")})
+        found = tracer.run(RaySource.even(position, direction), keep=True).detections
+        own = found.kind == NOMINAL
+        path = found.path[own]
+        np.testing.assert_array_equal(np.sort(path), np.nonzero(valid)[0])
+        assert valid.any()
+        np.testing.assert_allclose(found.place[own], place[path, :2], rtol=0, atol=path_figure.AGREEMENT)
+        np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=path_figure.AGREEMENT)
+
+
+@pytest.mark.parametrize("name", sorted(SAG_TERMS))
+def test_what_a_term_of_a_sag_has_to_keep_to(name: str, backend: Any) -> None:
+    """What kernels compute is what NumPy computes, with its slopes; without numbers it adds nothing; and a length that
+    grows takes all numbers along.
+    """
+    kind = SAG_TERMS[name]
+    assert list(kind.POWERS) == [f.name for f in fields(kind)]
+    generator = np.random.default_rng(3)
+    term = kind(**{key: generator.uniform(0.01, 0.1) for key in kind.POWERS})
+    x, y = generator.uniform(-0.5, 0.5, (2, 100))
+    h = 1e-4
+    height, by_x, by_y = (np.array(a) for a in term.height(backend.Float(x), backend.Float(y)))
+    np.testing.assert_allclose(height, term.sag(x, y), rtol=0, atol=1e-16)
+    # of fourth order: exact for a polynomial but for rounding of 0.1 m over h
+    for slope, (dx, dy) in ((by_x, (h, 0.0)), (by_y, (0.0, h))):
+        far, near = (term.sag(x + n * dx, y + n * dy) - term.sag(x - n * dx, y - n * dy) for n in (2, 1))
+        np.testing.assert_allclose(slope, (8.0 * near - far) / (12.0 * h), rtol=0, atol=1e-12)
+    for nothing in kind().height(backend.Float(x), backend.Float(y)):
+        assert np.all(np.array(nothing) == 0.0)
+    np.testing.assert_allclose(grown(term, 3.0).sag(3.0 * x, 3.0 * y), 3.0 * term.sag(x, y), rtol=1e-13)
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, assert_never
@@ -12,7 +12,8 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from optics.geometry import zernike
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
-from optics.geometry.zernike import triangle_index, triangle_order
+from optics.geometry.sag_terms import SagTerm, grown
+from optics.geometry.zernike import triangle_order, triangle_polynomial
 from optics.numerics.frozen_map import FrozenMap
 
 
@@ -144,19 +145,21 @@ class SurfaceNumbers:
     Attributes:
         curvature, conic: c, 1/m, and k; None for a plane.
         even: A4, A6, ..., m^-3, m^-5, ...
+        terms: further terms of the sag, at most one of a kind.
         figure, grid: departures from that shape.
     """
 
     curvature: Any = None
     conic: Any = None
     even: tuple[Any, ...] = ()
+    terms: tuple[SagTerm, ...] = ()
     figure: FigureNumbers | None = None
     grid: GridNumbers | None = None
 
     @property
     def is_conic(self) -> bool:
         """True when there is nothing but a conic or a plane: a ray's crossing has a closed form."""
-        return not self.even and self.figure is None and self.grid is None
+        return not self.even and not self.terms and self.figure is None and self.grid is None
 
 
 def level(
@@ -164,7 +167,7 @@ def level(
 ) -> tuple[Any, Any, Any, Any]:
     """Level function G of a surface and its gradient, on Dr.Jit arrays.
 
-    With h the aspheric terms and the figure and w = z - h(x, y), the surface is where
+    With h all terms beyond the conic and the figure and w = z - h(x, y), the surface is where
 
         G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
 
@@ -195,9 +198,12 @@ def level(
             slope = dr.fma(slope, r2, float(n + 2) * surface.even[n])
         radial = 2.0 * slope * r2
         height, sx, sy = polynomial * r2 * r2, radial * x, radial * y
+    for term in surface.terms:
+        added = term.height(x, y)
+        height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
     if surface.figure is not None:
         figure = surface.figure
-        added = polynomial_figure(x - figure.x, y - figure.y, figure.coefficients, figure.order)
+        added = triangle_polynomial(x - figure.x, y - figure.y, figure.coefficients, figure.order)
         height, sx, sy = added if height is None else (height + added[0], sx + added[1], sy + added[2])
     if surface.grid is not None:
         added = grid_figure(x, y, surface.grid, table, active)
@@ -228,26 +234,6 @@ def along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
     import drjit as dr
 
     return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
-
-
-def polynomial_figure(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
-    """Sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
-
-    ``coefficients`` is ordered by ``zernike.triangle_index``.
-    """
-    height: Any = 0.0 * x
-    slope_x: Any = 0.0 * x
-    slope_y: Any = 0.0 * x
-    for a in range(order, -1, -1):
-        row: Any = 0.0 * x
-        row_slope: Any = 0.0 * x
-        for b in range(order - a, -1, -1):
-            row_slope = row_slope * y + row
-            row = row * y + coefficients[triangle_index(a, b)]
-        slope_x = slope_x * x + height
-        height = height * x + row
-        slope_y = slope_y * x + row_slope
-    return height, slope_x, slope_y
 
 
 def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = True) -> tuple[Any, Any, Any]:
@@ -297,28 +283,44 @@ def _weights(f: Any) -> tuple[list[Any], list[Any]]:
 
 @dataclass(frozen=True)
 class Surface:
-    """Rotationally symmetric surface z = c r^2 / (1 + sqrt(1 - (1+k) c^2 r^2)) + A4 r^4 + A6 r^6 + ... + figure.
+    """Surface z = c r^2 / (1 + sqrt(1 - (1+k) c^2 r^2)) + A4 r^4 + A6 r^6 + ... + further terms + figure.
 
     Attributes:
         curvature: c = 1/R in 1/m; 0 is a plane. Positive: centre of curvature on the +z side.
         conic: k, Schwarzschild's constant (0 sphere, -1 paraboloid).
         even: (A4, A6, A8, ...) in m^-3, m^-5, m^-7, ...
         figure: departure from that shape.
+        terms: further terms of the sag (``optics.geometry.sag_terms``), at most one of a kind; without them the ideal
+            shape is one of revolution.
     """
 
     curvature: float = 0.0
     conic: float = 0.0
     even: tuple[float, ...] = ()
     figure: Figure | None = None
+    terms: tuple[SagTerm, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that there is one term of a kind."""
+        if len({type(term) for term in self.terms}) < len(self.terms):
+            raise ValueError("a surface has two terms of the same kind; add their numbers up")
 
     @property
     def is_plane(self) -> bool:
         """True when the ideal shape is flat."""
-        return self.curvature == 0.0 and not any(self.even)
+        return self.curvature == 0.0 and not any(self.even) and not self.terms
 
     def with_figure(self, figure: Figure | None) -> Surface:
         """The same shape with another figure."""
         return replace(self, figure=figure)
+
+    def grown(self, scale: float) -> Surface:
+        """The surface of a body that is larger by a factor, its figure as it was, as ``optics.raytrace.system`` takes
+        it.
+        """
+        even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(self.even))
+        terms = tuple(grown(term, scale) for term in self.terms)
+        return replace(self, curvature=self.curvature / scale, even=even, terms=terms)
 
     def figure_disk(self, aperture: Aperture | None) -> ZernikeFigure:
         """The Zernike figure that terms are added to: the surface's own, or one without terms over the aperture's disk.
@@ -346,6 +348,8 @@ class Surface:
             z = self.curvature * r2 / (1.0 + np.sqrt(1.0 - (1.0 + self.conic) * self.curvature**2 * r2))
         for i, a in enumerate(self.even):
             z = z + a * r2 ** (i + 2)
+        for term in self.terms:
+            z = z + term.sag(x, y)
         if self.figure is not None:
             z = z + self.figure.sag(x, y)
         return np.asarray(z)

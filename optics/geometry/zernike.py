@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from math import comb, factorial, isqrt, sqrt
 from typing import Any
@@ -138,6 +138,33 @@ def triangle_index(a: int, b: int) -> int:
     """Place of x^a y^b in the list ordered by total degree."""
     d = a + b
     return d * (d + 1) // 2 + b
+
+
+def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
+    """Sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
+
+    Args:
+        x: where, metres, arrays of NumPy or Dr.Jit.
+        y: likewise.
+        coefficients: m^(1-a-b), ordered by ``triangle_index``.
+        order: highest degree a + b.
+
+    Returns:
+        Height, metres, and its derivatives by x and y.
+    """
+    height: Any = 0.0 * x
+    slope_x: Any = 0.0 * x
+    slope_y: Any = 0.0 * x
+    for a in range(order, -1, -1):
+        row: Any = 0.0 * x
+        row_slope: Any = 0.0 * x
+        for b in range(order - a, -1, -1):
+            row_slope = row_slope * y + row
+            row = row * y + coefficients[triangle_index(a, b)]
+        slope_x = slope_x * x + height
+        height = height * x + row
+        slope_y = slope_y * x + row_slope
+    return height, slope_x, slope_y
 
 
 def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from optics.geometry import zernike
 from optics.geometry.aperture import ApertureNumbers
+from optics.geometry.sag_terms import SagTerm, grown, kinds_of, of_kinds
 from optics.geometry.surface import Figure, FigureNumbers, GridFigure, SurfaceNumbers, ZernikeFigure
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
 from optics.numerics.backend import Backend
@@ -30,6 +31,7 @@ class Structure:
     interaction: Interaction
     plane: bool
     even: int
+    terms: tuple[type[SagTerm], ...]  # kinds of further terms of the sag
     figure_order: int  # radial order of the Zernike figure, -1 for none
     grid: bool
     aperture: type[ApertureNumbers] | None
@@ -306,6 +308,7 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
         )
     interaction, is_plane, grid, aperture = kinds.pop()
     # a plane may have terms that are zero, and the terms that a surface lacks are
+    terms = kinds_of([term for e in elements for term in e.surface.terms])
     even = 0 if is_plane else max(len(e.surface.even) for e in elements)
     order = -1
     for e in elements:
@@ -315,7 +318,7 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
             motion = state.get(e.body)
             if motion is not None and motion.figure:
                 order = max(order, zernike.order_of(motion.figure))
-    return Structure(interaction, is_plane, even, order, grid, aperture, graded)
+    return Structure(interaction, is_plane, even, terms, order, grid, aperture, graded)
 
 
 def _known_figure(element: Element) -> Figure | None:
@@ -386,11 +389,12 @@ def _surface_numbers(
         for n in range(structure.even):
             term = surface.even[n] if n < len(surface.even) else 0.0
             even.append(term / scale ** (2 * n + 3))
+    terms = tuple(grown(term, scale) for term in of_kinds(surface.terms, structure.terms))
     figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
     grid = None
     if isinstance(surface.figure, GridFigure):
         grid = map_leaves(lambda number: np.full(count, number), surface.figure.numbers)
-    return SurfaceNumbers(curvature, conic, tuple(even), figure, grid)
+    return SurfaceNumbers(curvature, conic, tuple(even), terms, figure, grid)
 
 
 def _figure_numbers(

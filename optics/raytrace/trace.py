@@ -27,6 +27,9 @@ NEWTON_STEPS = 3
 below 1e-3, so that each step gains at least six digits; three reach rounding. A ray that has not converged is marked
 invalid."""
 
+FURTHER_STEPS = 2
+"""As many more for a surface with further terms of its sag, which may depart by millimetres."""
+
 CONVERGED = 1e-12
 """Largest distance to the surface of a valid hit, metres."""
 
@@ -257,11 +260,16 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
         # functions)
         numbers = map_leaves(dr.detach, surface)
         origin, direction, t = dr.detach(p), dr.detach(d), dr.detach(t)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(_steps(surface)):
         t = newton_step(origin, direction, t, numbers, table)
     if differentiable:
         t = newton_step(p, d, t, surface, table)
     return t, ok & _on_sheet(level(*along(origin, direction, t), numbers, table))
+
+
+def _steps(surface: SurfaceNumbers) -> int:
+    """Newton steps from the conic to the surface."""
+    return NEWTON_STEPS + (FURTHER_STEPS if surface.terms else 0)
 
 
 def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool) -> Any:
@@ -277,7 +285,7 @@ def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, atta
     if attached:
         numbers = map_leaves(dr.detach, surface)
         ray, tau = curve.detached(), dr.detach(tau)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(_steps(surface)):
         tau = step(ray, tau, numbers)
     return step(curve, tau, surface) if attached else tau
 

@@ -8,10 +8,10 @@ import numpy as np
 from optics.design.design_rays import Beams
 from optics.design.design_variables import Prescription, Stand, Variable
 from optics.design.merit_function import Operands
-from optics.geometry.surface import Surface, plane
+from optics.geometry.surface import plane
 from optics.numerics import quadrature
-from scenes.models.camera_model import IMAGE, _even_terms
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec, MirrorSpec
+from scenes.models.camera_model import IMAGE, surface_of
+from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec
 from scenes.specs.load import find_camera, load_camera
 from scenes.specs.test_setup import ExperimentSetup, read_setup
 from scenes.yaml.errors import names_text, nearest
@@ -49,7 +49,7 @@ def resolve_design(path: str | Path) -> CameraDesignSetup:
 
 def prescription_of(camera: CameraSpec) -> Prescription:
     """The prescription of a camera's file."""
-    surfaces = {n: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for n, m in camera.mirrors.items()}
+    surfaces = {name: surface_of(mirror) for name, mirror in camera.mirrors.items()}
     stands = {n: Stand(m.z) for n, m in camera.mirrors.items()}
     return Prescription(
         {**surfaces, IMAGE: plane()}, {**stands, IMAGE: Stand(camera.image.z)}, camera.stop, camera.field_bias
@@ -90,9 +90,8 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
     for mirror in start.mirrors:
         surface = prescription.surfaces[mirror]
         terms = {f"A{2 * n + 4}": a for n, a in enumerate(surface.even)}
-        mirrors[mirror] = MirrorSpec.model_construct(
-            z=prescription.stands[mirror].z, radius=1.0 / surface.curvature, conic=surface.conic, aspheric=terms
-        )
+        numbers = {"z": prescription.stands[mirror].z, "radius": 1.0 / surface.curvature, "conic": surface.conic}
+        mirrors[mirror] = start.mirrors[mirror].model_copy(update={**numbers, "aspheric": terms})
     update = {
         "name": name,
         "description": description or start.description,

@@ -28,7 +28,7 @@ from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trac
 from optics.waves.imaging import aim_collimated
 
 if TYPE_CHECKING:
-    from scenes.specs.camera import CameraSpec
+    from scenes.specs.camera import CameraSpec, MirrorSpec
 
 IMAGE = "image"
 REFERENCE = "reference"
@@ -129,7 +129,7 @@ def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
 
 def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     """What `derive_camera` says. Raises AimError, BeamMissedError."""
-    surfaces = {name: Surface(1.0 / m.radius, m.conic, _even_terms(m.aspheric)) for name, m in spec.mirrors.items()}
+    surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)
     bare = _bare(spec, surfaces, {})
@@ -168,12 +168,11 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     )
 
 
-def _even_terms(aspheric: Mapping[str, float] | None) -> tuple[float, ...]:
-    """(A4, A6, ...) from a mapping with those names, gaps filled by zero."""
-    if not aspheric:
-        return ()
-    last = max(int(name[1:]) for name in aspheric)
-    return tuple(float(aspheric.get(f"A{n}", 0.0)) for n in range(4, last + 1, 2))
+def surface_of(mirror: MirrorSpec) -> Surface:
+    """The shape of a mirror of a camera's file; terms A4, A6, ... that stand between others and are not given are 0."""
+    last = max((int(name[1:]) for name in mirror.aspheric), default=2)
+    even = tuple(float(mirror.aspheric.get(f"A{n}", 0.0)) for n in range(4, last + 1, 2))
+    return Surface(1.0 / mirror.radius, mirror.conic, even, terms=tuple((mirror.sag or {}).values()))
 
 
 def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:

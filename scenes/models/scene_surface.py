@@ -123,12 +123,6 @@ class SceneSurface:
     clearance: float = LEAST_CLEARANCE
 
 
-def grown(surface: Surface, scale: float) -> Surface:
-    """A surface grown by a scale, its figure as it was, as ``optics.raytrace.system`` takes it."""
-    even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(surface.even))
-    return replace(surface, curvature=surface.curvature / scale, even=even)
-
-
 def mirror_surface(
     element: Element,
     placed: PlacedBodies,
@@ -151,7 +145,7 @@ def mirror_surface(
     if element.aperture is None:
         raise ValueError(f"{element.name}: a mirror without a clear aperture cannot stand in a scene")
     size = float(placed.size(element.body)[0])
-    surface, aperture = grown(element.figured(motion), size), element.aperture.grown(size)
+    surface, aperture = element.figured(motion).grown(size), element.aperture.grown(size)
     vertices, triangles, apart = sheet_mesh(surface, aperture)
     optical, rear = finishes.mirror, finishes.mirror_back
     return SceneSurface(

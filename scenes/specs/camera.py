@@ -1,16 +1,21 @@
 """The optical prescription of a camera and its optimisation, as a file in scenes/library/cameras gives them."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from math import isfinite
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
+from optics.geometry.sag_terms import SAG_TERMS, SagTerm
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.band import BandSpec
 from scenes.specs.detector import PixelPitch
-from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Wavelength
 from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text, Whole
-from scenes.yaml.units import ANGLE, LENGTH, SCALE
+from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity, parse_quantity, power_of_length
 
 IMAGE = "image"
 Vary = Literal["radius", "conic", "A4", "A6", "A8", "z"]
@@ -54,20 +59,89 @@ class CameraDesignSpec(Spec):
 FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]
 
 
+class SagTerms:
+    """Annotation of a mapping from names of ``SAG_TERMS`` to their numbers, those that are registered when the file is
+    read; in the model the terms themselves.
+    """
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Read by ``_read``, written as it was read."""
+        as_text = core_schema.plain_serializer_function_ser_schema(self._written, when_used="json-unless-none")
+        return core_schema.no_info_plain_validator_function(self._read, serialization=as_text)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """The kinds at this moment with their numbers."""
+
+        def value(power: int) -> JsonSchemaValue:
+            if not power:
+                return {"type": "number"}
+            return Quantity(power_of_length(power)).__get_pydantic_json_schema__(schema, handler)
+
+        kinds = {name: {key: value(power) for key, power in kind.POWERS.items()} for name, kind in SAG_TERMS.items()}
+        terms = {
+            name: {"type": "object", "properties": keys, "additionalProperties": False} for name, keys in kinds.items()
+        }
+        return {"type": "object", "properties": terms, "additionalProperties": False}
+
+    def _read(self, value: object) -> FrozenMap[str, SagTerm]:
+        terms = {}
+        for name, given in _mapping(value, SAG_TERMS, "no such term of a sag").items():
+            kind = SAG_TERMS[name]
+            units = kind.POWERS
+            numbers = _mapping(given, units, "unknown key", (name,))
+            terms[name] = kind(**{key: _number(numbers[key], units[key], (name, key)) for key in numbers})
+        return FrozenMap(terms)
+
+    def _written(self, terms: Mapping[str, SagTerm]) -> dict[str, dict[str, object]]:
+        return {
+            name: {
+                key: format_quantity(number, power_of_length(power)) if power else number
+                for key, power in term.POWERS.items()
+                if (number := getattr(term, key)) != 0.0
+            }
+            for name, term in terms.items()
+        }
+
+
+def _mapping(value: object, names: Mapping[str, Any], problem: str, within: KeyPath = ()) -> dict[str, Any]:
+    """A mapping with no other keys than these."""
+    if not isinstance(value, Mapping):
+        raise Problem("not a mapping", shown(value), f"a mapping with keys {names_text(names)}", within=within)
+    for name in value:
+        if name not in names:
+            raise Problem(problem, shown(name), names_text(names), nearest(str(name), names), (*within, name))
+    return dict(value)
+
+
+def _number(value: object, power: int, within: KeyPath) -> float:
+    """A quantity in metres to a power, or a plain number."""
+    try:
+        if power:
+            return parse_quantity(value, power_of_length(power))
+    except Problem as problem:
+        problem.within = within
+        raise
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise Problem("not a number", shown(value), "a plain number, without a unit", within=within)
+    return float(value)
+
+
 class MirrorSpec(Spec):
-    """A mirror of revolution about the parent axis.
+    """A mirror about the parent axis; of revolution, unless ``sag`` has terms that are not.
 
     Attributes:
         z: vertex on the parent axis, metres; light enters toward +z.
         radius: vertex radius of curvature, metres, positive if the centre of curvature lies toward +z.
         conic: conic constant k.
         aspheric: terms A4, A6, A8 of the sag beyond the conic's, 1/m^3, 1/m^5, 1/m^7; empty for a pure conic.
+        sag: further terms of the sag, by kind, each with its numbers.
     """
 
     z: Length
     radius: Length
     conic: Number = 0.0
     aspheric: AsphereTerms = Field(default_factory=FrozenMap)
+    sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
 
     @model_validator(mode="after")
     def _is_curved(self) -> "MirrorSpec":

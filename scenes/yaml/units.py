@@ -126,6 +126,17 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
 }
 """The units that are suggested, as `_look_up` gives them: to ask pint for one takes it half a second to start."""
 
+
+def power_of_length(metre: int) -> Kind:
+    """What has the unit m^``metre``, the power not being 0."""
+    known = {1: LENGTH, -1: PER_LENGTH, -3: PER_LENGTH3, -5: PER_LENGTH5, -7: PER_LENGTH7}
+    if metre in known:
+        return known[metre]
+    head, power = ("1/", -metre) if metre < 0 else ("", metre)
+    units = tuple(f"{head}{unit}^{power}" for unit in ("m", "mm"))
+    return Kind(f"a quantity in {units[0]}", units[0], units, f"1e-3 {units[0]}")
+
+
 _CELSIUS = ("degC", "celsius", "°C")
 _ZERO_CELSIUS = Decimal("273.15")
 

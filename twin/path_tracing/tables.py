@@ -10,6 +10,7 @@ from typing import Any, assert_never
 import numpy as np
 
 from optics.geometry.aperture import Aperture, DiskNumbers, EllipseNumbers, RectangleNumbers, RingNumbers
+from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
 from optics.geometry.surface import FigureNumbers, GridFigure, GridNumbers, SurfaceNumbers, ZernikeFigure
 from optics.geometry.zernike import triangle_size
 from optics.numerics.backend import Backend
@@ -60,12 +61,14 @@ class SurfaceForm:
 
     Attributes:
         even: number of aspheric terms.
+        terms: kinds of further terms of the sag.
         figure_order: highest order of a polynomial figure, -1 when there is none.
         grid: some surface has a figure on a grid.
         flat: all surfaces are planes without figure.
     """
 
     even: int
+    terms: tuple[type[SagTerm], ...]
     figure_order: int
     grid: bool
     flat: bool
@@ -77,7 +80,8 @@ class SurfaceForm:
         order = max((f.order for s in shapes if isinstance(f := s.figure, ZernikeFigure)), default=-1)
         grid = any(isinstance(s.figure, GridFigure) for s in shapes)
         flat = order < 0 and not grid and all(s.is_plane for s in shapes)
-        return cls(max((len(s.even) for s in shapes), default=0), order, grid, flat)
+        terms = kinds_of([term for s in shapes for term in s.terms])
+        return cls(max((len(s.even) for s in shapes), default=0), terms, order, grid, flat)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +90,7 @@ class SceneTables:
 
     Attributes:
         rows: (surfaces * ROW) geometry; finishes: (surfaces * 3 * FINISH_ROW).
+        terms: (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 when there are none.
         figures: (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
         grids, samples: (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
         kind: (surfaces,) bits; planes: (surfaces * 4) world normal and offset of flat faces.
@@ -96,6 +101,7 @@ class SceneTables:
     """
 
     rows: Any
+    terms: Any
     figures: Any
     grids: Any
     samples: Any
@@ -116,13 +122,20 @@ class SceneTables:
     def surface(self, number: Any, row: list[Any], form: SurfaceForm, active: Any) -> SurfaceNumbers:
         """The shape of each path's surface, whose row of the geometry is given."""
         figure = grid = None
+        terms: list[SagTerm] = []
+        if form.terms:
+            sizes = [len(kind.POWERS) for kind in form.terms]
+            f = self._row(self.terms, number, _blocks(sum(sizes)), active)
+            for kind, size in zip(form.terms, sizes, strict=True):
+                terms.append(kind(*f[:size]))
+                f = f[size:]
         if form.figure_order >= 0:
             size = triangle_size(form.figure_order)
             f = self._row(self.figures, number, _blocks(2 + size), active)
             figure = FigureNumbers(f[0], f[1], tuple(f[2 : 2 + size]))
         if form.grid:
             grid = GridNumbers(*self._row(self.grids, number, GRID_ROW // BLOCK, active)[:7])
-        return SurfaceNumbers(row[12], row[13], tuple(row[14 : 14 + form.even]), figure, grid)
+        return SurfaceNumbers(row[12], row[13], tuple(row[14 : 14 + form.even]), tuple(terms), figure, grid)
 
     def finish(self, row: Any, active: Any) -> list[Any]:
         """The finish of each path's row, ``FINISH_ROW`` numbers."""
@@ -198,6 +211,7 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
     signatures = np.array([nominal.get(d.name, 0) for d in detectors] or [0], np.uint64)
     out = SceneTables(
         backend.opaque(rows),
+        backend.opaque(_terms(surfaces, form)),
         backend.opaque(figures),
         backend.opaque(placements),
         backend.opaque(samples),
@@ -235,6 +249,16 @@ def _geometry(s: SceneSurface) -> np.ndarray:
 def _blocks(numbers: int) -> int:
     """Blocks that a row of so many numbers takes."""
     return -(-numbers // BLOCK)
+
+
+def _terms(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> np.ndarray:
+    """Rows of further terms of the sag, kind by kind."""
+    if not form.terms:
+        return np.zeros(1)
+    rows = [list(leaves(of_kinds(s.surface.terms, form.terms)).values()) for s in surfaces]
+    out = np.zeros((len(surfaces), BLOCK * _blocks(len(rows[0]))))
+    out[:, : len(rows[0])] = rows
+    return out
 
 
 def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,112 @@
+"""Terms of a surface's sag beyond a conic with even powers of the radius, kind by kind.
+
+A kind is one frozen dataclass, whose fields are numbers: floats in a ``Surface``, arrays over systems in a batch,
+Dr.Jit arrays in a kernel. They are 0 by default, and a term of zeros adds nothing, exactly: surfaces of one batch or
+one scene share the code of all their terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from optics.geometry.zernike import triangle_index, triangle_polynomial, triangle_size
+from optics.numerics.frozen_map import FrozenMap
+
+
+class SagTerm(Protocol):
+    """What a kind has to be, beside a frozen dataclass of numbers without a ``__post_init__``.
+
+    Attributes:
+        POWERS: name of each field, in their order -> power of the metre of its unit, -3 for 1/m^3. Files are read by
+            it, and a body that grows takes the number along.
+    """
+
+    POWERS: ClassVar[Mapping[str, int]]
+
+    def sag(self, x: Any, y: Any) -> Any:
+        """Height at x, y, metres, NumPy arrays (...) -> (...); NaN where it ends."""
+        ...
+
+    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Height (metres) and its derivatives by x and y, Dr.Jit arrays; some finite number where ``sag`` ends."""
+        ...
+
+
+def grown(term: SagTerm, scale: Any) -> SagTerm:
+    """A term on a body that is larger by a factor; the factor and with it the numbers may be arrays, complex ones,
+    too.
+    """
+    kind = type(term)
+    return kind(**{name: getattr(term, name) * scale**power for name, power in kind.POWERS.items()})
+
+
+def of_kinds(terms: Sequence[SagTerm], kinds: Sequence[type[SagTerm]]) -> tuple[SagTerm, ...]:
+    """One term of each kind, in their order: the given ones, and those that add nothing for the rest."""
+    known: Mapping[Any, SagTerm] = {type(term): term for term in terms}
+    return tuple(known[kind] if kind in known else kind() for kind in kinds)
+
+
+def kinds_of(terms: Sequence[SagTerm]) -> tuple[type[SagTerm], ...]:
+    """Their kinds, each once, in an order that depends on the kinds alone."""
+    return tuple(sorted({type(term) for term in terms}, key=lambda kind: (kind.__module__, kind.__qualname__)))
+
+
+@dataclass(frozen=True)
+class XYPolynomial:
+    """Sum of c_ab x^a y^b of orders 2 to 4: a freeform. ``x2y`` stands for x^2 y; 1/m, 1/m^2, 1/m^3."""
+
+    POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
+        **dict.fromkeys(("x2", "xy", "y2"), -1),
+        **dict.fromkeys(("x3", "x2y", "xy2", "y3"), -2),
+        **dict.fromkeys(("x4", "x3y", "x2y2", "xy3", "y4"), -3),
+    )
+    x2: Any = 0.0
+    xy: Any = 0.0
+    y2: Any = 0.0
+    x3: Any = 0.0
+    x2y: Any = 0.0
+    xy2: Any = 0.0
+    y3: Any = 0.0
+    x4: Any = 0.0
+    x3y: Any = 0.0
+    x2y2: Any = 0.0
+    xy3: Any = 0.0
+    y4: Any = 0.0
+
+    def _terms(self) -> dict[tuple[int, int], Any]:
+        """(a, b) -> c_ab."""
+        return {
+            (2, 0): self.x2,
+            (1, 1): self.xy,
+            (0, 2): self.y2,
+            (3, 0): self.x3,
+            (2, 1): self.x2y,
+            (1, 2): self.xy2,
+            (0, 3): self.y3,
+            (4, 0): self.x4,
+            (3, 1): self.x3y,
+            (2, 2): self.x2y2,
+            (1, 3): self.xy3,
+            (0, 4): self.y4,
+        }
+
+    def sag(self, x: Any, y: Any) -> Any:
+        """Height, metres."""
+        return np.asarray(sum(c * x**a * y**b for (a, b), c in self._terms().items()))
+
+    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Height and slopes."""
+        coefficients: list[Any] = [0.0] * triangle_size(4)
+        for (a, b), c in self._terms().items():
+            coefficients[triangle_index(a, b)] = c
+        return triangle_polynomial(x, y, coefficients, 4)
+
+
+SAG_TERMS: dict[str, type[SagTerm]] = {"polynomial": XYPolynomial}
+"""Name that a mirror's file may write under ``sag`` -> kind, whose numbers stand there by name. A new one is added
+here: the traces, their derivatives, the path tracer, meshes and the reader of files know it from this entry.
+"""
