@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-import drjit as dr
 import numpy as np
 import pytest
 import tifffile
@@ -27,38 +26,51 @@ import twin.validate
 from analysis.monitor import monitoring, recovery
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.monitoring import PARAMETERS, MonitorGeometry
+from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
+from analysis.units import ARCSEC
 from optics.geometry.aperture import Circle
 from optics.geometry.sag_terms import SAG_TERMS, XYPolynomial, grown
 from optics.geometry.surface import plane
-from optics.geometry.tree import Motion
+from optics.geometry.tree import Motion, State
 from optics.geometry.vector_shape import Polygon
+from optics.materials.material import material
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.targets.target_shapes import Target
+from optics.thermal.heat import Temperature
 from optics.waves.pupil_function import circular_pupil
 from scenes.models.camera_model import surface_of
+from scenes.models.obstruction import find_obstructions
+from scenes.models.scene_surface import IDEAL
+from scenes.models.scenery import build_scenery
 from scenes.schema import json_schema
 from scenes.specs.camera import MirrorSpec
+from scenes.specs.channel import PRISMS
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit_spec import OrbitSpec
+from scenes.specs.resolved import resolve
 from scenes.specs.study import DesignSpec, Sampler
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
+from tests.scenes.mirror_reflectors import HOLLOW, PERISCOPE
 from tests.twin import test_path_figure as path_figure
+from tests.twin import test_prism_images
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study as write_study_file
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
+from twin.path_tracing.stray_rays import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.run.artefact import Table
 from twin.run.page import RunFacts, write_test
@@ -484,6 +496,8 @@ class Cylinder:
         return c * x * x / (1.0 + np.sqrt(1.0 - (c * x) ** 2)) + self.step * y
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        import drjit as dr
+
         c = self.curvature
         root = dr.sqrt(dr.maximum(1.0 - (c * x) ** 2, 1e-6))
         return c * x * x / (1.0 + root) + self.step * y, c * x / root, self.step + 0.0 * y
@@ -594,6 +608,126 @@ def test_what_a_term_of_a_sag_has_to_keep_to(name: str, backend: Any) -> None:
     for nothing in kind().height(backend.Float(x), backend.Float(y)):
         assert np.all(np.array(nothing) == 0.0)
     np.testing.assert_allclose(grown(term, 3.0).sag(3.0 * x, 3.0 * y), 3.0 * term.sag(x, y), rtol=1e-13)
+
+
+# --- reflectors of the monitor ----------------------------------------------------------------------------------------
+
+REFLECTORS = "optics.raytrace.reflectors.REFLECTORS"
+TURN = 2.0 * ARCSEC
+PRISM_180 = "{material: fused silica, distance: 2.4 m, width: 60 mm, tilt: [3 arcmin, 3 arcmin]}"
+PRISM_0 = "{material: fused silica, distance: 0.5 m, shift: 100 mm, width: 60 mm, tilt: [3 arcmin, 3 arcmin]}"
+
+
+def with_mirrors(folder: Path, *changes: tuple[str, str]) -> Path:
+    """The library's pair with mirrors in place of its prisms, as files, and a job for it."""
+    text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8")
+    made = "{kind: hollow, material: fused silica, distance: 2.4 m, width: 60 mm}"
+    onward = "{kind: periscope, material: fused silica, distance: 0.5 m, shift: 130 mm, width: 60 mm}"
+    for old, new in (("name: gf7_pair", "name: mirrors"), (PRISM_180, made), (PRISM_0, onward), *changes):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / "mirrors.yaml").write_text(text, "utf-8")
+    (folder / "job.yaml").write_text("instrument: mirrors.yaml\n", "utf-8")
+    return folder / "job.yaml"
+
+
+def spot_places(experiment: MonitorExperiment, states: list[State]) -> np.ndarray:
+    """Spots of all channels, row and column in pixels from the images of each state, without noise, (S, C, 2)."""
+    photons = experiment.path.expected_photons(states)
+    frames = experiment.expected_frames(photons).reshape(-1, *photons.shape[2:])
+    return measure_spots(frames, 9, experiment.calibration).position.reshape(len(states), -1, 2)
+
+
+@extends(REFLECTORS)
+def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plane mirrors in place of both prisms: named by a file, seen in the images of the monitor, followed by the path
+    tracer, deformed by heat.
+    """
+    with pytest.raises(InputError, match=r"prism_180.kind: not one of the choices; found 'hollow', allowed: lateral_"):
+        resolve(with_mirrors(tmp_path))
+    add(monkeypatch, REFLECTORS, "hollow", HOLLOW)
+    add(monkeypatch, REFLECTORS, "periscope", PERISCOPE)
+    schema = json_schema("instrument")["$defs"]
+    for prism, kinds in (("Prism180Spec", ["lateral_transfer", "hollow"]), ("Prism0Spec", ["rhomboid", "periscope"])):
+        assert schema[prism]["properties"]["kind"]["anyOf"][0]["enum"] == kinds
+    for change, said in (
+        (("hollow, ", "hollow, angle_errors: {window: [0 rad, 0 rad]}, "), "no such face; found 'window', allowed: mi"),
+        (("kind: periscope", "kind: hollow"), "prism_0.kind: not one of the choices; found 'hollow', allowed: rhomboi"),
+        (("shift: 130 mm", "shift: 110 mm"), "monitor.prism_0.shift: base/forward/monitor/left/prism_0: the mirrors"),
+    ):
+        with pytest.raises(InputError, match=re.escape(said)):
+            MonitorExperiment(resolve(with_mirrors(tmp_path, change)), backend)
+    experiment = MonitorExperiment(resolve(with_mirrors(tmp_path)), backend)
+    instrument = experiment.instrument
+    assert not instrument.assembly.media
+    # the plates that take the monitor's light out of the pupil stand in the cameras', nothing in the monitor's
+    obstructions = find_obstructions(instrument, backend)
+    assert {(o.body.rpartition("/")[2], o.beam.rpartition("/")[2]) for o in obstructions} == {("mirror", "imaging")}
+    assert all(0.0 < o.used <= o.share < 0.03 for o in obstructions)
+
+    # spots: as a whole they may turn; one mirror by an angle, about an axis square to the beams, is a facet by twice
+    # that, and the spot moves by four times f; the focal length differs by 3 % across the line
+    def turned(part: str, vector: tuple[float, float, float], pivot: str = "origin") -> State:
+        return {f"base/{c.camera}/monitor/{c.side}/{part}": Motion(rotate=vector, pivot=pivot) for c in channels}
+
+    channels = instrument.channels
+    whole = [turned(prism, tuple(TURN * np.eye(3)[a]), "centre") for prism in PRISMS for a in range(3)]
+    single = [turned(part, (0.0, TURN, 0.0)) for part in ("prism_0/first", "prism_0/second", "prism_180/mirror")]
+    places = np.moveaxis(test_prism_images.spots(experiment.path, [{}, *whole, *single]), 0, 1)
+    moved = places[1:] - places[:1]
+    # coma, and that beams walk over the mirrors of the camera
+    assert np.abs(places[0]).max() < 0.1
+    assert np.abs(moved[: len(whole)]).max() < test_prism_images.STILL
+    focal = np.array([instrument.cameras[c.camera].line_focal_length for c in channels])
+    for shift in moved[len(whole) :]:
+        np.testing.assert_allclose(np.linalg.norm(shift, axis=-1), 4.0 * TURN * focal / 12e-6, rtol=0.07)
+    # images of one of these states: rows are y, columns x; of the beams' mean and the centroid coma makes two things
+    seen = np.diff(spot_places(experiment, [{}, single[0]]), axis=0)[0]
+    np.testing.assert_allclose(seen[:, ::-1], moved[len(whole)], rtol=0, atol=0.05)
+
+    # heat: a free plate in a gradient across it becomes a sphere of curvature alpha times the gradient
+    plate = "base/forward/monitor/left/prism_180/mirror"
+    warm = experiment.thermal.state({plate: Temperature(0.0, (0.0, 0.0, 2.0))})[plate]
+    disk = 0.03 * np.hypot(1.0, np.sqrt(2.0))
+    bent = -2.0 * material("fused silica").expansion * disk**2 / (4.0 * np.sqrt(3.0))
+    assert warm.figure[4] == pytest.approx(bent, rel=1e-6)
+
+    # the path tracer, with a mirror turned
+    state = turned("prism_0/first", (0.0, TURN, 0.0))
+    scenery = build_scenery(instrument, state, IDEAL)
+    tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument))
+    aimed, placed = experiment.path.nominal, instrument.assembly.place([state])
+    for number, channel in enumerate(channels):
+        direction = aimed.direction[number]
+        position = np.broadcast_to(placed.pose(channel.reticle_body).translation, direction.shape)
+        systems = assemble(instrument.assembly, [f"{channel.key}/monitor"], [state])
+        traced = trace(backend, systems, make_rays(backend, position, direction))
+        place, _, length, valid = (a[0] for a in traced.numpy())
+        found = tracer.run(RaySource.even(position, direction), keep=True).detections
+        ccd = [d.name for d in scenery.detectors].index(f"{channel.key}/area_ccd")
+        own = (found.kind == NOMINAL) & (found.detector == ccd)
+        path = found.path[own]
+        np.testing.assert_array_equal(np.sort(path), np.nonzero(valid)[0])
+        assert valid.sum() > 100
+        np.testing.assert_allclose(found.place[own], place[path, :2], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_job_with_a_reflector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The main job's command with stray light, pictures and report."""
+    add(monkeypatch, REFLECTORS, "hollow", HOLLOW)
+    add(monkeypatch, REFLECTORS, "periscope", PERISCOPE)
+    job = with_mirrors(tmp_path)
+    job.write_text(
+        "instrument: mirrors.yaml\n"
+        "perturb: {base/forward/monitor/left/prism_0/first: {rotate: [0 arcsec, 1 arcsec, 0 arcsec]}}\n"
+        "render: {frames: 1, stray: {paths: 20000}}\n",
+        "utf-8",
+    )
+    done = invoke(twin.render.app, job, "--out", tmp_path / "run")
+    assert done.exit_code == 0, done.output
+    assert "hollow" in (tmp_path / "run" / "config.yaml").read_text("utf-8")
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------

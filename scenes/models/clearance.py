@@ -18,7 +18,7 @@ from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly, Element
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, prism_of
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 LEAST_GAP = 20e-6
@@ -125,7 +125,7 @@ def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
 
 def _remedy(path: str) -> tuple[int, KeyPath, str]:
     """How willingly a body is moved (the first first), which key moves it, and what to choose there."""
-    kind = path.rpartition("/")[2]
+    kind = prism_of(path)
     if path == CENTRAL_PRISM:
         return 2, (CENTRAL_KEY, "position"), "a position"
     if kind == PRISM_0:

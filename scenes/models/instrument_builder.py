@@ -17,13 +17,13 @@ from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
 from scenes.models.camera_assembly import camera_bodies, camera_elements, camera_sequences, focal_plane_body
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.models.clearance import check_clearance, check_solids
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.monitor_chain import MonitorChain, check_prisms, leaving_beams, monitor_chain, square_facets
-from scenes.models.prism_model import facet_block
 from scenes.specs.baffle import Plate
 from scenes.specs.channel import BASE, CENTRAL_PRISM, SIDES, Channel
 from scenes.specs.job import NodeInfo

@@ -26,11 +26,11 @@ from optics.numerics.array_math import inner, norm, turned
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.reflectors import Mount, Reflector, ReflectorParts
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.models.instrument_model import MisplacedError, key_of
-from scenes.models.prism_model import null_point, prism_0, prism_180, roof_offset
 from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel
 from scenes.yaml.errors import KeyPath
 
@@ -62,7 +62,7 @@ class MonitorChain:
     Attributes:
         bodies: of the prisms and their faces, and of the facet.
         elements: in the order in which the leaving beam meets them; the last one is the return face.
-        solids: the two prisms.
+        solids: of the two prisms, or of what stands in their place.
         glass: prism -> length of the beam inside it, one way, metres.
     """
 
@@ -148,7 +148,8 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     whole = float(norm(across))
     toward = across / whole
     transfer = whole - monitor.prism_0.shift
-    off = roof_offset(monitor.prism_180.width)
+    made = monitor.prism_180
+    off = made.reflector.sideways(made.width)
     shortest = 2.0 * off + monitor.prism_180.width
     if transfer < shortest:
         raise spec.error(
@@ -163,34 +164,19 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     # of the two mirror-image prisms the one that lies more nearly across the line
     x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
     hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
-    made = monitor.prism_180
     pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
-    pose = pose @ _turn(made.tilt, null_point(length, made.width))
-    first = prism_180(
-        channel.prism_body(PRISM_180),
-        into_camera @ pose,
-        channel.prism_elements(PRISM_180),
-        made.material,
-        length,
-        made.width,
-        hand,
-        made.angle_errors,
-    )
+    pose = pose @ _turn(made.tilt, made.reflector.null_point(length, made.width))
+    names = channel.prism_body(PRISM_180), channel.prism_elements(PRISM_180)
+    mount = Mount(names[0], into_camera @ pose, names[1], made.material, length, made.width, hand, made.angle_errors)
+    first = _made(spec, PRISM_180, "width", made.reflector, mount)
     small = monitor.prism_0
     pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
-    pose = pose @ _turn(small.tilt, (0.0, 0.0, 0.0))
-    try:
-        second = prism_0(
-            channel.prism_body(PRISM_0),
-            into_camera @ pose,
-            channel.prism_elements(PRISM_0),
-            small.material,
-            small.shift,
-            small.width,
-            small.angle_errors,
-        )
-    except ValueError as error:
-        raise spec.error(str(error), ("monitor", PRISM_0, "shift")) from error
+    pose = pose @ _turn(small.tilt, small.reflector.null_point(small.shift, small.width))
+    names = channel.prism_body(PRISM_0), channel.prism_elements(PRISM_0)
+    mount = Mount(
+        names[0], into_camera @ pose, names[1], small.material, small.shift, small.width, errors=small.angle_errors
+    )
+    second = _made(spec, PRISM_0, "shift", small.reflector, mount)
     face = Element(
         f"{channel.key}/return_face",
         channel.face_body,
@@ -202,9 +188,17 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     return MonitorChain(
         (*first.bodies, *second.bodies, facet),
         (*first.elements, *second.elements, face),
-        (first.solid, second.solid),
+        (*first.solids, *second.solids),
         MappingProxyType({PRISM_180: first.path_length, PRISM_0: second.path_length}),
     )
+
+
+def _made(spec: InstrumentSpec, prism: str, key: str, reflector: Reflector, mount: Mount) -> ReflectorParts:
+    """A reflector; InputError at a key of the prism where it cannot be made."""
+    try:
+        return reflector.parts(mount)
+    except ValueError as error:
+        raise spec.error(str(error), ("monitor", prism, key)) from error
 
 
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
@@ -222,7 +216,7 @@ def check_prisms(spec: InstrumentSpec) -> None:
     monitor, face = spec.monitor, spec.monitor.return_face.aperture
     for name, prism in monitor.prisms.items():
         known = glass(prism.material)
-        if not known.shortest <= monitor.wavelength <= known.longest:
+        if prism.reflector.transparent and not known.shortest <= monitor.wavelength <= known.longest:
             raise spec.error(
                 f"the index of {prism.material} is not known at the monitor's wavelength of "
                 f"{1e9 * monitor.wavelength:.6g} nm",

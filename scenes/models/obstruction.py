@@ -168,8 +168,11 @@ def _aimed(
 def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray:
     """Which imaging rays (N, K, 2, 3) pass the clear aperture through which a channel's beam enters a prism, (N,)."""
     assembly, placed = instrument.assembly, instrument.assembly.place()
-    for element in assembly.elements.values():
-        if element.solid == path and element.name.endswith(f"/{PRISM_180}/entry"):
+    for channel in instrument.channels:
+        prism = channel.prism_body(PRISM_180)
+        if path == prism or path.startswith(f"{prism}/"):
+            mirrors = len(instrument.cameras[channel.camera].mirrors)
+            element = assembly.elements[assembly.sequences[f"{channel.key}/outgoing"][mirrors]]
             assert element.aperture is not None
             into = placed.pose(element.body).inverse()
             start, end = into.apply(segments[:, -1, 0]), into.apply(segments[:, -1, 1])

@@ -1,18 +1,20 @@
 """An instrument: cameras on a common base with their autocollimation monitors and prisms, as its file gives it."""
 
+from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from optics.materials.glass import GLASSES, glass
 from optics.materials.material import MATERIALS, material
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.channel import PRISM_0, PRISM_180
 from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
-from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, Reference, Spec, Text, Whole, name_in
+from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Spec, Text, Whole, name_in
 from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE, TIME
 
 Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]
@@ -22,20 +24,21 @@ GlassName = Annotated[str, Field(strict=True), name_in("glass", GLASSES, glass)]
 """A glass of the catalogue in optics/materials/glass.py."""
 
 
-PRISM_180_FACES = ("window", "mirror", "roof_a", "roof_b")
-PRISM_0_FACES = ("entry", "mirror_a", "mirror_b", "exit")
+FaceErrors = Annotated[dict[Name, Tilt], NothingIsEmpty, AfterValidator(FrozenMap)]
 
 
-def _faces_of(known: tuple[str, ...]) -> AfterValidator:
-    """Refuse angle errors of faces that a prism does not have."""
+def _kinds(returns: bool) -> OneOf:
+    """Names of the reflectors that send the beam back, or of those that send it on."""
+    return OneOf(lambda: (name for name, kind in REFLECTORS.items() if kind.returns == returns))
 
-    def check(errors: dict[str, tuple[float, float]]) -> FrozenMap[str, tuple[float, float]]:
-        for name in errors:
-            if name not in known:
-                raise Problem("no such face", shown(name), names_text(known), nearest(name, known), (name,))
-        return FrozenMap(errors)
 
-    return AfterValidator(check)
+def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector) -> None:
+    """Refuse angle errors of faces that a reflector does not have."""
+    known = reflector.faces
+    for name in errors:
+        if name not in known:
+            within = ("angle_errors", name)
+            raise Problem("no such face", shown(name), names_text(known), nearest(name, known), within)
 
 
 class Prism180Spec(Spec):
@@ -49,15 +52,25 @@ class Prism180Spec(Spec):
             It leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
         angle_errors: face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a,
             roof_b.
+        kind: what stands in its place, by its name among ``REFLECTORS``; the prism when nothing is said.
     """
 
     material: GlassName
     distance: PositiveLength
     width: PositiveLength
     tilt: Tilt = (0.0, 0.0)
-    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, _faces_of(PRISM_180_FACES)] = Field(
-        default_factory=FrozenMap
-    )
+    angle_errors: FaceErrors = Field(default_factory=FrozenMap)
+    kind: Annotated[str, _kinds(returns=True)] | None = None
+
+    @property
+    def reflector(self) -> Reflector:
+        """What stands there."""
+        return REFLECTORS[self.kind or "lateral_transfer"]
+
+    @model_validator(mode="after")
+    def _has_these_faces(self) -> "Prism180Spec":
+        _check_faces(self.angle_errors, self.reflector)
+        return self
 
 
 class Prism0Spec(Spec):
@@ -70,6 +83,7 @@ class Prism0Spec(Spec):
         width: of the clear apertures across the beam, metres.
         tilt: turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
         angle_errors: face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit.
+        kind: what stands in its place, by its name among ``REFLECTORS``; the prism when nothing is said.
     """
 
     material: GlassName
@@ -77,9 +91,18 @@ class Prism0Spec(Spec):
     shift: PositiveLength
     width: PositiveLength
     tilt: Tilt = (0.0, 0.0)
-    angle_errors: Annotated[dict[Name, Tilt], NothingIsEmpty, _faces_of(PRISM_0_FACES)] = Field(
-        default_factory=FrozenMap
-    )
+    angle_errors: FaceErrors = Field(default_factory=FrozenMap)
+    kind: Annotated[str, _kinds(returns=False)] | None = None
+
+    @property
+    def reflector(self) -> Reflector:
+        """What stands there."""
+        return REFLECTORS[self.kind or "rhomboid"]
+
+    @model_validator(mode="after")
+    def _has_these_faces(self) -> "Prism0Spec":
+        _check_faces(self.angle_errors, self.reflector)
+        return self
 
 
 class CentralPrismSpec(Spec):

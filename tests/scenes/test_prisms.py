@@ -12,10 +12,10 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, solid_mesh
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Interaction
+from optics.raytrace.reflectors import EDGE, Mount, prism_0, prism_180, roof_offset
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.instrument_model import key_of
-from scenes.models.prism_model import EDGE, prism_0, prism_180, roof_offset
 from scenes.specs.channel import CENTRAL_KEY, CENTRAL_PRISM, PRISMS, prism_of
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 
@@ -28,11 +28,11 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def parts_180(hand: float = 1.0, errors=None):
-    return prism_180("glass", Pose(), "p", "fused silica", LENGTH, WIDTH, hand, errors or {})
+    return prism_180(Mount("glass", Pose(), "p", "fused silica", LENGTH, WIDTH, hand, errors or {}))
 
 
 def parts_0(errors=None):
-    return prism_0("glass", Pose(), "p", "fused silica", SHIFT, WIDTH, errors or {})
+    return prism_0(Mount("glass", Pose(), "p", "fused silica", SHIFT, WIDTH, errors=errors or {}))
 
 
 def assembled(parts) -> Assembly:
@@ -241,12 +241,12 @@ def test_bodies(hand, width) -> None:
     """Closed solids with glass around their clear apertures: EDGE of it, and EDGE / sqrt(3) toward the roof's slanted
     edges. The rhomboid's volume is that of its box.
     """
-    long = prism_180("glass", Pose(), "p", "fused silica", LENGTH, width, hand, {})
-    small = prism_0("glass", Pose(), "p", "fused silica", SHIFT + width, width, {})
+    long = prism_180(Mount("glass", Pose(), "p", "fused silica", LENGTH, width, hand))
+    small = prism_0(Mount("glass", Pose(), "p", "fused silica", SHIFT + width, width))
     for parts in (long, small):
         placed = RigidTree(parts.bodies).place()
-        made = solid_mesh(parts.solid, placed)
-        by_body = {face.body: polygon for face, polygon in zip(parts.solid.faces, made.polygons, strict=True)}
+        made = solid_mesh(parts.solids[0], placed)
+        by_body = {face.body: polygon for face, polygon in zip(parts.solids[0].faces, made.polygons, strict=True)}
         for element in parts.elements:
             face = next(body for body in (element.body, element.body.rpartition("/")[0]) if body in by_body)
             pose = placed.pose(element.body)
@@ -259,11 +259,11 @@ def test_bodies(hand, width) -> None:
             assert room.min() > EDGE / np.sqrt(3.0) - 1e-9
     box = (SHIFT + width) * (width + 2.0 * EDGE) * (width + 2.0 * EDGE)
     placed = RigidTree(small.bodies).place()
-    assert solid_mesh(small.solid, placed).mesh.volume == pytest.approx(box, rel=1e-9)
+    assert solid_mesh(small.solids[0], placed).mesh.volume == pytest.approx(box, rel=1e-9)
 
 
 def test_faces_do_what_they_should() -> None:
-    kinds = {face.name: face.coating for face in parts_180().solid.faces}
+    kinds = {face.name: face.coating for face in parts_180().solids[0].faces}
     assert kinds["window"] is Coating.TRANSMITTING
     assert kinds["mirror"] is Coating.MIRROR
     assert kinds["roof_a"] is kinds["roof_b"] is Coating.TOTAL
@@ -284,7 +284,7 @@ def test_what_cannot_be_made() -> None:
     with pytest.raises(ValueError, match="no such face: roof"):
         parts_180(errors={"roof": (0.0, 0.0)})
     with pytest.raises(ValueError, match="cannot displace the beam by only 50 mm; at least 63 mm"):
-        prism_0("glass", Pose(), "p", "fused silica", 0.05, 0.06, {})
+        prism_0(Mount("glass", Pose(), "p", "fused silica", 0.05, 0.06))
     with pytest.raises(ValueError, match="glass/entry"):
         RigidTree((Body("glass/entry"), *parts_0().bodies))
 

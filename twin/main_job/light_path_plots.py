@@ -93,7 +93,7 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
         fill = _GLASS if solid.transparent else _BLOCK
         axes.add_patch(Polygon(outline, closed=True, fc=fill, ec="none", zorder=1.6))
         axes.add_patch(Polygon(outline, closed=True, fill=False, ec=INK, lw=0.8, zorder=3))
-        if not solid.transparent:
+        if solid.path == CENTRAL_PRISM:
             middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
             _label(axes, "central prism", np.array([middle, outline[:, 1].min()]), (0, -4), "top")
         elif prism_of(solid.path) == PRISM_0:

@@ -1,4 +1,4 @@
-"""Shapes of the monitor's prisms: faces on bodies, elements on faces, clear apertures.
+"""What turns and displaces a monitor's beam, kind by kind: faces on bodies, elements on faces, clear apertures.
 
 The 180-deg prism is a slice of a corner cube. Its frame has z along the beam that enters, x along the transfer, the
 origin in the middle of its window:
@@ -17,8 +17,8 @@ The 0-deg prism is a rhomboid, its frame's z along the beam, x along the displac
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import sqrt
 
@@ -30,6 +30,7 @@ from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body
 from optics.numerics.array_math import inner, norm
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
 
 EDGE = 0.003
@@ -56,22 +57,79 @@ class Passage:
 
 
 @dataclass(frozen=True, eq=False)
-class PrismParts:
-    """A prism ready for the assembly.
+class Mount:
+    """Where a reflector stands and what it is to do; its frame has z along the beam that enters, x along the way on
+    which the beam is displaced.
 
     Attributes:
-        bodies: its own and its faces'.
-        elements: in the order in which the beam that leaves the camera meets them.
-        solid: its glass.
+        path: of its body; all other bodies stand below it.
+        pose: of that body in the one that carries it.
+        key: prefix of its elements' names.
+        material: of its glass, or of what its mirrors are ground from.
+        length: from the middle of the entering to that of the leaving beam along x, metres.
+        width: of the clear apertures, metres.
+        hand: of a reflector that returns the beam, +1: the beam enters at +y of the middle; -1: the mirror image.
+        errors: face -> tilt about its x and y, as made, radians.
+    """
+
+    path: str
+    pose: Pose
+    key: str
+    material: str
+    length: float
+    width: float
+    hand: float = 1.0
+    errors: Mapping[str, tuple[float, float]] = field(default_factory=FrozenMap)
+
+
+@dataclass(frozen=True, eq=False)
+class ReflectorParts:
+    """A reflector ready for the assembly.
+
+    Attributes:
+        bodies: its own and its faces'; the first has the pivots ``apex`` and ``centre``.
+        elements: in the order in which the beam that leaves the camera meets them, with clear apertures.
+        solids: its glass, and what carries its mirrors.
         path_length: of the beam's middle inside the glass, metres.
-        apex: null point of the 180-deg prism in its frame, metres; the middle for the rhomboid.
+        apex: of a reflector that returns the beam the point about which it may turn, else its middle, in its frame,
+            metres.
     """
 
     bodies: tuple[Body, ...]
     elements: tuple[Element, ...]
-    solid: Solid
+    solids: tuple[Solid, ...]
     path_length: float
     apex: tuple[float, float, float]
+
+
+def _nowhere(width: float) -> float:
+    return 0.0
+
+
+def _middle(length: float, width: float) -> tuple[float, float, float]:
+    return (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Reflector:
+    """A kind of reflector, as the monitor of an instrument's file may name it.
+
+    Attributes:
+        returns: the beam goes back antiparallel, from (x, y) to (-x, -y) (what stands for the 180-deg prism); else on
+            in its direction, displaced by ``Mount.length`` along x (the 0-deg prism).
+        faces: those that may be tilted as made.
+        parts: makes it; ValueError where it cannot be made for its mount.
+        sideways: width -> how far from the middle along y the beam passes, metres.
+        null_point: length and width -> where it may turn without turning the beam, in its frame, metres.
+        transparent: it is made of glass that the beam goes through, whose index has to be known.
+    """
+
+    returns: bool
+    faces: tuple[str, ...]
+    parts: Callable[[Mount], ReflectorParts]
+    sideways: Callable[[float], float] = _nowhere
+    null_point: Callable[[float, float], tuple[float, float, float]] = _middle
+    transparent: bool = True
 
 
 Plane = tuple[str, tuple[float, float, float], tuple[float, float, float], Coating]
@@ -80,28 +138,9 @@ Plane = tuple[str, tuple[float, float, float], tuple[float, float, float], Coati
 _S = 1.0 / sqrt(2.0)
 
 
-def prism_180(
-    path: str,
-    pose: Pose,
-    key: str,
-    material: str,
-    length: float,
-    width: float,
-    hand: float,
-    errors: Mapping[str, tuple[float, float]],
-) -> PrismParts:
-    """The lateral-transfer prism.
-
-    Args:
-        path: of its body.
-        pose: in the body that carries it, as the module says.
-        key: prefix of its elements' names.
-        material: its glass.
-        length: from the middle of the entering to that of the leaving beam along x, metres.
-        width: of the clear apertures, metres.
-        hand: +1: the beam enters at +y of the ridge; -1: the mirror image of that prism.
-        errors: face -> tilt about its x and y, radians.
-    """
+def prism_180(mount: Mount) -> ReflectorParts:
+    """The lateral-transfer prism."""
+    length, width, hand = mount.length, mount.width, mount.hand
     off = roof_offset(width)
     half = 0.5 * width
     height = _beam_height(width)
@@ -128,7 +167,7 @@ def prism_180(
         Passage("roof_b", "roof_b", Interaction.TOTAL, at([x, -y, height - sqrt(2.0) * off]), turned),
         Passage("exit", "window", Interaction.REFRACT, at([x, -y, 0.0]), -up),
     ]
-    return _parts(path, pose, key, material, planes, passages, width, errors, apex, {"window": (0.0, 0.0, 0.0)})
+    return _parts(mount, planes, passages, apex, {"window": (0.0, 0.0, 0.0)})
 
 
 def _beam_height(width: float) -> float:
@@ -146,25 +185,18 @@ def roof_offset(width: float) -> float:
     return 0.5 * width + EDGE
 
 
-def prism_0(
-    path: str,
-    pose: Pose,
-    key: str,
-    material: str,
-    shift: float,
-    width: float,
-    errors: Mapping[str, tuple[float, float]],
-) -> PrismParts:
-    """The rhomboid; arguments as ``prism_180``, shift is the beam's displacement along x, metres.
+def prism_0(mount: Mount) -> ReflectorParts:
+    """The rhomboid.
 
     Raises:
         ValueError: the displacement is too small for the width, so that the rhomboid would cut the beam.
     """
+    shift, width = mount.length, mount.width
     half = 0.5 * width + EDGE
     if shift < half + 0.5 * width:
         raise ValueError(
-            f"{path}: a rhomboid of width {1e3 * width:.4g} mm cannot displace the beam by only {1e3 * shift:.4g} mm; "
-            f"at least {1e3 * (half + 0.5 * width):.4g} mm"
+            f"{mount.path}: a rhomboid of width {1e3 * width:.4g} mm cannot displace the beam by only "
+            f"{1e3 * shift:.4g} mm; at least {1e3 * (half + 0.5 * width):.4g} mm"
         )
     x = 0.5 * shift
     planes: list[Plane] = [
@@ -182,30 +214,26 @@ def prism_0(
         Passage("mirror_b", "mirror_b", Interaction.TOTAL, np.array([x, 0, 0.0]), along_x),
         Passage("exit", "exit", Interaction.REFRACT, np.array([x, 0, half]), along_z),
     ]
-    return _parts(path, pose, key, material, planes, passages, width, errors, (0.0, 0.0, 0.0), {})
+    return _parts(mount, planes, passages, (0.0, 0.0, 0.0), {})
 
 
 def _parts(
-    path: str,
-    pose: Pose,
-    key: str,
-    material: str,
+    mount: Mount,
     planes: list[Plane],
     passages: list[Passage],
-    width: float,
-    errors: Mapping[str, tuple[float, float]],
     apex: tuple[float, float, float],
     origins: Mapping[str, tuple[float, float, float]],
-) -> PrismParts:
+) -> ReflectorParts:
     """Bodies, elements and solid from planes and passages; ``origins`` places the frame of a face that two passages
     share.
     """
+    path, width, errors = mount.path, mount.width, mount.errors
     used = {p.face: p for p in reversed(passages)}
     shared = {face for face in used if sum(p.face == face for p in passages) > 1}
     unknown = set(errors) - set(used)
     if unknown:
         raise ValueError(f"{path}: no such face: {', '.join(sorted(unknown))}; faces are {', '.join(used)}")
-    bodies = [Body(path, pose, pivots={"apex": apex, "centre": _centre(passages)})]
+    bodies = [Body(path, mount.pose, pivots={"apex": apex, "centre": _centre(passages)})]
     faces, frames = [], {}
     for name, normal, point, coating in planes:
         if name not in used:
@@ -232,7 +260,7 @@ def _parts(
         aperture = Ellipse(0.5 * width / cosine, 0.5 * width, (float(centre[0]), float(centre[1])))
         elements.append(
             Element(
-                f"{key}/{passage.name}",
+                f"{mount.key}/{passage.name}",
                 _footprint(path, passage, shared),
                 plane(),
                 passage.interaction,
@@ -241,7 +269,7 @@ def _parts(
             )
         )
     inside = sum(float(norm(b.place - a.place)) for a, b in pairwise(passages))
-    return PrismParts(tuple(bodies), tuple(elements), Solid(path, material, tuple(faces)), inside, apex)
+    return ReflectorParts(tuple(bodies), tuple(elements), (Solid(path, mount.material, tuple(faces)),), inside, apex)
 
 
 def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
@@ -285,3 +313,13 @@ def facet_block(
     for name, normal, point, coating in walls:
         faces.append(Face(name, path, coating, Pose(_axes(np.array(normal, float), None), np.array(point, float))))
     return Solid(path, material, tuple(faces), transparent=False)
+
+
+REFLECTORS: dict[str, Reflector] = {
+    "lateral_transfer": Reflector(True, ("window", "mirror", "roof_a", "roof_b"), prism_180, roof_offset, null_point),
+    "rhomboid": Reflector(False, ("entry", "mirror_a", "mirror_b", "exit"), prism_0),
+}
+"""Name that an instrument's file may write as ``kind`` of ``monitor.prism_180``, if it returns the beam, or of
+``monitor.prism_0`` -> kind. A new one is added here: the reader of files, the instrument, its images, heat, stray light
+and pictures know it from this entry.
+"""
