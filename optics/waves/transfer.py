@@ -23,7 +23,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import map_coordinates, spline_filter
 
-from optics.numerics.quadrature import gauss
+from optics.numerics.quadrature import gauss, nodes_for
 from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.pupil_function import PupilFunction
 
@@ -99,17 +99,6 @@ def _band(wavelengths: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.
     if not np.all(wavelengths > 0.0) or not np.all(weights >= 0.0) or not np.sum(weights) > 0.0:
         raise ValueError("wavelengths must be positive, weights not negative and not all zero")
     return wavelengths, weights / np.sum(weights)
-
-
-def nodes_for(span: float, least: int) -> int:
-    """Gauss nodes for exp(i phase) with a phase that runs over +-``span`` radians, and with a smooth amplitude.
-
-    Gauss' rule for a linear phase needs span / 2 nodes, and more that grow like the cube root of the span; with these
-    it is right to 1e-8 for spans up to 100. ``least`` serves a constant phase. At F/9 and 450 nm the transfer function
-    of a camera with 0.1 waves of aberration is then right to 3e-8 within 2 mm of its focus (7 waves at the edge), and
-    to 3e-7 at 5 mm.
-    """
-    return least + int(np.ceil(0.5 * span + 2.0 * span ** (1 / 3)))
 
 
 LEAST_ALONG = 8

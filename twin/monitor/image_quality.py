@@ -33,8 +33,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
-from optics.waves.pupil_function import DEGREE, WORST_RESIDUAL
-from optics.waves.pupil_stack import PupilStack, products, to_terms
+from optics.waves.pupil_stack import DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models.camera_assembly import line_body
 from scenes.models.camera_model import LAUNCH_DISTANCE
