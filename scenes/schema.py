@@ -89,14 +89,14 @@ def _describe(model: dict[str, Any]) -> None:
     """Move what a class's docstring says of its attributes to where an editor shows it."""
     text = model.get("description", "")
     model["description"] = text.split("\n\n")[0]
-    each = [(name, said) for names, said in _ATTRIBUTE.findall(text) for name in names.split(", ")]
-    for name, said in each:
+    each = [(name, description) for names, description in _ATTRIBUTE.findall(text) for name in names.split(", ")]
+    for name, description in each:
         item = model.get("properties", {}).get(name)
         if item is not None:
-            said = " ".join(said.split())
+            description = " ".join(description.split())
             # In the file a quantity has the unit that is written beside it.
             unit = item.get("description") or item.get("items", {}).get("description")
-            item["description"] = f"{_SI_UNIT.sub('', said).rstrip('.')}: {unit}" if unit else said
+            item["description"] = f"{_SI_UNIT.sub('', description).rstrip('.')}: {unit}" if unit else description
 
 
 def write_schemas(folder: Path) -> list[Path]:

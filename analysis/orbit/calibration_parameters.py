@@ -252,8 +252,8 @@ def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike, 
     values, sigmas = np.asarray(reading, np.float64), np.asarray(sigma, np.float64)
     if values.shape != (4,) or sigmas.shape != (4,):
         raise CalibrationError(f"monitor: reading and sigma must be (4,), {', '.join(DRIFT)}")
-    told = zip(DRIFT, values.tolist(), sigmas.tolist(), strict=True)
-    return [Prior({f"{field} {line} {n}": 1.0}, v, s, group) for n, v, s in told if s != np.inf]
+    readings = zip(DRIFT, values.tolist(), sigmas.tolist(), strict=True)
+    return [Prior({f"{field} {line} {n}": 1.0}, v, s, group) for n, v, s in readings if s != np.inf]
 
 
 @dataclass(frozen=True, eq=False)

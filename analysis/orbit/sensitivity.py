@@ -46,10 +46,6 @@ class Sensitivity:
         }
         return {"what": self.what, "axis": self.axis, **answers}
 
-    def slope_of(self, angle: str) -> float:
-        """Linear derivative of one angle, rad/m. ValueError if it is none of `angles`."""
-        return float(self.slope[self.angles.index(angle)])
-
 
 def sensitivity(
     station: Station,

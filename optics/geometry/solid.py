@@ -194,10 +194,10 @@ def _without(rings: _Rings, u: int, v: int) -> _Rings | None:
     """The faces with corner v drawn into its neighbour u; None when they would not be those of a body any more."""
     out = {}
     for face, ring in rings.items():
-        drawn = [u if w == v else w for w in ring]
-        drawn = [w for w, after in _edges(drawn) if w != after]
-        if len(drawn) > 2:
-            out[face] = drawn
+        merged = [u if w == v else w for w in ring]
+        merged = [w for w, after in _edges(merged) if w != after]
+        if len(merged) > 2:
+            out[face] = merged
     if len(out) < 4 or any(len(set(ring)) < len(ring) for ring in out.values()):
         return None
     edges = {edge: face for face, ring in out.items() for edge in _edges(ring)}

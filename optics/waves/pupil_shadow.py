@@ -130,7 +130,7 @@ class PupilShadow:
         near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < most[:, None, None, None]
         full_at = np.nonzero(inside & full[:, None, None])
         b, s, g, k = np.nonzero(~inside & near & full[:, None, None])
-        cut_points, cut_weights = drawn_in(self.pieces[b, k] - away[b, s, g][:, None], self.radius[b], count)
+        cut_points, cut_weights = quadrature_within(self.pieces[b, k] - away[b, s, g][:, None], self.radius[b], count)
         cut_points += (sign[g] * shift[b, s])[:, None]
         pair = self._pairs(moves, full)
         normal, limit = sides(self.pieces.reshape(-1, *self.pieces.shape[2:]))
@@ -299,7 +299,7 @@ def _most(radius: np.ndarray) -> np.ndarray:
     return np.asarray(np.sum(np.abs(radius), axis=-1))
 
 
-def drawn_in(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Quadrature over the intersection of polygons with the inside of edges.
 
     Whatever of a polygon's boundary lies outside of the edge is drawn in along the radius. That changes no winding

@@ -28,7 +28,7 @@ from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import ImagingRays
-from optics.waves.pupil_shadow import SMALLEST, drawn_in, separate, tiled
+from optics.waves.pupil_shadow import SMALLEST, quadrature_within, separate, tiled
 from optics.waves.pupil_stack import products, to_terms
 from scenes.models.clearance import convex_bodies
 from scenes.models.obstruction import imaging_segments, rays_taken
@@ -101,7 +101,8 @@ class Shadows:
         tiles, tiled_from = tiled(pieces)
         flat = tiles.reshape(-1, *tiles.shape[2:])
         points, weights = (
-            a.reshape(*tiles.shape[:2], _NODES**2) for a in drawn_in(flat, np.ones((len(flat), 1), complex), _NODES)
+            a.reshape(*tiles.shape[:2], _NODES**2)
+            for a in quadrature_within(flat, np.ones((len(flat), 1), complex), _NODES)
         )
         areas = np.sum(weights, axis=-1) @ (tiled_from[:, None] == np.arange(pieces.shape[1]))
         points, weights = (a.reshape(count, -1) if pieces.shape[1] else np.zeros((count, 0)) for a in (points, weights))

@@ -2,8 +2,6 @@
 own statistics under noise that is common to many points, and what a narrow field can say of the principal point.
 """
 
-import math
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,7 +17,6 @@ from analysis.orientation.distortion_model import (
     slope,
 )
 from analysis.orientation.interior import fit_interior_orientation
-from analysis.orientation.sets import combine_sets
 
 FALSE_ALARM = 1e-6
 ARCSEC = np.pi / 180 / 3600
@@ -393,42 +390,6 @@ def test_error_of_the_zero_of_the_angles():
     )
     assert bare.probability < 1e-12
     assert any("lacks a term" in line for line in bare.statements)
-
-
-# ---- several sets
-
-
-def test_sets():
-    """10 sets: each is solved by itself; rms, mean and scatter at each point, and scatter of f as its noise says."""
-    rng = np.random.default_rng(9)
-    fixed = rng.standard_normal(55) * 2e-6  # the same in all sets, as a dividing error is
-    position = line_image(GF7) + fixed + rng.standard_normal((10, 55)) * 0.5e-6
-    for with_point in (False, True):
-        sets = combine_sets(position, GF7, with_point)
-        for k in range(10):
-            if with_point:
-                f, p = principal_distance_and_point(position[k], GF7)
-            else:
-                f, p = principal_distance(position[k], GF7), 0.0
-            assert sets.principal_distance[k] == f
-            assert sets.principal_point[k] == p
-            assert np.array_equal(sets.distortion[k], distortion(position[k], GF7, f, p))
-        assert sets.mean[0] == pytest.approx(math.fsum(sets.principal_distance) / 10, rel=1e-15)
-        assert sets.mean[1] == pytest.approx(math.fsum(sets.principal_point) / 10, rel=1e-12)
-        assert sets.rms_distortion**2 == pytest.approx(
-            sets.mean_distortion**2 + 0.9 * sets.scatter_distortion**2, rel=1e-9
-        )
-        assert sets.overall_rms == pytest.approx(np.sqrt(np.mean(sets.rms_distortion**2)), rel=1e-12)
-        freedom = 10 - 1
-        sigma = 0.5e-6 / np.sqrt(np.sum(np.tan(GF7) ** 2))
-        assert in_range(freedom * (sets.scatter[0] / sigma) ** 2, freedom)
-        # each set loses one or two of its 55 freedoms to f and p, alike in all sets
-        assert in_range(freedom * np.sum(sets.scatter_distortion**2) / 0.5e-6**2, freedom * (55 - 1 - with_point))
-    assert combine_sets(position, np.tile(GF7, (10, 1)), True).mean[1] == sets.mean[1]
-    with pytest.raises(OrientationError, match="at least 2 sets"):
-        combine_sets(position[:1], GF7)
-    with pytest.raises(OrientationError, match="all angles of set 0 are the same"):
-        combine_sets(position, np.full(55, 0.01))
 
 
 # ---- bad input

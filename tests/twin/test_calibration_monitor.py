@@ -19,10 +19,10 @@ from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.camera_drift import (
     PooledErrors,
-    all_told,
+    adjust_field_with_readings,
+    adjust_with_readings,
     flown,
     height_per_arcsec,
-    told_alone,
     with_monitor,
     without_monitor,
 )
@@ -64,7 +64,7 @@ def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
 def test_exact_readings_return_everything() -> None:
     """Places of the sensor are solved to 1e-12 m; 1e-6 of the drift is 20 pm, and 1e-6 of 1 um is as good."""
     campaign = flown(setup_with(exact=True), 1.0, SEED)
-    found = all_told(campaign)
+    found = adjust_with_readings(campaign)
     for one in campaign.passes:
         assert np.abs(one.drift["forward"]).max() > 0.1 * ARCSEC
         assert not np.any(one.drift["nadir"])
@@ -120,11 +120,11 @@ def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
         return replace(one, readings=FrozenMap({**one.readings, "forward": one.readings["forward"] + wrong}))
 
     all_off = replace(campaign, passes=tuple(off(p) for p in campaign.passes))
-    found = all_told(all_off)
+    found = adjust_with_readings(all_off)
     moved = abs(found.value("forward x") - campaign.truth["forward"].interior[1])
     assert moved == pytest.approx(0.65 * ARCSEC, rel=0.01)
     assert with_monitor(all_off).together.height < 0.02
-    alone = told_alone(campaign, campaign.passes[0])
+    alone = adjust_field_with_readings(campaign, campaign.passes[0])
     last = off(campaign.passes[-1])
     cameras = {k: alone.cameras[k].drifted(last.readings[k]) for k in LINES}
     errors = at_checks(campaign, last, cameras, alone.bias(KEPT[0]))

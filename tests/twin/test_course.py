@@ -23,7 +23,7 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from twin.main_job.render_results import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.time_series import course_states, run_course
+from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -161,10 +161,10 @@ def test_small_temperatures_act_linearly(prepared) -> None:
 
 def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch) -> None:
     resolved, experiment = resolve(folder / "config.yaml"), prepared
-    states = course_states(experiment, resolved.job)
+    states = series_states(experiment, resolved.job)
     done: list[int] = []
     monkeypatch.setattr("twin.monitor.time_series.CHUNK", 2)
-    pieces = run_course(experiment, resolved, states, done.append)
+    pieces = run_series(experiment, resolved, states, done.append)
     assert done == [0, 2, 3]
     whole = json.loads((folder / "course.json").read_text())
     for name, camera in pieces.to_dict()["cameras"].items():
@@ -173,7 +173,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
                 np.testing.assert_allclose(numbers, whole["cameras"][name][which][key], rtol=1e-6, atol=1e-8)
     monkeypatch.setattr("twin.monitor.time_series.LARGEST_SERIES", 50_000)
     with pytest.raises(InputError, match="do not fit into memory; found '3 times', allowed: at most 1 "):
-        run_course(experiment, resolved, states)
+        run_series(experiment, resolved, states)
 
 
 # --- the run folder ---------------------------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def test_the_cold_of_the_perturbation_is_told_there(prepared, tmp_path) -> None:
     job = load_job(written(tmp_path, text))
     check_nodes(job, prepared.instrument.nodes)
     with pytest.raises(InputError, match=r"base/backward would be at -0\.85 K.* at 0 min") as caught:
-        course_states(prepared, job)
+        series_states(prepared, job)
     assert caught.value.line == 7
 
 
@@ -275,7 +275,7 @@ def test_a_time_at_which_the_light_is_lost_is_named(prepared, tmp_path) -> None:
     text = COURSE.replace("1 min", "1 min, 2 min") + f"    {LEFT}: {{gradient: {gradients}}}"
     resolved = resolve(written(tmp_path, text)).with_render(1, 1)
     with pytest.raises(InputError, match="at 1 min of the course cannot be rendered"):
-        run_course(prepared, resolved, course_states(prepared, resolved.job))
+        run_series(prepared, resolved, series_states(prepared, resolved.job))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from scipy import stats
 
 from scenes.specs.study import ParetoSpec
 from tests.twin.study_data import columns, dataset, study_of
-from twin.study.report.study_analysis import courses, pareto_front, ranks_of
+from twin.study.report.study_analysis import convergences, pareto_front, ranks_of
 from twin.study.report.study_report import summary
 from twin.study.report.study_statistics import describe, quantile_ranks, runs_for_quantile, share_interval, std_interval
 
@@ -25,7 +25,7 @@ def draws(n: int, seed: int = 3) -> np.ndarray:
 
 def test_quantiles_of_a_normal_sample() -> None:
     n = 40_000
-    found = describe(draws(n), drawn=True)
+    found = describe(draws(n), sampled=True)
     z = -stats.norm.ppf(FALSE_ALARM / 2.0)
     for estimate, q in (
         (found.median, 0.5),
@@ -40,7 +40,7 @@ def test_quantiles_of_a_normal_sample() -> None:
     assert abs(found.mean.value - 5.0) < z * 2.0 / math.sqrt(n)
     assert abs(found.std.value - 2.0) < z * 2.0 / math.sqrt(2.0 * n)
     assert found.normality.normal
-    assert not describe(np.exp(draws(500)), drawn=True).normality.normal
+    assert not describe(np.exp(draws(500)), sampled=True).normality.normal
 
 
 @pytest.mark.parametrize("q", [0.5, 0.95])
@@ -191,13 +191,13 @@ def test_a_grid_is_taken_apart_exactly() -> None:
 
 
 def test_enough_runs() -> None:
-    few, many = ({c.name: c for c in courses(draws(n))} for n in (100, 20_000))
+    few, many = ({c.name: c for c in convergences(draws(n))} for n in (100, 20_000))
     assert not few["mean"].enough
     # 1.96/sqrt(n) = 0.1 needs 384 runs; Student's factor and the sample's sigma change it by a few percent
     assert few["mean"].needed == pytest.approx(384, rel=0.05)
     assert few["p99.7"].needed == 1228
     assert all(course.enough for course in many.values())
-    assert courses(np.ones(50)) == ()
+    assert convergences(np.ones(50)) == ()
 
 
 def test_requirements_count_runs_with_numbers() -> None:

@@ -125,7 +125,7 @@ def residual_figure(run: TurntableRun) -> Figure:
     return figure
 
 
-def drawn(name: str, run: TurntableRun) -> str:
+def figure_svg(name: str, run: TurntableRun) -> str:
     """One figure as SVG; name: ``comparisons``, ``curve`` or ``residuals``."""
     draw = {"comparisons": comparison_figure, "curve": curve_figure, "residuals": residual_figure}[name]
     with look(f"turntable-{name}"):
@@ -186,7 +186,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         "turntable-comparisons",
         "Comparisons with the reference",
         "Above, all repeats; below, their RMS at each angle, and what the mean of all repeats would have at worst.",
-        drawn("comparisons", run),
+        figure_svg("comparisons", run),
     )
     return Section("Regional comparison of the turntable", tuple(text), (figure, table))
 
@@ -240,14 +240,14 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         "Dividing error",
         "Means with their sigmas (the scatter of the repeats and the reference), the chosen fit and the true curve "
         "without its subdivision error.",
-        drawn("curve", run),
+        figure_svg("curve", run),
     )
     residuals = SvgFigure(
         "turntable-residuals",
         "What the fits miss",
         "Squares: held-out readings minus the fit, with the sigma of the measurement. Lines: true curve without "
         "subdivision error minus the fit.",
-        drawn("residuals", run),
+        figure_svg("residuals", run),
     )
     return Section("Fits of the dividing error", tuple(text), (curve, residuals, table))
 

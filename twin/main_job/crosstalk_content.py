@@ -139,9 +139,9 @@ def statements(run: RenderRun) -> list[dict[str, Any]]:
     out = []
     for name, table in run.crosstalk.items():
         labels = [f"{m.label} [{m.unit}]" for m in table.motions] + [m.label for m in table.motions]
-        said = [_split(s, labels) for s in table.observability.statements]
+        statements = [_split(s, labels) for s in table.observability.statements]
         focal = [_split(s, labels) for s in table.focal_length_statements()]
-        out.append({"name": name, "focal": focal, "first": said[0]["text"], "motions": said[1:]})
+        out.append({"name": name, "focal": focal, "first": statements[0]["text"], "motions": statements[1:]})
     return out
 
 

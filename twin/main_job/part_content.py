@@ -13,7 +13,7 @@ from scenes.specs.course import moment
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import PARAMETERS
 from twin.monitor.image_quality import PLACES, CameraQuality
-from twin.monitor.time_series import CourseRun
+from twin.monitor.time_series import TimeSeries
 from twin.path_tracing.path_result import Family
 from twin.run.artefact import FAR, MINUS, decimals_for, fixed, plain, residual, residual_text, significant
 from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
@@ -22,30 +22,30 @@ from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeR
 ANGLE_MEANING = "angle between the two lines of sight"
 
 
-def course_content(run: RenderRun) -> dict[str, Any] | None:
+def series_content(run: RenderRun) -> dict[str, Any] | None:
     """Facts and the table of errors; None for a job without a course."""
-    course = run.course
-    if course is None:
+    series = run.series
+    if series is None:
         return None
     tables = []
-    for name, estimators in course.parameters.items():
+    for name, estimators in series.parameters.items():
         rows = []
         for k, p in enumerate(PARAMETERS):
             values = {e: (v.vector[:, k] * PER_SI[k], v.sigma[:, k] * PER_SI[k]) for e, v in estimators.items()}
             key = f"course.{name}.{p.key}"
-            rows.append(_row(key, f"{p.symbol} [{p.unit}]", p.meaning, course.truth[name][k] * PER_SI[k], values))
+            rows.append(_row(key, f"{p.symbol} [{p.unit}]", p.meaning, series.truth[name][k] * PER_SI[k], values))
         tables.append({"title": f"Camera {name}", "rows": rows})
-    if course.recovered_angle:
-        values = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in course.recovered_angle.items()}
-        row = _row("course.angle", "Δθ [arcsec]", ANGLE_MEANING, course.angle_change / ARCSEC, values)
+    if series.recovered_angle:
+        values = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in series.recovered_angle.items()}
+        row = _row("course.angle", "Δθ [arcsec]", ANGLE_MEANING, series.angle_change / ARCSEC, values)
         tables.append({"title": "Angle between the cameras", "rows": [row]})
     return {
-        "count": len(course.times),
-        "first": moment(float(course.times[0])),
-        "last": moment(float(course.times[-1])),
-        "shown": moment(float(course.times[course.shown])),
+        "count": len(series.times),
+        "first": moment(float(series.times[0])),
+        "last": moment(float(series.times[-1])),
+        "shown": moment(float(series.times[series.shown])),
         "tables": tables,
-        "worst": _worst(course),
+        "worst": _worst(series),
         "files": [f"images/{c.camera}_{c.side}_course.tiff" for c in run.experiment.path.channels],
     }
 
@@ -77,21 +77,21 @@ def _range(low: str, high: str) -> str:
     return low if low == high else f"{low} … {high}"
 
 
-def _worst(course: CourseRun) -> dict[str, str]:
+def _worst(series: TimeSeries) -> dict[str, str]:
     """The camera that the model reads worst in Δα, by how much, when, and how much truly happened, in arcsec."""
     errors = {
-        name: (estimators["model"].vector[:, 0] - course.truth[name][0]) * PER_SI[0]
-        for name, estimators in course.parameters.items()
+        name: (estimators["model"].vector[:, 0] - series.truth[name][0]) * PER_SI[0]
+        for name, estimators in series.parameters.items()
     }
     name = max(errors, key=lambda n: float(np.max(np.abs(errors[n]))))
     k = int(np.argmax(np.abs(errors[name])))
-    sigma = float(course.parameters[name]["model"].sigma[k, 0]) * PER_SI[0]
-    true = float(course.truth[name][0, k]) * PER_SI[0]
+    sigma = float(series.parameters[name]["model"].sigma[k, 0]) * PER_SI[0]
+    true = float(series.truth[name][0, k]) * PER_SI[0]
     places = decimals_for(sigma)
     return {
         "error": fixed(float(errors[name][k]), places, sign=True),
         "camera": name,
-        "time": moment(float(course.times[k])),
+        "time": moment(float(series.times[k])),
         "true": fixed(true, places, sign=True),
         "sigma": fixed(sigma, places),
     }

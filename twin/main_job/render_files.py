@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from twin.main_job.render_results import RenderRun, quality_dict, stated
-from twin.monitor.time_series import CourseRun
+from twin.monitor.time_series import TimeSeries
 from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
@@ -37,8 +37,8 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
     folder.write_bytes("irradiance.nc", netcdf(irradiance(run)))
     if run.stray is not None:
         _write_numbers(folder, "stray", run.stray.to_dict())
-    if run.course is not None:
-        _write_course(run, run.course, folder)
+    if run.series is not None:
+        _write_series(run, run.series, folder)
     if run.targets is not None:
         _write_targets(run.targets, folder)
     if run.quality is not None:
@@ -50,15 +50,15 @@ def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> Non
     folder.write_json(f"{kind}.json", described(kind, data))
 
 
-def _write_course(run: RenderRun, course: CourseRun, folder: RunFolder) -> None:
+def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None:
     """Numbers, expected images, and of each channel the first frame of every time as one page."""
-    _write_numbers(folder, "course", course.to_dict())
+    _write_numbers(folder, "course", series.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
         for ending, contents in FRAME_FORMATS.items():
             name = f"images/{channel.camera}_{channel.side}_course.{ending}"
-            folder.write_bytes(name, contents(course.frames[:, i]))
-    time = ("time", course.times, {"units": "s", "long_name": "time of the course"})
-    folder.write_bytes("course.nc", netcdf(_images(run, "time", time, course.photons)))
+            folder.write_bytes(name, contents(series.frames[:, i]))
+    time = ("time", series.times, {"units": "s", "long_name": "time of the course"})
+    folder.write_bytes("course.nc", netcdf(_images(run, "time", time, series.photons)))
 
 
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:

@@ -21,7 +21,7 @@ from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotFocus
-from twin.monitor.time_series import course_states, run_course, too_large
+from twin.monitor.time_series import run_series, series_states, too_large
 from twin.monitor.truth import trace_truth
 from twin.path_tracing.stray_light import stray_light
 from twin.path_tracing.stray_rays import NominalPathLost
@@ -96,7 +96,7 @@ def render_job(
     check_nodes(resolved.job, experiment.instrument.nodes)
     stage.begin(1)
     course = resolved.job.course
-    states = [experiment.state(resolved.job)] if course is None else course_states(experiment, resolved.job)
+    states = [experiment.state(resolved.job)] if course is None else series_states(experiment, resolved.job)
     shown = 0 if course is None else course.shown
     state = states[shown]
     stage.begin(2)
@@ -115,7 +115,7 @@ def render_job(
         raise _too_large(resolved, str(error)) from error
     series = None
     if photons is None:
-        series = run_course(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
+        series = run_series(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
         # rendered among other states a state differs in the last bit, and with it all noise; the run shows one of both
         photons = series.shown_photons[None]
     stray = None
@@ -165,7 +165,7 @@ def render_job(
             *(quality.warnings if quality is not None else ()),
             *((FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
         ),
-        course=series,
+        series=series,
         stray=stray,
         targets=targets,
         quality=quality,

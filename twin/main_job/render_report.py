@@ -9,9 +9,9 @@ from markupsafe import Markup
 
 from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job import crosstalk_content, part_content, report_content, report_labels
-from twin.main_job.course_plots import parameters_svg, temperatures_svg
 from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
+from twin.main_job.series_plots import parameters_svg, temperatures_svg
 from twin.main_job.spot_plots import residuals_svg, spots_svg
 from twin.main_job.target_plots import curves_svg, images_svg, pupils_svg
 from twin.pictures.light_paths import trace_light_paths
@@ -50,9 +50,9 @@ def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
         "side": Markup(side_view_svg(experiment.instrument, paths)),
         "footprints": Markup(footprints_svg(experiment.instrument, paths)),
     }
-    if run.course is not None:
-        figures["temperatures"] = Markup(temperatures_svg(run.course))
-        figures["course"] = Markup(parameters_svg(run.course, titles))
+    if run.series is not None:
+        figures["temperatures"] = Markup(temperatures_svg(run.series))
+        figures["course"] = Markup(parameters_svg(run.series, titles))
     if run.targets is not None:
         cameras = run.targets.cameras
         figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}
@@ -63,7 +63,7 @@ def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
     template = environment(__package__).get_template(TEMPLATE)
     return template.render(
         setup=report_content.setup(run),
-        course=part_content.course_content(run),
+        course=part_content.series_content(run),
         stray=part_content.stray_content(run),
         targets=part_content.target_content(run),
         quality=part_content.quality_content(run),

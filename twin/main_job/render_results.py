@@ -18,7 +18,7 @@ from scenes.specs.resolved import ResolvedJob
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.time_series import CourseRun
+from twin.monitor.time_series import TimeSeries
 from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
 from twin.targets.target_result import TargetRun
@@ -55,7 +55,7 @@ class RenderRun:
         recovery: what the images say (one state).
         crosstalk: camera -> response to elementary motions.
         warnings: what the user should know.
-        course: all times of the job's course, None if it has none; the rest is then about the time it shows.
+        series: all times of the job's course, None if it has none; the rest is then about the time it shows.
         stray: ghosts and stray light, None if not asked for.
         targets: test targets on the line CCDs, None if not asked for.
         quality: image quality of the nominal and of the perturbed state, None if not asked for.
@@ -74,7 +74,7 @@ class RenderRun:
     recovery: Recovery
     crosstalk: Mapping[str, CameraCrosstalk]
     warnings: tuple[str, ...]
-    course: CourseRun | None = None
+    series: TimeSeries | None = None
     stray: StrayPair | None = None
     targets: TargetRun | None = None
     quality: ImageQuality | None = None

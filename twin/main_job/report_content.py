@@ -154,7 +154,7 @@ def setup(run: RenderRun) -> dict[str, Any]:
 def _perturbations(run: RenderRun) -> list[dict[str, str]]:
     """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
     job = run.resolved.job
-    motions, fields = motions_of(job), job.fields(None if run.course is None else run.course.shown)
+    motions, fields = motions_of(job), job.fields(None if run.series is None else run.series.shown)
     out = []
     for path in dict.fromkeys((*motions, *fields)):
         motion = motions.get(path, Motion())
@@ -167,7 +167,7 @@ def _perturbations(run: RenderRun) -> list[dict[str, str]]:
 def _heated(run: RenderRun) -> int:
     """How many bodies have another temperature than nominal, faces of prisms not counted."""
     job = run.resolved.job
-    fields = run.experiment.thermal.fields(job.fields(None if run.course is None else run.course.shown))
+    fields = run.experiment.thermal.fields(job.fields(None if run.series is None else run.series.shown))
     return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
 
 

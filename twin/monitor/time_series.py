@@ -35,7 +35,7 @@ LARGEST_SERIES = 200_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class CourseRun:
+class TimeSeries:
     """What a course of T times gave.
 
     Attributes:
@@ -92,7 +92,7 @@ class CourseRun:
         return out
 
 
-def course_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
+def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
     """The state at each time of a job's course.
 
     Args:
@@ -117,18 +117,18 @@ def course_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
     return out
 
 
-def run_course(
+def run_series(
     experiment: MonitorExperiment,
     resolved: ResolvedJob,
     states: Sequence[State],
     advance: Callable[[int], None] = lambda done: None,
-) -> CourseRun:
+) -> TimeSeries:
     """Trace, render, expose and recover all times of a course against one nominal measurement.
 
     Args:
         experiment: the instrument.
         resolved: a job with a course; its frames and seed are used.
-        states: of ``course_states``.
+        states: of ``series_states``.
         advance: called with the number of times that are done, first with 0.
 
     Raises:
@@ -179,7 +179,7 @@ def run_course(
         advance(piece.stop)
     names = list(experiment.instrument.cameras)
     changes = {name: [t.cameras[name] for t in truths] for name in names}
-    return CourseRun(
+    return TimeSeries(
         times=np.array(course.times),
         temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
         shown=course.shown,

@@ -77,9 +77,9 @@ def spread(
 
     share = lobe[0]
     chance = dr.select(share > 0.0, dr.maximum(share, floor), 0.0)
-    drawn = met & ~leaving.diffusing & (rng.next_float64() < chance)
-    plain = met & ~leaving.diffusing & ~drawn
-    weight = dr.select(drawn, leaving.weight * share / chance, leaving.weight)
+    scattering = met & ~leaving.diffusing & (rng.next_float64() < chance)
+    plain = met & ~leaving.diffusing & ~scattering
+    weight = dr.select(scattering, leaving.weight * share / chance, leaving.weight)
     weight = dr.select(plain, leaving.weight * (1.0 - share) / (1.0 - chance), weight)
 
     def turn(direction: Any, event: Any, rng: Any) -> tuple[Any, Any, Any]:
@@ -111,7 +111,7 @@ def spread(
 
     direction, event, rng = dr.if_stmt(
         (leaving.direction, leaving.event, rng),
-        drawn | (met & leaving.diffusing),
+        scattering | (met & leaving.diffusing),
         turn,
         lambda direction, event, rng: (direction, event, rng),
         arg_labels=("direction", "event", "rng"),

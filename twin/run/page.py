@@ -155,5 +155,5 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
         for file, content in frame_files(name, frames, stretch=None):
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
-    told = {"test": kind, "backend": facts.backend, "seed": facts.seed, "warnings": list(report.warnings)}
-    write_manifest(folder, facts.program, facts.started, facts.seconds, **told)
+    entries = {"test": kind, "backend": facts.backend, "seed": facts.seed, "warnings": list(report.warnings)}
+    write_manifest(folder, facts.program, facts.started, facts.seconds, **entries)

@@ -307,7 +307,7 @@ def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: fl
     Raises:
         ValueError: a fact that it does not know.
     """
-    told = {
+    entries = {
         **facts,
         "program": program,
         "versions": versions(),
@@ -315,9 +315,9 @@ def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: fl
         "wall_time_s": seconds,
         "sha256": folder.checksums(),
     }
-    if unknown := sorted(told.keys() - Manifest.model_fields.keys()):
+    if unknown := sorted(entries.keys() - Manifest.model_fields.keys()):
         raise ValueError(f"no fact of a manifest: {', '.join(unknown)}")
-    folder.write_json(MANIFEST, {key: told[key] for key in Manifest.model_fields if key in told})
+    folder.write_json(MANIFEST, {key: entries[key] for key in Manifest.model_fields if key in entries})
 
 
 def read_manifest(folder: Path) -> Manifest | None:

@@ -128,7 +128,7 @@ class _Display:
         )
         self._task = self.bar.add_task("runs", total=None, rate="")
         self._began: tuple[float, int] | None = None
-        self._said = time.monotonic()
+        self._last_text = time.monotonic()
 
     def __enter__(self) -> _Display:
         self.bar.start()
@@ -163,8 +163,8 @@ class _Display:
         rate = (done - self._began[1]) / max(now - self._began[0], 1e-9)
         text = f"{rate:.3g}/s" if done > self._began[1] else ""
         self.bar.update(self._task, completed=done, total=total, rate=text)
-        if not self.console.is_terminal and text and now - self._said > TICK_SECONDS:
-            self._said = now
+        if not self.console.is_terminal and text and now - self._last_text > TICK_SECONDS:
+            self._last_text = now
             self._say(f"{done} of {total} runs, {text}, {_time_text((total - done) / rate)} left")
 
 

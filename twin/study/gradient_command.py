@@ -56,8 +56,8 @@ def _work(setup: StudySetup, session: Session) -> Result:
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", whole_table(found).content())
     write_report(setup, found, folder)
-    told = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
-    write_manifest(folder, PROGRAM, session.started, session.seconds, **told)
+    entries = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    write_manifest(folder, PROGRAM, session.started, session.seconds, **entries)
     return Result(numbers, lambda console: _print_result(found, console))
 
 

@@ -138,9 +138,14 @@ def run_study(
             result = store.result()
             numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
             write_report(numbers.data, plan, folder.path, numbers.files)
-            told = {"backend": options.backend, "seed": setup.study.design.seed, "workers": count, "warnings": warnings}
-            told |= {"runs": plan.runs, "failed": int(result.failed.sum())}
-            write_manifest(folder, PROGRAM, started, engine.seconds, **told)
+            entries = {
+                "backend": options.backend,
+                "seed": setup.study.design.seed,
+                "workers": count,
+                "warnings": warnings,
+            }
+            entries |= {"runs": plan.runs, "failed": int(result.failed.sum())}
+            write_manifest(folder, PROGRAM, started, engine.seconds, **entries)
     return StudyRun(numbers.summary, folder.path, plan, tuple(warnings))
 
 

@@ -276,5 +276,5 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     folder.write_text("validation.html", render_report(validation))
     for name, content in summary_files(validation).items():
         folder.write_bytes(f"{SUMMARY}/{name}", content)
-    told = {"backend": validation.backend, "seed": validation.seed, "only": validation.only, "fast": validation.fast}
-    write_manifest(folder, PROGRAM, validation.started, validation.seconds, **told)
+    entries = {"backend": validation.backend, "seed": validation.seed, "only": validation.only, "fast": validation.fast}
+    write_manifest(folder, PROGRAM, validation.started, validation.seconds, **entries)

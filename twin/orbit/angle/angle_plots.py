@@ -144,7 +144,7 @@ def scatter_figure(run: AngleRun) -> Figure:
     return figure
 
 
-def drawn(name: str, run: AngleRun) -> str:
+def figure_svg(name: str, run: AngleRun) -> str:
     """One figure as SVG; name: ``geometry``, ``scatter`` or one of `panels`."""
     with look(f"angle-{name}"):
         if name in panels(run):

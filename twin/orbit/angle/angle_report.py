@@ -48,13 +48,13 @@ def _lead(run: AngleRun) -> tuple[str, ...]:
     for which, by in ((np.flatnonzero(~few), "by planes"), (np.flatnonzero(few), "along the track, by planes")):
         if not len(which):
             continue
-        said = (
+        text = (
             f"{listed([f'{names[k]} = {np.degrees(found[k]):.6f}°' for k in which])} with "
             f"{'a sigma' if len(which) == 1 else 'sigmas'} of {listed([f'{sigma[k]:.2f}″' for k in which])} {by}, "
             f"{listed([f'{fixed(off[k], 2)}″' for k in which])} from the truth. "
             f"Planes minus resection: {listed([f'{fixed(difference[k], 3)}″' for k in which])}"
         )
-        lead.append(f"{said}.")
+        lead.append(f"{text}.")
     if flight.trace:
         (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC
         at = run.names.index(name)
@@ -72,9 +72,9 @@ def _methods(run: AngleRun) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for k, name in enumerate(names):
         for method, angles in estimate.angles.items():
-            said = " (folded)" if angles.folded[k] else ""
+            text = " (folded)" if angles.folded[k] else ""
             rows.append(
-                (name, METHOD_NAMES[method], f"dihedral{said}", *_row(angles.values, angles.sigma, dihedral, k))
+                (name, METHOD_NAMES[method], f"dihedral{text}", *_row(angles.values, angles.sigma, dihedral, k))
             )
         # across the track the sigma is another one
         mostly = abs(along[k]) > 0.99 * look[k]
@@ -114,7 +114,7 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
         )
     on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
     state = ("corrected" if effects.corrected else "not corrected") + " in the analysis" if on else ""
-    changed = "; ".join(f"{name} {_told(change)}" for name, change in test.changes.items())
+    changed = "; ".join(f"{name} {_change_text(change)}" for name, change in test.changes.items())
     described = (setup.camera or setup.instrument).description  # type: ignore[union-attr]
     pairs = "; ".join(
         f"{sign} between {a} and {b}" for sign, (a, b) in zip(signs(setup.angles), setup.angles.values(), strict=True)
@@ -143,17 +143,17 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _told(change: PerturbationSpec) -> str:
+def _change_text(change: PerturbationSpec) -> str:
     """What happens to a line or a node, in the file's words."""
     plain = change.plain()
-    said = []
+    text = []
     for action in change.uses():
         value = plain[action]
         items = value.items() if isinstance(value, dict) else [("", value)]
         parts = (f"{key} [{', '.join(v)}]" if isinstance(v, list) else f"{key} {v}" for key, v in items)
         about = f" about {change.pivot}" if action == "rotate" and change.pivot != DEFAULT_PIVOT else ""
-        said.append(f"{action} {', '.join(part.strip() for part in parts)}{about}")
-    return ", ".join(said) if said else "unchanged"
+        text.append(f"{action} {', '.join(part.strip() for part in parts)}{about}")
+    return ", ".join(text) if text else "unchanged"
 
 
 def _warnings(run: AngleRun) -> tuple[str, ...]:

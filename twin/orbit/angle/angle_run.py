@@ -346,7 +346,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
     for frame, (axes, origin) in places.items():
         moved = common.in_frame(axes, origin)
         for method in METHODS:
-            with warnings.catch_warnings(record=True) as said:
+            with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", NearVerticalWarning)
                 try:
                     fits = [fit_plane(moved.station, strip, method) for strip in moved.strips.values()]
@@ -355,7 +355,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
                     steepest = min(abs(float(fit.normal[2])) for fit in fits)
                 except PlaneError:
                     values, sigma, steepest = np.full(count, np.nan), np.full(count, np.nan), 0.0
-            warned = any(issubclass(w.category, NearVerticalWarning) for w in said)
+            warned = any(issubclass(w.category, NearVerticalWarning) for w in caught)
             rows.append(FrameRow(frame, method, values, sigma, steepest, warned))
     return tuple(rows)
 

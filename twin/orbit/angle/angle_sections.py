@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.units import ARCSEC
-from twin.orbit.angle.angle_plots import drawn, panels, signs
+from twin.orbit.angle.angle_plots import figure_svg, panels, signs
 from twin.orbit.angle.angle_run import AngleRun, Scatter, values_of
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT
 from twin.run.artefact import Cell, SvgFigure, Table, fixed
@@ -48,7 +48,9 @@ def _geometry(run: AngleRun) -> Section:
             f"An angle that is wrong by 1″ moves intersected heights by {listed(heights)}: the true line turned "
             "by 1″ and its ray intersected with the other line's on the ground."
         )
-    figure = SvgFigure("geometry", "Planes and strips", "In the orbital frame at the station.", drawn("geometry", run))
+    figure = SvgFigure(
+        "geometry", "Planes and strips", "In the orbital frame at the station.", figure_svg("geometry", run)
+    )
     return Section("Geometry", tuple(text), (figure,))
 
 
@@ -115,7 +117,7 @@ def _sections_scatter(run: AngleRun) -> Section:
         "scatter-passes",
         "Angles of all passes",
         _shared(run),
-        drawn("scatter", run),
+        figure_svg("scatter", run),
     )
     return Section("Planes and resection", text, (both, table, figure))
 
@@ -124,8 +126,8 @@ def _shared(run: AngleRun) -> str:
     if len(run.names) == 1:
         return "Beside the normal distribution of the claimed sigma."
     first, second = signs(run.names)[:2]
-    said = "Angles share the station, and where they have a line in common its plane."
-    return said if len(run.names) == 2 else f"{first} and {second}; the table has the others. {said}"
+    remark = "Angles share the station, and where they have a line in common its plane."
+    return remark if len(run.names) == 2 else f"{first} and {second}; the table has the others. {remark}"
 
 
 def _scatter_row(scatter: Scatter, k: int) -> tuple[float, ...]:
@@ -141,8 +143,8 @@ def _frames(run: AngleRun) -> Section:
     for row in run.frames:
         off = (row.values - reference) / ARCSEC
         cells = [float(v) if np.isfinite(v) else None for v in off]
-        said = "biased, and says so" if row.warned else ""
-        rows.append((row.frame, row.method, *cells, row.steepest, said if np.all(np.isfinite(off)) else "singular"))
+        remark = "biased, and says so" if row.warned else ""
+        rows.append((row.frame, row.method, *cells, row.steepest, remark if np.all(np.isfinite(off)) else "singular"))
     worst = max(
         (float(np.max(np.abs(r.values - reference))) for r in run.frames if r.warned and np.all(np.isfinite(r.values))),
         default=0.0,
@@ -221,7 +223,7 @@ def _sensitivity(run: AngleRun) -> Section:
         caption = (
             "All planes move with the station." if name == "station" else "All points of one strip moved together."
         )
-        figures.append(SvgFigure(f"sensitivity-{name}", moved, caption, drawn(name, run)))
+        figures.append(SvgFigure(f"sensitivity-{name}", moved, caption, figure_svg(name, run)))
     rows: list[tuple[Cell, ...]] = []
     for entry in (row.to_dict() for row in run.table):
         what = "station" if entry["what"] == "station" else f"{entry['what']} points".replace("_", " ")

@@ -31,7 +31,7 @@ from twin.run.svg import (
 )
 
 
-def drift_drawn(run: CalibrationRun, found: Monitoring) -> str:
+def drift_svg(run: CalibrationRun, found: Monitoring) -> str:
     """The figure as SVG."""
     with look("calibration-monitor-heights"):
         return to_svg(_figure(run, found))
@@ -56,8 +56,10 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
     fine = np.linspace(0.0, size[-1], 101)
     left.plot(fine * angle, expected_height(run, found, fine), "--", color=GREY, lw=1.0, label="mean of many campaigns")
     cases = {"without monitor": (VERMILION, "o"), "with monitor": (BLUE, "s")}
-    told = [s.told for s in found.sizes if s.told is not None]
-    for (label, (colour, marker)), rows in zip(cases.items(), ([s.without for s in found.sizes], told), strict=True):
+    monitored = [s.monitored for s in found.sizes if s.monitored is not None]
+    for (label, (colour, marker)), rows in zip(
+        cases.items(), ([s.without for s in found.sizes], monitored), strict=True
+    ):
         if rows:
             height = [row.together.height for row in rows]
             left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
@@ -69,8 +71,8 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
         ("no drift", GREY, list(found.at(0.0).without.schemes.values())),
         ("without monitor", VERMILION, list(here.without.schemes.values())),
     ]
-    if here.told is not None:
-        bars.append(("with monitor", BLUE, list(here.told.schemes.values())))
+    if here.monitored is not None:
+        bars.append(("with monitor", BLUE, list(here.monitored.schemes.values())))
     place, width = np.arange(len(names)), 0.8 / len(bars)
     for k, (label, colour, values) in enumerate(bars):
         at = place + (k - 0.5 * (len(bars) - 1)) * width
@@ -94,7 +96,7 @@ COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GREY)
 MARKERS = "osD^vP"
 
 
-def drawn(name: str, run: CalibrationRun) -> str:
+def figure_svg(name: str, run: CalibrationRun) -> str:
     """One figure of `FIGURES` as SVG."""
     with look(f"calibration-{name}"):
         return to_svg(FIGURES[name](run))
@@ -118,9 +120,9 @@ def schemes_figure(run: CalibrationRun) -> Figure:
         before = values_of(run.before, what)
         low, high = before.min(), before.max()
         axes.set_ylim(0.0, 1.35 * table.max())
-        said = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
+        label = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
         axes.set(title=f"RMS in {title}, m", xticks=place, xlabel="scheme")
-        axes.text(0.5, 0.97, said, transform=axes.transAxes, ha="center", va="top", color=GREY, fontsize=8.5)
+        axes.text(0.5, 0.97, label, transform=axes.transAxes, ha="center", va="top", color=GREY, fontsize=8.5)
         if limit < 1.35 * table.max():
             axes.axhline(limit, color=GREY, lw=0.9, ls="--")
         axes.set_xticklabels(labels)

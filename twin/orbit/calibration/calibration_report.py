@@ -51,8 +51,8 @@ def _summary(run: CalibrationRun) -> Table:
     for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
         plan, height = (values_of(errors, what) for what in ("plan_rms", "height_rms"))
         numbers = (plan.mean(), plan.std(), plan.max(), height.mean(), height.std(), height.max())
-        said_so = "yes" if meets(errors, limits.plan, limits.height) else "no"
-        rows.append((name, *(float(v) for v in numbers), said_so))
+        meets_limits = "yes" if meets(errors, limits.plan, limits.height) else "no"
+        rows.append((name, *(float(v) for v in numbers), meets_limits))
     return Table(
         "schemes",
         "Schemes of parameters, tested on all fields without ground control",
@@ -106,9 +106,9 @@ def _light(setup: CalibrationSetup) -> str:
 
 
 def _warnings(run: CalibrationRun) -> tuple[str, ...]:
-    found, spec, said = run.together, run.campaign.spec, []
+    found, spec, assumptions = run.together, run.campaign.spec, []
     if spec.errors.switched_on and found.p_value < 1e-3:
-        said.append(
+        assumptions.append(
             f"the adjustment does not fit: a chi-square as large has a chance of {found.p_value:.1g}; biases may "
             f"drift during a pass{', and the cameras drift from field to field' * bool(spec.drift)}"
         )
@@ -119,11 +119,13 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
             scale, shown = 1.0, "m"
         others = len(run.surprises) - 1
         more = f", and {others} other{'s' * (others > 1)} beyond {SURPRISE:g}" if others else ""
-        said.append(
+        assumptions.append(
             f"{first.name} has changed by {first.change / scale:.3g} {shown}, {first.ratio:.1f} times what is "
             f"expected (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
             "the times, for the fit need not show such an error"
         )
     if any_effect(run.campaign.effects) and not spec.effects.corrected:
-        said.append("light time, aberration and refraction are left in the image points and go into the parameters")
-    return tuple(said)
+        assumptions.append(
+            "light time, aberration and refraction are left in the image points and go into the parameters"
+        )
+    return tuple(assumptions)

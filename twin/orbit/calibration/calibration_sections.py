@@ -12,7 +12,7 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import unit
-from twin.orbit.calibration.calibration_plots import drawn, drift_drawn
+from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
 from twin.orbit.calibration.field_sections import (
@@ -39,9 +39,9 @@ def monitor_gain(found: Monitoring) -> str:
         f"With cameras that drift by {found.angle / ARCSEC:.2g}″ (d_alpha, 1σ) from field to field, heights without "
         f"ground control (scheme {scheme}) are wrong by {blind:.2f} m RMS, {still:.2f} m without drift"
     )
-    if here.told is None:
+    if here.monitored is None:
         return f"{text}."
-    return f"{text}; with the on-board monitor's readings, {here.told.schemes[scheme].height:.2f} m."
+    return f"{text}; with the on-board monitor's readings, {here.monitored.schemes[scheme].height:.2f} m."
 
 
 def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
@@ -75,7 +75,7 @@ def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
             "Height errors and the drift of the cameras",
             "Left: one campaign, its drift drawn once and scaled; the dashed line is what many campaigns would have "
             "on average. Right: RMS over all fields.",
-            drift_drawn(run, found),
+            drift_svg(run, found),
         ),
         _by_size(found),
         _by_scheme(found),
@@ -86,7 +86,7 @@ def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
 def _by_size(found: Monitoring) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for size in found.sizes:
-        rows.append((size.factor, size.factor * found.angle / ARCSEC, *_cells(size.without), *_cells(size.told)))
+        rows.append((size.factor, size.factor * found.angle / ARCSEC, *_cells(size.without), *_cells(size.monitored)))
     return Table(
         "monitor-sizes",
         "All fields adjusted at once",
@@ -103,16 +103,16 @@ def _by_scheme(found: Monitoring) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for scheme, still in none.schemes.items():
         blind = here.without.schemes[scheme]
-        told = None if here.told is None else here.told.schemes[scheme]
+        monitored = None if here.monitored is None else here.monitored.schemes[scheme]
         rows.append(
             (
                 scheme,
                 still.plan,
                 blind.plan,
-                None if told is None else told.plan,
+                None if monitored is None else monitored.plan,
                 still.height,
                 blind.height,
-                None if told is None else told.height,
+                None if monitored is None else monitored.height,
             )
         )
     return Table(
@@ -262,13 +262,13 @@ def _schemes(run: CalibrationRun) -> Section:
         f"{'meets them, too' if meets(run.before, limits.plan, limits.height) else 'does not meet them'}.",
     )
     figures = (
-        SvgFigure("schemes-of-fields", "Schemes", "Each line is a field.", drawn("schemes-of-fields", run)),
+        SvgFigure("schemes-of-fields", "Schemes", "Each line is a field.", figure_svg("schemes-of-fields", run)),
         SvgFigure(
             "check-points",
             f"Errors at check points of {run.campaign.passes[0].name}",
             "Arrows in plan, colour in height: before calibration and with the field's own parameters. The scales "
             "differ.",
-            drawn("check-points", run),
+            figure_svg("check-points", run),
         ),
     )
     return Section("Schemes of averaged parameters", text, (figures[0], *tables, figures[1]))
@@ -384,7 +384,7 @@ def _parameters(run: CalibrationRun) -> Section:
         "residuals",
         f"Residuals of the control points in the images, {one}",
         "RMS of x and y in each line's title. What is left is noise of the image and of the attitude.",
-        drawn("residuals", run),
+        figure_svg("residuals", run),
     )
     return Section("Parameters", tuple(text), (*tables, figure))
 
@@ -420,7 +420,7 @@ def _rank(run: CalibrationRun) -> Section:
         "Correlations",
         "Of the simultaneous adjustment, held unknowns left out. Yaw of all fields goes with y of the outer lines; "
         "roll and pitch of a field go with the offset of its orbit.",
-        drawn("correlation-matrix", run),
+        figure_svg("correlation-matrix", run),
     )
     return Section("What cannot be told apart", tuple(text), (table, figure))
 

@@ -74,12 +74,12 @@ class DriftSize:
     Attributes:
         factor: against the file's.
         without: adjusted as if nothing drifted.
-        told: with the monitor's readings; None without a monitor.
+        monitored: with the monitor's readings; None without a monitor.
     """
 
     factor: float
     without: Treatment
-    told: Treatment | None
+    monitored: Treatment | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +119,8 @@ def monitored(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Ad
     metres = 0.0
     for k, factor in enumerate(FACTORS):
         campaign = flown(setup, factor, seed)
-        told = with_monitor(campaign) if setup.test.monitor is not None else None
-        sizes.append(DriftSize(factor, without_monitor(campaign), told))
+        treatment = with_monitor(campaign) if setup.test.monitor is not None else None
+        sizes.append(DriftSize(factor, without_monitor(campaign), treatment))
         if factor == 0.0:
             metres = height_per_arcsec(campaign)
         advance("drift", k + 1, len(FACTORS))
@@ -157,9 +157,9 @@ def without_monitor(campaign: Campaign) -> Treatment:
 
 def with_monitor(campaign: Campaign) -> Treatment:
     """With the monitor's readings: as observations where a field is calibrated, and as they are where it is tested."""
-    found = all_told(campaign)
+    found = adjust_with_readings(campaign)
     errors = [tested(campaign, p, found.cameras_of(p.name), found.bias(p.name)) for p in campaign.passes]
-    alone = {p.name: told_alone(campaign, p) for p in campaign.passes}
+    alone = {p.name: adjust_field_with_readings(campaign, p) for p in campaign.passes}
     schemes = {}
     for k, names in enumerate(campaign.spec.schemes):
         schemes[str(k + 1)] = PooledErrors.of(_scheme(campaign, alone, names, p) for p in campaign.passes)
@@ -168,19 +168,21 @@ def with_monitor(campaign: Campaign) -> Treatment:
     return Treatment(PooledErrors.of(errors), found.p_value, FrozenMap(schemes))
 
 
-def all_told(campaign: Campaign) -> Adjustment:
+def adjust_with_readings(campaign: Campaign) -> Adjustment:
     """All fields at once, with the drift of every camera in every field as unknowns that the readings tell."""
-    return simultaneous(campaign, tuple(p for one in campaign.passes for p in _told(campaign, one)), drift=True)
+    return simultaneous(
+        campaign, tuple(p for one in campaign.passes for p in _reading_priors(campaign, one)), drift=True
+    )
 
 
-def told_alone(campaign: Campaign, one: FieldPass) -> Adjustment:
+def adjust_field_with_readings(campaign: Campaign, one: FieldPass) -> Adjustment:
     """A field by itself with its readings; the interior orientation is that of the cameras without their drift."""
     return adjust(
         [one.control],
         campaign.laboratory,
         campaign.noise,
         unknowns=Unknowns(drift="field"),
-        priors=_told(campaign, one),
+        priors=_reading_priors(campaign, one),
         gauge=GAUGE,
     )
 
@@ -197,7 +199,7 @@ def height_per_arcsec(campaign: Campaign) -> float:
     return float(np.nanmean(check_errors(ground[1], ground[0]).error[:, 2]))
 
 
-def _told(campaign: Campaign, one: FieldPass) -> list[Prior]:
+def _reading_priors(campaign: Campaign, one: FieldPass) -> list[Prior]:
     sigma = reading_sigma(campaign.spec)
     return [p for line in LINES for p in monitor_priors(one.name, line, one.readings[line], sigma)]
 

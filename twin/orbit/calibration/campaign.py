@@ -43,7 +43,7 @@ _DRIFT, _READING = 6, 7
 """Streams of a field's seed. What else is drawn of a field does not change with them."""
 
 
-def drawn_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
+def sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
 
     The draws of a line are the same whatever their sigmas are.
@@ -59,7 +59,7 @@ def drawn_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> Fro
     return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
 
-def drawn_readings(
+def sample_readings(
     spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
@@ -274,8 +274,8 @@ def _pass(
     imager: Imager | None,
 ) -> tuple[FieldPass, FieldImages | None]:
     """Fly and measure; rays are made later, when the effects on the light are taken out."""
-    pictures, drift = stream(seed, _PICTURES), drawn_drift(spec, seed)
-    readings = drawn_readings(spec, drift, seed)
+    pictures, drift = stream(seed, _PICTURES), sample_drift(spec, seed)
+    readings = sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth)
@@ -293,24 +293,26 @@ def _pass(
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _drawn(field, spec, spec.points, sensors, pass_data, (place, image, ground))
+        points = _simulated_points(field, spec, spec.points, sensors, pass_data, (place, image, ground))
     else:
         points, images = imager.measured(field, sensors, pass_data, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
     if spec.strip is not None and spec.points is not None:
-        drawn = spec.points.model_copy(update={"control": 0, "check": spec.strip.ties, "length": spec.strip.length})
+        tie_points = spec.points.model_copy(
+            update={"control": 0, "check": spec.strip.ties, "length": spec.strip.length}
+        )
         own = stream(seed, _TIES)
         a, b, c = (np.random.default_rng(s) for s in own.spawn(3))
         try:
-            ties = _drawn(field, spec, drawn, sensors, pass_data, (a, b, c)).check_images
+            ties = _simulated_points(field, spec, tie_points, sensors, pass_data, (a, b, c)).check_images
         except BenchError as error:
             remedy = "a shorter strip, or a longer pass (`span`)"
             raise BenchError(f"tie points: {error}", ("strip", "length"), remedy) from error
-    drawn_errors = measured.errors
-    assert drawn_errors is not None
+    attitude_errors = measured.errors
+    assert attitude_errors is not None
     middle = float(earth.geodetic(trajectory.position(0.0))[1])
-    shape = np.sin(middle - drawn_errors.reference)
-    found = rotation_matrix(drawn_errors.bias + shape * drawn_errors.thermal).T
+    shape = np.sin(middle - attitude_errors.reference)
+    found = rotation_matrix(attitude_errors.bias + shape * attitude_errors.thermal).T
     given = points.control_ground
     one = FieldPass(
         name,
@@ -324,7 +326,7 @@ def _pass(
         points.check_ground,
         points.sigma,
         Rotation.from_matrix(found).as_euler("XYZ"),
-        -drawn_errors.position(np.array(0.0)),
+        -attitude_errors.position(np.array(0.0)),
         trajectory,
         measured,
         drift,
@@ -334,7 +336,7 @@ def _pass(
     return (one.shifted(errors.datum) if errors.switched_on and any(errors.datum) else one), images
 
 
-def _drawn(
+def _simulated_points(
     field: FieldSpec,
     spec: OrbitCalibrationSpec,
     wanted: PointsSpec,
@@ -351,9 +353,9 @@ def _drawn(
     for k, (line, pixel) in seen.items():
         # sigma is that of x and y in the focal plane
         unit = np.array([1.0 / data.pixels_per_line(k), 1.0])
-        drawn = sigma * unit * image.standard_normal((len(line), 2))
+        noise = sigma * unit * image.standard_normal((len(line), 2))
         spread = np.diag((max(sigma, _LEAST_IMAGE) * unit) ** 2)
-        images[k] = ImagePoints.of(np.arange(len(line)), line + drawn[:, 0], pixel + drawn[:, 1], spread)
+        images[k] = ImagePoints.of(np.arange(len(line)), line + noise[:, 0], pixel + noise[:, 1], spread)
     count = wanted.control
     given = points[:count] + control * ground.standard_normal((count, 3))
     control_images = {k: row.taken(np.arange(count)) for k, row in images.items()}

@@ -9,7 +9,7 @@ from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.calibration_plots import drawn
+from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import BEYOND, FieldImages
@@ -17,7 +17,7 @@ from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.influences import INNER, SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
 from twin.orbit.images.point_judgement import WRONG
-from twin.orbit.images.point_report import drawn_points
+from twin.orbit.images.point_report import points_png
 from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
 from twin.run.report import Section
 
@@ -86,7 +86,7 @@ def biases_section(run: CalibrationRun) -> Section:
         "Bias of the attitude against latitude",
         "From the adjustment of all fields, which knows of the orbit's offsets. The error bars of yaw are common to "
         "all fields (y of the outer lines); its differences are known far better.",
-        drawn("bias-latitude", run),
+        figure_svg("bias-latitude", run),
     )
     if not run.latitude:
         few = "There are too few fields, or all at one latitude, to tell a drift with latitude from the season."
@@ -226,7 +226,7 @@ def images_section(campaign: Campaign) -> Section:
             f"From predicted to found, {_SORTS[sort]} points, first patch of {first.name}",
             "Arrows: what is left after the median displacement, enlarged as the title says; crosses: rejected by the "
             "neighbours; points: not matched.",
-            drawn_points(first.shown, points),
+            points_png(first.shown, points),
         )
         for sort, points in first.patches[0].points.sorts.items()
     ]
@@ -276,8 +276,8 @@ def light_section(run: CalibrationRun) -> Section:
             moved = [float(v / pitch[line]) for line in LINES for v in row.moved[line]]
             sizes.append((name, *moved))
         inner, turned = row.most(INNER), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
-        said = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
-        rows.append((f"{name} left in" if row.left else name, *row.before, *row.after, *said, row.p_value))
+        shifts = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
+        rows.append((f"{name} left in" if row.left else name, *row.before, *row.after, *shifts, row.p_value))
     pixels = Table(
         "light-pixels",
         "How far image points move",

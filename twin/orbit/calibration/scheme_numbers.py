@@ -140,7 +140,7 @@ class MonitoringNumbers:
                 size.factor,
                 size.factor * found.angle,
                 TreatmentNumbers.of(size.without),
-                None if size.told is None else TreatmentNumbers.of(size.told),
+                None if size.monitored is None else TreatmentNumbers.of(size.monitored),
             )
             for size in found.sizes
         )

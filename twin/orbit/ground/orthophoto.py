@@ -134,8 +134,8 @@ def _plan_error(extent: Extent, spec: ControlSpec, seed: np.random.SeedSequence)
     east, north = extent.grown(_MARGIN).axes(spacing, 3)
     grids = []
     for k in range(2):
-        drawn = spec.sigma * correlated_field((len(north), len(east)), spacing, spec.correlation, stream(seed, k))
-        coefficients = spline_filter(drawn.astype(np.float64), order=3, mode="mirror")
+        error = spec.sigma * correlated_field((len(north), len(east)), spacing, spec.correlation, stream(seed, k))
+        coefficients = spline_filter(error.astype(np.float64), order=3, mode="mirror")
         grids.append(SplineGrid(coefficients, (spacing, spacing), (float(east[0]), float(north[0])), "mirror"))
     return grids[0], grids[1]
 

@@ -81,8 +81,8 @@ class Terrain:
         count = 64
         while count * spec.post < 1.5 * side and count < _MOST_POSTS:
             count *= 2
-        drawn = fractal_field((count, count), spec.post, spec.exponent, spec.longest, seed).astype(np.float64)
-        posts = spec.height + (spec.relief or 0.0) * drawn
+        relative = fractal_field((count, count), spec.post, spec.exponent, spec.longest, seed).astype(np.float64)
+        posts = spec.height + (spec.relief or 0.0) * relative
         corner = -0.5 * count * spec.post
         coefficients = spline_filter(posts, order=3, mode="grid-wrap")
         return cls(SplineGrid(coefficients, (spec.post, spec.post), (corner, corner), "grid-wrap"))

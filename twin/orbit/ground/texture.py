@@ -95,12 +95,12 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
     longest = max(0.5 * extent.side, 2.0 * spec.field_size)
     relative = fractal_field(shape, spec.spacing, _EXPONENT, _WILD * spec.field_size, wild)
     if spec.fields > 0.0:
-        drawn, covered = _fields(extent, spec, shape, (east[0], north[0]), plots, changed)
+        fields, covered = _fields(extent, spec, shape, (east[0], north[0]), plots, changed)
         where = fractal_field(shape, spec.spacing, 2.0, longest, mask)
         covered &= where < np.quantile(where[::16, ::16], spec.fields)
         del where
         # a field is even, with a little of the soil's own pattern
-        relative[covered] = 0.97 * drawn[covered] + 0.25 * relative[covered]
+        relative[covered] = 0.97 * fields[covered] + 0.25 * relative[covered]
     level = spec.mean * (1.0 + spec.contrast * relative)
     _draw_roads(level, extent, spec, (east[0], north[0]), ways)
     np.clip(level, _DARKEST, _BRIGHTEST, out=level)
@@ -146,7 +146,7 @@ def _fields(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fields' brightness, of zero mean and unit rms, and where there are any."""
     random = np.random.default_rng(seed)
-    drawn, covered = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    fields, covered = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     block = _BLOCK * spec.field_size
     columns, rows = (int(np.ceil(d / block)) + 1 for d in (extent.east - extent.west, extent.north - extent.south))
     for k in range(rows * columns):
@@ -160,9 +160,9 @@ def _fields(
             place = (corners @ axes.T + middle - first) / spec.spacing
             points = np.rint(place * 2**_SHIFT_BITS).astype(np.int32)
             value = float(np.clip(new if change < changed else old, -2.5, 2.5))
-            cv2.fillConvexPoly(drawn, points, value, shift=_SHIFT_BITS)
+            cv2.fillConvexPoly(fields, points, value, shift=_SHIFT_BITS)
             cv2.fillConvexPoly(covered, points, 1, shift=_SHIFT_BITS)
-    return drawn, covered.astype(bool)
+    return fields, covered.astype(bool)
 
 
 def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tuple[float, float, float, float]]:

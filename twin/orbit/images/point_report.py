@@ -127,7 +127,7 @@ def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> 
             f"From predicted to found, {_NAMES[sort]} points",
             "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
             "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
-            drawn_points(patch, one),
+            points_png(patch, one),
         )
         for sort, one in points.sorts.items()
     ]
@@ -207,7 +207,7 @@ def _floats(pair: np.ndarray) -> tuple[float, float]:
     return float(pair[0]), float(pair[1])
 
 
-def drawn_points(patch: Patch, points: MatchedPoints) -> bytes:
+def points_png(patch: Patch, points: MatchedPoints) -> bytes:
     """PNG: every line's frame with its points and their displacements."""
     with look(f"points-{points.kind}"):
         names = [n for n in points.lines if n != points.source]

@@ -379,11 +379,11 @@ def _causes(
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
     states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
     truth, _ = _changes(experiment, states, 0)
-    said = monitor.clean(states)
+    estimates = monitor.clean(states)
     out = []
     for k, (what, path) in enumerate(named):
         true = {n: truth[n][2 * k + 1] - truth[n][2 * k] for n in pair}
-        error = {n: said[n].vector[2 * k + 1] - said[n].vector[2 * k] - true[n] for n in pair}
+        error = {n: estimates[n].vector[2 * k + 1] - estimates[n].vector[2 * k] - true[n] for n in pair}
         out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
     return tuple(out)
 
@@ -466,8 +466,8 @@ def _view(
     exact, noisy = [], []
     for sensor, (row, column) in zip(sensors, seen, strict=True):
         exact.append(_sightings(sensor, true, row[good], column[good]))
-        drawn = noise * image.standard_normal((2, len(good)))
-        noisy.append(_sightings(sensor, measured, row[good] + drawn[0], column[good] + drawn[1]))
+        offsets = noise * image.standard_normal((2, len(good)))
+        noisy.append(_sightings(sensor, measured, row[good] + offsets[0], column[good] + offsets[1]))
     return View(points[good], (exact[0], exact[1]), (noisy[0], noisy[1]))
 
 

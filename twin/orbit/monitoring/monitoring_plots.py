@@ -51,13 +51,13 @@ def angle_figure(run: MonitorRun) -> Figure:
     minutes = run.flight.times / 60.0
     figure = new_figure(4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
-    true, said = run.angle_change / ARCSEC, run.angle / ARCSEC
+    true, monitored = run.angle_change / ARCSEC, run.angle / ARCSEC
     above.plot(minutes, true, color=INK, lw=1.3, label="true, traced")
-    above.plot(minutes, said, "o", color=BLUE, ms=4, label="monitored")
+    above.plot(minutes, monitored, "o", color=BLUE, ms=4, label="monitored")
     above.set_ylabel("change of the angle, arcsec")
     above.legend(loc="best")
     below.axhline(0.0, color=GREY, lw=0.7)
-    below.plot(minutes, said - true, "o-", color=VERMILION, ms=3, lw=1.0)
+    below.plot(minutes, monitored - true, "o-", color=VERMILION, ms=3, lw=1.0)
     below.set(ylabel="monitored − true,\narcsec", xlabel="time, min")
     _finish(above, below)
     return figure
@@ -135,7 +135,7 @@ FIGURES: dict[str, Callable[[MonitorRun], Figure]] = {
 }
 
 
-def drawn(name: str, run: MonitorRun) -> str:
+def figure_svg(name: str, run: MonitorRun) -> str:
     """One of `FIGURES` as SVG."""
     with look(f"monitor-{name}"):
         return to_svg(FIGURES[name](run))

@@ -11,7 +11,7 @@ from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit_monitor import PARAMETERS
 from twin.orbit.monitoring.monitoring_numbers import cause_heights
-from twin.orbit.monitoring.monitoring_plots import PART_NAMES, drawn
+from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.report import Report, Section
@@ -33,7 +33,7 @@ def _angle(run: MonitorRun) -> Section:
         f"{moment(run.flight.spec.reference)}, when the cameras were calibrated and the monitor took its reference.",
     )
     figure = SvgFigure(
-        "angle", "Intersection angle over the orbit", "Model estimator, all frames.", drawn("angle", run)
+        "angle", "Intersection angle over the orbit", "Model estimator, all frames.", figure_svg("angle", run)
     )
     return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.flight.pair)))
 
@@ -41,8 +41,8 @@ def _angle(run: MonitorRun) -> Section:
 def _changes(run: MonitorRun, name: str) -> Table:
     flight = run.flight
     rows: list[tuple[Cell, ...]] = []
-    for time, true, said in zip(flight.times, flight.truth[name], flight.monitored[name].vector, strict=True):
-        both = zip(true * PER_SI, said * PER_SI, strict=True)
+    for time, true, monitored in zip(flight.times, flight.truth[name], flight.monitored[name].vector, strict=True):
+        both = zip(true * PER_SI, monitored * PER_SI, strict=True)
         rows.append((float(time / 60.0), *(float(v) + 0.0 for pair in both for v in pair)))
     heads = ["time, min"]
     for key in PARAMETERS:
@@ -67,7 +67,7 @@ def _height(run: MonitorRun) -> Section:
         "evenly forward and back.",
     )
     caption = "Above: mean over the points. Below: all errors, with the points' noise."
-    figure = SvgFigure("height", "Height errors over the orbit", caption, drawn("height", run))
+    figure = SvgFigure("height", "Height errors over the orbit", caption, figure_svg("height", run))
     return Section("Heights with and without monitoring", text, (figure,))
 
 
@@ -91,7 +91,7 @@ def _interval(run: MonitorRun) -> Section:
         rows,
         (1, None, 3, 3, 3, 3),
     )
-    figure = SvgFigure("interval", "RMS in height against the interval", "Over all times.", drawn("interval", run))
+    figure = SvgFigure("interval", "RMS in height against the interval", "Over all times.", figure_svg("interval", run))
     return Section("How often to measure", (), (figure, table))
 
 
@@ -132,7 +132,7 @@ def _rest(run: MonitorRun) -> Section:
         *_worse(run),
     )
     caption = "Mean over the points; parts below 5 mm are left out."
-    figure = SvgFigure("remainder", "What the correction leaves", caption, drawn("remainder", run))
+    figure = SvgFigure("remainder", "What the correction leaves", caption, figure_svg("remainder", run))
     return Section("Where the rest comes from", text, (figure, parts, table))
 
 
@@ -153,12 +153,12 @@ def _worse(run: MonitorRun) -> tuple[str, ...]:
 
 
 def _conversion(run: MonitorRun) -> Section:
-    told, flight = run.conversion, run.flight
+    conversion, flight = run.conversion, run.flight
     rows: list[tuple[Cell, ...]] = []
     at = flight.spec.referred
     for name in flight.pair:
         slopes = [float(v) for v in run.slopes[name][at] / PER_SI]
-        rows.append((name, told.traced[name], told.theory[name], *slopes))
+        rows.append((name, conversion.traced[name], conversion.theory[name], *slopes))
     table = Table(
         "conversion",
         "Metres of height",
@@ -171,12 +171,12 @@ def _conversion(run: MonitorRun) -> Section:
     predicted = -sum(run.slopes[n][:, 0] * flight.truth[n][:, 0] for n in flight.pair)
     none = run.cases["none"].camera
     size = rms(none) or 1.0
-    by_angle = -told.of_angle * run.angle_change / ARCSEC
+    by_angle = -conversion.of_angle * run.angle_change / ARCSEC
     text = (
-        f"Base to height is {told.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
-        f"{abs(told.of_angle):.2f} m; it is more by the camera that looks farther aside, so that the angle alone gives "
-        f"the height without monitoring to {100.0 * rms(none - by_angle) / size:.1f}% of its RMS, and the d_alpha of "
-        f"both cameras to {100.0 * rms(none - predicted) / size:.1f}%.",
+        f"Base to height is {conversion.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
+        f"{abs(conversion.of_angle):.2f} m; it is more by the camera that looks farther aside, so that the angle alone "
+        f"gives the height without monitoring to {100.0 * rms(none - by_angle) / size:.1f}% of its RMS, and the "
+        f"d_alpha of both cameras to {100.0 * rms(none - predicted) / size:.1f}%.",
     )
     return Section("From arcseconds to metres", text, (table,))
 

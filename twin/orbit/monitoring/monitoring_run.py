@@ -195,18 +195,18 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
 def analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRun:
     """All cases of a flight."""
     count, spec = len(flight.times), flight.spec
-    said = {n: flight.monitored[n].vector * _mask(flight) for n in flight.pair}
+    monitored = {n: flight.monitored[n].vector * _mask(flight) for n in flight.pair}
     changes = {
         "none": {n: np.zeros((count, 4)) for n in flight.pair},
-        "monitored": said,
-        "interval": _interpolated(flight, said, spec.interval),
+        "monitored": monitored,
+        "interval": _interpolated(flight, monitored, spec.interval),
         "parameters": dict(flight.truth),
     }
     true = _intersected(flight, [_true_pair(flight, k) for k in range(count)])
     cases = {name: _errors(_intersected(flight, _corrected(flight, each)), true) for name, each in changes.items()}
     cases["true"] = _errors(true, true)
     intervals = {
-        interval: _errors(_intersected(flight, _corrected(flight, _interpolated(flight, said, interval))), true)
+        interval: _errors(_intersected(flight, _corrected(flight, _interpolated(flight, monitored, interval))), true)
         for interval in spec.compared
     }
     slopes = _slopes(flight)
@@ -235,9 +235,9 @@ def _mask(flight: MonitorFlight) -> np.ndarray:
     return np.array([float(name in flight.spec.apply) for name in PARAMETERS])
 
 
-def _interpolated(flight: MonitorFlight, said: Mapping[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
+def _interpolated(flight: MonitorFlight, monitored: Mapping[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
     at = flight.spec.measured(interval)
-    return {n: between(flight.times, flight.times[at], values[at]) for n, values in said.items()}
+    return {n: between(flight.times, flight.times[at], values[at]) for n, values in monitored.items()}
 
 
 def _corrected(flight: MonitorFlight, changes: Mapping[str, np.ndarray]) -> list[list[CalibratedLine]]:
@@ -290,11 +290,15 @@ def _slopes(flight: MonitorFlight) -> dict[str, np.ndarray]:
 
 
 def _propagated(
-    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], name: str, said: CameraParameters, at: int | None = None
+    flight: MonitorFlight,
+    slopes: Mapping[str, np.ndarray],
+    name: str,
+    monitored: CameraParameters,
+    at: int | None = None,
 ) -> np.ndarray:
     """Variance of the mean height by one camera's values, m^2; ``at``: all of them belong to this time."""
     slope = (slopes[name] if at is None else slopes[name][at]) * _mask(flight)
-    return np.asarray(np.einsum("...i,...ij,...j->...", slope, said.covariance, slope))
+    return np.asarray(np.einsum("...i,...ij,...j->...", slope, monitored.covariance, slope))
 
 
 def _parts(
@@ -351,10 +355,10 @@ def _conversion(flight: MonitorFlight) -> Conversion:
 def _scatter(flight: MonitorFlight, slopes: Mapping[str, np.ndarray]) -> Scatter:
     """Exact image points, so that the monitor's noise is all there is."""
     k, mask = flight.worst, _mask(flight)
-    said = {n: flight.repeated[n].vector * mask for n in flight.pair}
+    monitored = {n: flight.repeated[n].vector * mask for n in flight.pair}
     heights = []
     for row in range(flight.spec.repeats):
-        pair = [flight.calibrated[n].corrected(said[n][row]) for n in flight.pair]
+        pair = [flight.calibrated[n].corrected(monitored[n][row]) for n in flight.pair]
         heights.append(_found(flight, pair, k, exact_data=True)[:, 2].mean())
     variance = sum(_propagated(flight, slopes, n, flight.repeated[n], k) for n in flight.pair)
     return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))

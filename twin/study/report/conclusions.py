@@ -6,7 +6,7 @@ from collections import Counter
 
 from scenes.specs.study import GRID, SAMPLERS
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
-from twin.study.report.study_analysis import GOALS, Course, StudyAnalysis
+from twin.study.report.study_analysis import GOALS, Convergence, StudyAnalysis
 from twin.study.report.study_runs import Response, typeset
 from twin.study.report.study_statistics import LEAST
 from twin.study.report.study_wording import listed, number, percent, plural, span, with_unit
@@ -37,7 +37,7 @@ def warnings(found: StudyAnalysis) -> list[str]:
         missing = int((~r.good & ~runs.failed).sum())
         if missing:
             out.append(f"{r.name} has no finite number in {plural(missing, 'run')} that did not fail.")
-    if runs.drawn and failed < runs.count < LEAST:
+    if runs.sampled and failed < runs.count < LEAST:
         out.append(
             f"{plural(runs.count, 'run')} are few: distributions, upper quantiles and sensitivity indices cannot be "
             f"told from fewer than {LEAST}, and intervals are wide."
@@ -47,7 +47,7 @@ def warnings(found: StudyAnalysis) -> list[str]:
 
 def indices_texts(found: StudyAnalysis) -> list[str]:
     """How the indices were found, and how good that is."""
-    if found.runs.drawn:
+    if found.runs.sampled:
         out = [
             f"From the given runs ({design_title(found.runs.kind)}; not a design made for the indices): polynomial "
             f"chaos, whose squared coefficients are the parts of the variance; intervals from {RESAMPLES} resamples by "
@@ -94,10 +94,10 @@ def convergence_texts(found: StudyAnalysis, names: list[str]) -> list[str]:
             "The intervals are those of independent runs; this design is spread more evenly, and knows the mean better."
         )
     for name in names:
-        courses = found.courses[name]
-        good = [c.name for c in courses if c.enough]
-        bad = [f"{c.name}{_needed(c)}" for c in courses if not c.enough]
-        n = int(courses[0].counts[-1])
+        convergences = found.convergences[name]
+        good = [c.name for c in convergences if c.enough]
+        bad = [f"{c.name}{_needed(c)}" for c in convergences if not c.enough]
+        n = int(convergences[0].counts[-1])
         if not bad:
             out.append(f"{name}: {n} runs are enough for {listed(good)}.")
         else:
@@ -106,11 +106,11 @@ def convergence_texts(found: StudyAnalysis, names: list[str]) -> list[str]:
     return out
 
 
-def _needed(course: Course) -> str:
-    if course.needed is None:
+def _needed(convergence: Convergence) -> str:
+    if convergence.needed is None:
         return ""
-    how = "about" if course.relative is not None else "at least"
-    return f" ({how} {_round_up(course.needed)} runs)"
+    how = "about" if convergence.relative is not None else "at least"
+    return f" ({how} {_round_up(convergence.needed)} runs)"
 
 
 def _round_up(count: int) -> int:
@@ -131,7 +131,7 @@ def conclusions(found: StudyAnalysis) -> list[str]:
     out += [_knee(found, k) for k in range(len(found.fronts))]
     out += [_contributors(found, response) for response in found.runs.responses]
     # a stated sigma is a response of its own where it is all a grid is about; among drawn runs it hardly changes
-    if not found.runs.drawn:
+    if not found.runs.sampled:
         out += [_contributors(found, sigma) for sigma in found.runs.sigmas]
     return [text for text in out if text]
 
@@ -160,7 +160,7 @@ def _contributors(found: StudyAnalysis, response: Response) -> str:
     assert about.std is not None
     mean = with_unit(about.mean.value, response.unit)
     std = with_unit(about.std.value, response.unit)
-    where = "" if found.runs.drawn else " over the grid"
+    where = "" if found.runs.sampled else " over the grid"
     text = f"{name}: mean {mean}, standard deviation {std}{where}."
     indices = found.indices.get(name)
     if isinstance(indices, Indices):

@@ -42,7 +42,7 @@ def tornado_figure(found: StudyAnalysis) -> Figure:
     rows = [min(len(found.effects[r.name]) or _effects(found, r.name), MOST_BARS) for r in things]
     figure, grid = _columns(rows)
     for axes, response in zip(grid, things, strict=True):
-        if found.runs.drawn:
+        if found.runs.sampled:
             _swings(axes, found, response)
         else:
             _main_effects(axes, found, response)

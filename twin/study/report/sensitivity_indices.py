@@ -227,7 +227,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     if not axes:
         return NoIndices("no factor varies")
     noise = _noise(response)
-    if not runs.drawn:
+    if not runs.sampled:
         if not np.all(response.good):
             return NoIndices("runs of the grid are missing, and its variance cannot be taken apart")
         return Indices("grid", _of_grid(axes, response.values), 0, 0, None, 0.0, noise)

@@ -153,7 +153,9 @@ def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
         everything &= good
         judged &= response.good
         values = np.abs(response.values) if spec.magnitude else response.values
-        out.append(_counted(runs, name, _text(spec), good, response.good, describe(values, runs.drawn), response.unit))
+        out.append(
+            _counted(runs, name, _text(spec), good, response.good, describe(values, runs.sampled), response.unit)
+        )
     if len(out) > 1:
         out.append(_counted(runs, "", "all of them", everything, judged, None, ""))
     return tuple(out)
@@ -163,7 +165,7 @@ def _counted(
     runs: StudyRuns, name: str, text: str, good: np.ndarray, known: np.ndarray, judged: Description | None, unit: str
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = share_interval(met, count) if runs.drawn and count else None
+    interval = share_interval(met, count) if runs.sampled and count else None
     return Requirement(name, text, met, count, interval, judged, unit)
 
 
@@ -181,7 +183,7 @@ POINTS = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class Convergence:
     """A statistic of the first n runs.
 
     Attributes:
@@ -205,7 +207,7 @@ class Course:
     needed: int | None
 
 
-def courses(values: np.ndarray) -> tuple[Course, ...]:
+def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
     """Of (n,) finite values in the order of the runs; none for fewer than 20 and for constant values."""
     n = len(values)
     if n < 20 or np.ptp(values) == 0.0:
@@ -220,10 +222,10 @@ def courses(values: np.ndarray) -> tuple[Course, ...]:
         rows["sigma"].append((float(np.std(part, ddof=1)), std_interval(part)))
         for name, q in QUANTILES.items():
             rows[name].append((float(np.quantile(ordered, q)), quantile_interval(ordered, q)))
-    return tuple(_course(name, counts, row, sigma) for name, row in rows.items())
+    return tuple(_convergence(name, counts, row, sigma) for name, row in rows.items())
 
 
-def _course(name: str, counts: np.ndarray, row: list[tuple[float, Interval]], sigma: float) -> Course:
+def _convergence(name: str, counts: np.ndarray, row: list[tuple[float, Interval]], sigma: float) -> Convergence:
     low = np.array([math.nan if ends[0] is None else ends[0] for _, ends in row])
     high = np.array([math.nan if ends[1] is None else ends[1] for _, ends in row])
     half = 0.5 * (high[-1] - low[-1]) / sigma
@@ -233,7 +235,7 @@ def _course(name: str, counts: np.ndarray, row: list[tuple[float, Interval]], si
     needed = n if enough else None if relative is None else math.ceil(n * (relative / goal) ** 2)
     if relative is None and name in QUANTILES:
         needed = runs_for_quantile(QUANTILES[name])
-    return Course(name, counts, np.array([value for value, _ in row]), low, high, relative, enough, needed)
+    return Convergence(name, counts, np.array([value for value, _ in row]), low, high, relative, enough, needed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +248,7 @@ class StudyAnalysis:
         linear: None where no model can be fitted.
         effects: main effects of a grid; empty in drawn designs.
         indices: empty when the study does not ask for them.
-        courses: how the statistics settle; empty for grids.
+        convergences: how the statistics settle; empty for grids.
         requirements: in the study's order, then all together.
         fronts: of the pairs that the study asks for and that are numbers.
         not_numbers: pairs that are not.
@@ -257,7 +259,7 @@ class StudyAnalysis:
     linear: Mapping[str, LinearModel | None]
     effects: Mapping[str, tuple[MainEffect, ...]]
     indices: Mapping[str, Indices | NoIndices]
-    courses: Mapping[str, tuple[Course, ...]]
+    convergences: Mapping[str, tuple[Convergence, ...]]
     requirements: tuple[Requirement, ...]
     fronts: tuple[ParetoFront, ...]
     not_numbers: tuple[str, ...]
@@ -277,11 +279,13 @@ class StudyAnalysis:
                 fronts.append(pareto_front(spec, x.values, y.values))
         return cls(
             runs=runs,
-            descriptions={r.name: describe(r.values, runs.drawn) for r in everything},
+            descriptions={r.name: describe(r.values, runs.sampled) for r in everything},
             linear={r.name: linear_model(runs.factors, r) for r in everything},
-            effects={r.name: () if runs.drawn else main_effects(runs.factors, r) for r in everything},
+            effects={r.name: () if runs.sampled else main_effects(runs.factors, r) for r in everything},
             indices={r.name: sensitivity_indices(runs, r) for r in indexed},
-            courses={r.name: courses(r.known) if runs.drawn and not r.constant else () for r in runs.responses},
+            convergences={
+                r.name: convergences(r.known) if runs.sampled and not r.constant else () for r in runs.responses
+            },
             requirements=requirements(runs),
             fronts=tuple(fronts),
             not_numbers=tuple(wrong),
@@ -338,7 +342,7 @@ def plain_data(found: StudyAnalysis) -> dict[str, Any]:
                     for e in found.effects[r.name]
                 ],
                 **({"sobol": _indices(found.indices[r.name])} if r.name in found.indices else {}),
-                "convergence": {c.name: _analysis_course(c) for c in found.courses.get(r.name, ())},
+                "convergence": {c.name: _analysis_convergence(c) for c in found.convergences.get(r.name, ())},
             }
             for r in runs.everything
         },
@@ -430,9 +434,9 @@ def _indices(found: Indices | NoIndices) -> dict[str, Any]:
     }
 
 
-def _analysis_course(course: Course) -> dict[str, Any]:
+def _analysis_convergence(convergence: Convergence) -> dict[str, Any]:
     return {
-        "relative_half_width": course.relative,
-        "enough_runs": course.enough,
-        "runs_needed": course.needed,
+        "relative_half_width": convergence.relative,
+        "enough_runs": convergence.enough,
+        "runs_needed": convergence.needed,
     }

@@ -111,11 +111,11 @@ def histogram_figure(found: StudyAnalysis, names: Sequence[str]) -> Figure:
     things = [r for r in found.runs.responses if r.name in names]
     figure, grid = panels(len(things), min(len(things), 2), 3.0)
     for axes, response in zip(grid, things, strict=True):
-        _histogram(axes, response, found.descriptions[response.name], found.runs.drawn)
+        _histogram(axes, response, found.descriptions[response.name], found.runs.sampled)
     return figure
 
 
-def _histogram(axes: Axes, response: Response, about: Description, drawn: bool) -> None:
+def _histogram(axes: Axes, response: Response, about: Description, sampled: bool) -> None:
     values = response.known
     axes.set(xlabel=response.label, ylabel="runs")
     if response.constant or about.mean is None or about.std is None:
@@ -129,7 +129,7 @@ def _histogram(axes: Axes, response: Response, about: Description, drawn: bool) 
     axes.hist(values, bins=list(edges), color=SKY, edgecolor="white", linewidth=0.4)
     mean, std = about.mean.value, about.std.value
     axes.axvline(mean, color=INK, lw=1.3, label="mean")
-    if drawn:
+    if sampled:
         for k, place in enumerate((mean - 3.0 * std, mean + 3.0 * std)):
             axes.axvline(place, color=VERMILION, lw=1.2, ls="--", label="mean ± 3σ" if k == 0 else None)
         normal = about.normality is None or about.normality.normal
@@ -156,16 +156,18 @@ _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile",
 
 def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
     """Mean, sigma and the upper quantiles of the first n runs, each with its interval."""
-    courses = found.courses[response.name]
-    figure, grid = panels(len(courses), len(courses), 2.8)
-    for axes, course in zip(grid, courses, strict=True):
-        both = np.isfinite(course.low) & np.isfinite(course.high)
-        axes.fill_between(course.counts, course.low, course.high, where=both, color=SKY, alpha=0.4, lw=0)
-        axes.plot(course.counts, course.values, color=BLUE, lw=1.3)
+    convergences = found.convergences[response.name]
+    figure, grid = panels(len(convergences), len(convergences), 2.8)
+    for axes, convergence in zip(grid, convergences, strict=True):
+        both = np.isfinite(convergence.low) & np.isfinite(convergence.high)
+        axes.fill_between(convergence.counts, convergence.low, convergence.high, where=both, color=SKY, alpha=0.4, lw=0)
+        axes.plot(convergence.counts, convergence.values, color=BLUE, lw=1.3)
         axes.set_xscale("log")
-        axes.set(title=f"{_TITLES[course.name]} of {response.name}", xlabel="runs")
+        axes.set(title=f"{_TITLES[convergence.name]} of {response.name}", xlabel="runs")
         if not both.any():
-            axes.text(0.03, 0.04, f"no upper limit below {course.needed} runs", transform=axes.transAxes, fontsize=7.5)
+            axes.text(
+                0.03, 0.04, f"no upper limit below {convergence.needed} runs", transform=axes.transAxes, fontsize=7.5
+            )
         finish(axes, None, 5)
     grid[0].set_ylabel(typeset(response.unit) or response.name)
     return figure
@@ -185,10 +187,10 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
     wide = min(len(factors), 3)
     figure, grid = panels(len(factors), wide, 3.5 if wide < 3 else 3.0)
     for k, (axes, factor) in enumerate(zip(grid, factors, strict=True)):
-        other = _partner(factor, factors) if not found.runs.drawn else None
+        other = _partner(factor, factors) if not found.runs.sampled else None
         if not factor.numeric:
             _bars(axes, factor, other, response)
-        elif found.runs.drawn:
+        elif found.runs.sampled:
             _binned(axes, factor, response)
         else:
             _lines(axes, factor, other, response)
@@ -198,7 +200,7 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
         finish(axes, 5 if factor.numeric else None)
         name_texts(axes, factor, "x")
         # all panels of a drawn design have the same lines
-        if axes.get_legend_handles_labels()[0] and (k == 0 or not found.runs.drawn):
+        if axes.get_legend_handles_labels()[0] and (k == 0 or not found.runs.sampled):
             axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), fontsize=7.5, ncols=3, columnspacing=0.9)
     return figure
 

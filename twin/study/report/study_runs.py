@@ -150,7 +150,7 @@ class StudyRuns:
         return self.study.design.kind
 
     @property
-    def drawn(self) -> bool:
+    def sampled(self) -> bool:
         """Whether the runs are a sample of distributions; those of a grid are not."""
         return self.kind != GRID
 

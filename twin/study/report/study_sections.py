@@ -105,7 +105,7 @@ def response_table(found: StudyAnalysis) -> Table:
         d = found.descriptions[r.name]
         estimates = [with_limits(e) for e in (d.mean, d.std, d.median, d.p95, d.p997)]
         rows.append([r.name, typeset(r.unit), d.count, *estimates, number(d.low), number(d.high)])
-    if found.runs.drawn:
+    if found.runs.sampled:
         how = (
             "In brackets 95% confidence intervals: Student's for the mean, from the kurtosis for the standard "
             "deviation, order statistics for the quantiles; a question mark stands for an end that so few runs cannot "
@@ -151,7 +151,7 @@ def _requirements(found: StudyAnalysis) -> Section | None:
         ]
         for r in found.requirements
     ]
-    how = "The interval is Clopper and Pearson's, 95%." if found.runs.drawn else "A grid is no sample: no interval."
+    how = "The interval is Clopper and Pearson's, 95%." if found.runs.sampled else "A grid is no sample: no interval."
     lost = f" {failed} failed runs are not counted." if failed else ""
     return Section(
         "Requirements",
@@ -175,25 +175,28 @@ def _distributions(found: StudyAnalysis) -> Section | None:
     if not names:
         return None
     texts = [normality_text(r, found.descriptions[r.name]) for r in found.runs.responses if r.name in names]
-    told = tuple(text for text in texts if text is not None)
-    if told:
-        told = (*told, "The test is D'Agostino and Pearson's; a normal distribution fails it in one of 100 studies.")
+    remarks = tuple(text for text in texts if text is not None)
+    if remarks:
+        remarks = (
+            *remarks,
+            "The test is D'Agostino and Pearson's; a normal distribution fails it in one of 100 studies.",
+        )
     caption = "Number of runs by value."
-    if found.runs.drawn:
+    if found.runs.sampled:
         caption += (
             " Dashed: three standard deviations from the mean. Where the distribution is not normal, dotted: what "
         )
         caption += "0.135% and 99.865% of the runs lie below, from 741 runs on."
     figure = _figure("histograms", "Histograms", caption, lambda: histogram_figure(found, names))
-    return Section("Distributions", told, (figure,))
+    return Section("Distributions", remarks, (figure,))
 
 
 def _influences(found: StudyAnalysis) -> Section | None:
     things = with_tornado(found)
     if not things:
         return None
-    drawn = found.runs.drawn
-    if drawn:
+    sampled = found.runs.sampled
+    if sampled:
         caption = (
             "Change of the response from a factor's 5% to its 95% quantile by the linear model, the others unchanged, "
             "with 95% intervals (HC3). Blue: rises with the factor; red: falls; grey: of a text, between the values "
@@ -204,7 +207,7 @@ def _influences(found: StudyAnalysis) -> Section | None:
             "From the smallest to the largest of the means that belong to a factor's values. Blue: the mean at the "
             "last value is the larger one; red: the first; grey: texts."
         )
-    figure = _figure("tornado", "Swings" if drawn else "Main effects", caption, lambda: tornado_figure(found))
+    figure = _figure("tornado", "Swings" if sampled else "Main effects", caption, lambda: tornado_figure(found))
     rows: list[list[Cell]] = []
     texts = []
     for r in things:
@@ -219,10 +222,10 @@ def _influences(found: StudyAnalysis) -> Section | None:
                     r.name,
                     e.factor,
                     ends,
-                    with_limits(e.swing) if drawn else number(e.swing.value),
+                    with_limits(e.swing) if sampled else number(e.swing.value),
                     typeset(r.unit),
-                    _maybe(e.coefficient, drawn),
-                    _maybe(e.rank, drawn),
+                    _maybe(e.coefficient, sampled),
+                    _maybe(e.rank, sampled),
                 ]
             )
     table = Table(
@@ -230,31 +233,31 @@ def _influences(found: StudyAnalysis) -> Section | None:
         "Linear model and rank correlations",
         "Swing between the factor's 5% and 95% quantiles (second column), standardised regression coefficient (sigmas "
         "of the response per sigma of the factor) and Spearman's rank correlation"
-        + (", with 95% intervals. Where the last two differ much, the response is curved." if drawn else "."),
+        + (", with 95% intervals. Where the last two differ much, the response is curved." if sampled else "."),
         ("response", "factor", "from … to", "swing", "unit", "standardised", "rank correlation"),
         rows,
     )
     cannot = sorted({name for r in things for m in [found.linear[r.name]] if m is not None for name in m.cannot})
-    told = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
+    remarks = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
     if cannot:
-        told.append(f"Not told apart from the other factors, and left out of the model: {', '.join(cannot)}.")
-    return Section("What the factors do", tuple(told), (figure, table) if rows else (figure,))
+        remarks.append(f"Not told apart from the other factors, and left out of the model: {', '.join(cannot)}.")
+    return Section("What the factors do", tuple(remarks), (figure, table) if rows else (figure,))
 
 
-def _maybe(estimate: Estimate | None, drawn: bool) -> str:
+def _maybe(estimate: Estimate | None, sampled: bool) -> str:
     if estimate is None:
         return DASH
-    return with_limits(estimate) if drawn else number(estimate.value, 3)
+    return with_limits(estimate) if sampled else number(estimate.value, 3)
 
 
 def _indices(found: StudyAnalysis) -> Section | None:
     if not found.runs.study.report.sobol:
         return None
-    told = conclusions.indices_texts(found)
+    remarks = conclusions.indices_texts(found)
     things = with_indices(found)
     if not things:
-        return Section("Sobol indices", tuple(told))
-    chaos = found.runs.drawn
+        return Section("Sobol indices", tuple(remarks))
+    chaos = found.runs.sampled
     rows: list[list[Cell]] = []
     for r in things:
         part = found.indices[r.name]
@@ -267,15 +270,15 @@ def _indices(found: StudyAnalysis) -> Section | None:
     if chaos:
         caption += " RBD-FAST (SALib) needs no model and checks the first order; its own error is some 0.03 to 0.1."
     table = Table("sobol", "Indices", caption, heads, rows)
-    drawn = "with 95% intervals" if chaos else "exact for the grid"
-    figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {drawn}.",
+    intervals = "with 95% intervals" if chaos else "exact for the grid"
+    figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {intervals}.",
                      lambda: indices_figure(found))  # fmt: skip
-    return Section("Sobol indices", tuple(told), (figure, table))
+    return Section("Sobol indices", tuple(remarks), (figure, table))
 
 
 def _curves(found: StudyAnalysis) -> Section | None:
     figures = []
-    if found.runs.drawn:
+    if found.runs.sampled:
         caption = (
             "Points: runs. Line: means of neighbouring runs with 95% intervals. Band: the middle 68% of these runs."
         )
@@ -291,8 +294,8 @@ def _curves(found: StudyAnalysis) -> Section | None:
     if not figures:
         return None
     more = len(found.runs.factors) - MOST_PANELS
-    told = (f"The {MOST_PANELS} factors that matter most of {len(found.runs.factors)}.",) if more > 0 else ()
-    return Section("Response curves", told, tuple(figures))
+    remarks = (f"The {MOST_PANELS} factors that matter most of {len(found.runs.factors)}.",) if more > 0 else ()
+    return Section("Response curves", remarks, tuple(figures))
 
 
 def _pairs(found: StudyAnalysis) -> Section | None:
@@ -316,9 +319,9 @@ def _pairs(found: StudyAnalysis) -> Section | None:
 
 
 def _fronts(found: StudyAnalysis) -> Section | None:
-    told = tuple(f"{pair}: texts have no order, so that there is no front." for pair in found.not_numbers)
+    remarks = tuple(f"{pair}: texts have no order, so that there is no front." for pair in found.not_numbers)
     if not found.fronts:
-        return Section("Best compromises", told) if told else None
+        return Section("Best compromises", remarks) if remarks else None
     caption = "Blue: runs that no other run beats in both; the stairs bound what is known to be possible. "
     caption += "Knee: where the front, scaled to its range, bulges farthest from the line through its ends."
     parts: list[SvgFigure | Table] = [_figure("pareto", "Pareto fronts", caption, lambda: pareto_figure(found))]
@@ -349,7 +352,7 @@ def _fronts(found: StudyAnalysis) -> Section | None:
                 shown,
             )
         )
-    return Section("Best compromises", told, tuple(parts))
+    return Section("Best compromises", remarks, tuple(parts))
 
 
 def _cell(factor: Factor, run: int) -> Cell:
@@ -360,7 +363,7 @@ def _cell(factor: Factor, run: int) -> Cell:
 
 
 def _convergence(found: StudyAnalysis) -> Section | None:
-    names = [name for name, courses in found.courses.items() if courses][:MOST_FIGURES]
+    names = [name for name, convergences in found.convergences.items() if convergences][:MOST_FIGURES]
     if not names:
         return None
     caption = "Of the first n runs, with the 95% interval where both its ends can be told."

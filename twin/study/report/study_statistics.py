@@ -79,7 +79,7 @@ class Description:
     tails: tuple[float, float] | None = None
 
 
-def describe(values: np.ndarray, drawn: bool) -> Description:
+def describe(values: np.ndarray, sampled: bool) -> Description:
     """Statistics of the finite ones of ``values`` (n,); intervals and normality only where the runs were ``drawn``.
 
     The intervals take the runs as independent. Evenly spread designs (Latin hypercube, Sobol) know the mean better, so
@@ -91,23 +91,23 @@ def describe(values: np.ndarray, drawn: bool) -> Description:
         return Description(0)
     ordered = np.sort(good)
     quantiles = [
-        Estimate(float(np.quantile(ordered, q)), quantile_interval(ordered, q) if drawn else (None, None))
+        Estimate(float(np.quantile(ordered, q)), quantile_interval(ordered, q) if sampled else (None, None))
         for q in (0.5, 0.95, 0.997)
     ]
     std = None
     if n > 1:
-        std = Estimate(float(np.std(good, ddof=1)), std_interval(good) if drawn else (None, None))
+        std = Estimate(float(np.std(good, ddof=1)), std_interval(good) if sampled else (None, None))
     reach = n * TAILS[0] >= 1.0
     return Description(
         count=n,
-        mean=Estimate(float(np.mean(good)), mean_interval(good) if drawn else (None, None)),
+        mean=Estimate(float(np.mean(good)), mean_interval(good) if sampled else (None, None)),
         std=std,
         median=quantiles[0],
         p95=quantiles[1],
         p997=quantiles[2],
         low=float(ordered[0]),
         high=float(ordered[-1]),
-        normality=normality(good) if drawn else None,
+        normality=normality(good) if sampled else None,
         tails=(float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if reach else None,
     )
 

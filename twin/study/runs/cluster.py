@@ -211,11 +211,11 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
 
 def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]) -> None:
     end = time.monotonic() + WORKER_SECONDS
-    told = False
+    announced = False
     while not workers.count:
-        if not told:
+        if not announced:
             tell(f"the scheduler {address} has no workers yet; waiting for `dask worker {address} --nthreads 1`")
-            told = True
+            announced = True
         if time.monotonic() > end:
             raise ClusterError(f"the scheduler {address} had no workers for {WORKER_SECONDS:.0f} s")
         time.sleep(0.2)

@@ -139,7 +139,7 @@ class Engine:
             runs = _runs_text([self.plan.block(block)])
             if killed(error):
                 raise IncompleteError(f"the workers died in the first block, {runs}")
-            raise IncompleteError(f"the program failed in the first block, {runs}: {_told(error)}") from error
+            raise IncompleteError(f"the program failed in the first block, {runs}: {_error_text(error)}") from error
         first: Pilot = future.result()
         if first.refusal is not None:
             raise first.refusal
@@ -186,7 +186,7 @@ class Engine:
                 suspects.append(blocks)
                 continue
             bad.append(self.plan.block(blocks.start))
-            reason = "the workers died" if killed(error) else f"the program failed: {_told(error)}"
+            reason = "the workers died" if killed(error) else f"the program failed: {_error_text(error)}"
             if reason not in reasons:
                 reasons.append(reason)
         if bad:
@@ -217,8 +217,8 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
             except Problem as problem:
                 place: KeyPath = ("responses", name, key)
                 text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
-                told = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
-                raise setup.error(told, place) from None
+                restated = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
+                raise setup.error(restated, place) from None
 
 
 def fit_workers(wanted: int, memory: float, least: float) -> int:
@@ -248,7 +248,7 @@ def _runs_text(parts: Sequence[range]) -> str:
     return "runs " + ", ".join(f"{part.start}-{part.stop - 1}" for part in parts)
 
 
-def _told(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     notes = " ".join(getattr(error, "__notes__", ()))
     return f"{type(error).__name__}: {error} {notes}".strip()
 

@@ -57,8 +57,8 @@ class Plan:
         Raises:
             InputError: a factor takes a value that the base's schema does not allow.
         """
-        drawn = draw(setup.study)
-        plan = cls(setup, tuple(_column(setup, name, values) for name, values in drawn.items()))
+        sampled = draw(setup.study)
+        plan = cls(setup, tuple(_column(setup, name, values) for name, values in sampled.items()))
         plan.check()
         return plan
 
@@ -152,29 +152,29 @@ class Plan:
             raise self.setup.error(problem, ("factors", name, factor.kind)) from None
 
 
-def _column(setup: StudySetup, name: str, drawn: np.ndarray) -> Column:
+def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
     factor = setup.study.factors[name]
     numbers = factor.numbers()
     if factor.kind not in ("values", "table"):
-        return Column(name, numbers.unit or "", _like(setup, name, drawn))
+        return Column(name, numbers.unit or "", _like(setup, name, sampled))
     if numbers.numeric:
         listed = np.array(numbers.values, np.float64)
-        return Column(name, numbers.unit or "", (listed.astype(np.int64) if numbers.whole else listed)[drawn])
+        return Column(name, numbers.unit or "", (listed.astype(np.int64) if numbers.whole else listed)[sampled])
     scalars = factor.scalars()
     if all(isinstance(value, bool) for value in scalars):
-        return Column(name, "", np.array(scalars, bool)[drawn])
+        return Column(name, "", np.array(scalars, bool)[sampled])
     if not all(isinstance(value, str) for value in scalars):
         problem = Problem("values of different sorts", None, "all numbers, all quantities, or all texts")
         raise setup.error(problem, ("factors", name, factor.kind))
-    return Column(name, "", np.array(scalars, np.str_)[drawn])
+    return Column(name, "", np.array(scalars, np.str_)[sampled])
 
 
-def _like(setup: StudySetup, name: str, drawn: np.ndarray) -> np.ndarray:
+def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
     """Numbers without a unit become whole where the base has a whole number and all of them are."""
     factor = setup.study.factors[name]
     node = leaf(setup.tree, factor.places[0]) if factor.places else None
     whole = isinstance(node, int) and not isinstance(node, bool) and factor.unit is None
-    return drawn.astype(np.int64) if whole and np.all(drawn == np.rint(drawn)) else drawn
+    return sampled.astype(np.int64) if whole and np.all(sampled == np.rint(sampled)) else sampled
 
 
 def _telling(column: Column, limits: list[float]) -> list[Any]:

@@ -341,7 +341,7 @@ def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
         "recovered": run.recovered_dict(),
         "crosstalk": {name: table.to_dict() for name, table in run.crosstalk.items()},
     }
-    for name, part in (("course", run.course), ("stray", run.stray), ("mtf", run.targets)):
+    for name, part in (("course", run.series), ("stray", run.stray), ("mtf", run.targets)):
         if part is not None:
             out[name] = part.to_dict()
     if run.quality is not None:

@@ -97,8 +97,8 @@ class StudySetup:
                 continue
             source = self.study.source
             text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
-            told = Issue(text, source.file, source.line(found[1]), (*source.prefix, *found[1]))
-            issues.append(_with(told, issue.found, issue.allowed, issue.suggestion))
+            restated = Issue(text, source.file, source.line(found[1]), (*source.prefix, *found[1]))
+            issues.append(_with(restated, issue.found, issue.allowed, issue.suggestion))
         return InputError(*issues)
 
 

@@ -68,10 +68,12 @@ class StudyState(BaseModel):
         )
 
 
-def _differences(before: Mapping[str, str], now: Mapping[str, str], told: Callable[[str, str, str], str]) -> list[str]:
+def _differences(
+    before: Mapping[str, str], now: Mapping[str, str], message: Callable[[str, str, str], str]
+) -> list[str]:
     names = sorted({*before, *now})
     pairs = [(name, before.get(name, "not there"), now.get(name, "not there")) for name in names]
-    return [told(name, old, new) for name, old, new in pairs if old != new]
+    return [message(name, old, new) for name, old, new in pairs if old != new]
 
 
 class StudyFolder:

@@ -221,8 +221,8 @@ def _row(
 
 def _place(sentence: Sentence | None, places: Mapping[tuple[float, float], Answers]) -> Supposed:
     """Where a sentence holds, or all of those on signs."""
-    said = [sentence] if sentence else [s for s in SENTENCES if s.kind == "signs"]
-    held = sum(all(s.holds(a.rises, a.growth) for s in said) for a in places.values())
+    sentences = [sentence] if sentence else [s for s in SENTENCES if s.kind == "signs"]
+    held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
     text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)
 

@@ -82,7 +82,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
         for name, line in (("alpha", "forward"), ("beta", "aft"))
     }
 
-    def said(what: str) -> str:
+    def statement(what: str) -> str:
         bias, left = rows[what].bias / ARCSEC, rows[what].left / ARCSEC
         return (
             f"True ground points of the rigorous sensor, no errors: α {bias[0]:+.3f}″, β {bias[1]:+.3f}″. After the "
@@ -110,7 +110,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
         if identifier in context.selected:
             measured = float(rows[what].bias[which] / ARCSEC)
             reason = Explanation(value, CORRECTED, text)
-            yield context.check(identifier).evaluate(measured, None, said(what), 0.0, [reason])
+            yield context.check(identifier).evaluate(measured, None, statement(what), 0.0, [reason])
 
 
 def _refraction(passes: Passes, angle: str, line: str) -> float:

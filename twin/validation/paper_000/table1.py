@@ -145,10 +145,10 @@ def make_data(context: Context) -> Data:
     first, second, third = np.random.SeedSequence([context.seed, 5]).spawn(3)
     setup = setup_of(TEST, points=POINT_SIGMA)
     own = repeated(setup, second, count)
-    drawn = repeated(setup, third, count, corrected=False)
+    repeats = repeated(setup, third, count, corrected=False)
     # one precise orbit for both methods
-    moved = tuple(_at(m, o.station.position) for m, o in zip(drawn.measured, own.measured, strict=True))
-    return Data(repeated(setup_of(TEST), first, count), own, Passes(drawn.flight, moved))
+    moved = tuple(_at(m, o.station.position) for m, o in zip(repeats.measured, own.measured, strict=True))
+    return Data(repeated(setup_of(TEST), first, count), own, Passes(repeats.flight, moved))
 
 
 def _at(measured: Measurement, position: Array) -> Measurement:
@@ -252,14 +252,14 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
     bias = -next(row.bias for row in effect_rows(flight) if row.what == "all") / ARCSEC
     together = _distance(np.array([ALPHA, BETA]) - bias, covariance)
     apart = _distance(np.array([-ALPHA, BETA]) - bias, covariance)
-    drawn = _distance(np.array([ALPHA, BETA]) - np.mean(own.values, axis=0), np.cov(own.values.T))
+    distance = _distance(np.array([ALPHA, BETA]) - np.mean(own.values, axis=0), np.cov(own.values.T))
     forward, nadir, aft = (_pitch_variance(data.light, line) for line in LINES)
     simple = np.array([[forward + nadir, -nadir], [-nadir, nadir + aft]])
     how = (
         "By propagation of the points' errors and the exact effects on the light, as for the rows _own; correlation "
         f"{covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]):+.2f}. By the spread of "
-        f"{len(own.values)} pairs of measurements it is {drawn:.1f}. With opposite signs, −{ALPHA}″ and {BETA}″, it is "
-        f"{apart:.1f}; {LIMIT:.2f} is the limit."
+        f"{len(own.values)} pairs of measurements it is {distance:.1f}. With opposite signs, −{ALPHA}″ and {BETA}″, it "
+        f"is {apart:.1f}; {LIMIT:.2f} is the limit."
     )
     reason = Explanation(
         _distance(np.array([ALPHA, BETA]) - bias, 2.0 * simple),

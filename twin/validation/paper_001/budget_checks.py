@@ -163,15 +163,15 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         # with a correlation of all pairs the square grows by as much of what a plain sum has more
         largest = 1.0 + context.check("001.eq12").tolerance + SIGMAS * noise
         most = ((largest / measured) ** 2 - 1.0) / ((plain / total) ** 2 - 1.0)
-        said = f"holds up to a correlation of {max(most, 0.0):.2g} of all pairs"
-        drawn = Supposed("causes that are independent", said)
+        limit_text = f"holds up to a correlation of {max(most, 0.0):.2g} of all pairs"
+        independent = Supposed("causes that are independent", limit_text)
         how = (
             f"{causes} random states with all causes, {budget.FRAMES} noisy frames each: "
             f"{value / ARCSEC:.4f} arcsec; (12) over lines of {trials} states each: {total / ARCSEC:.4f}. The causes "
             "are drawn independently, as (12) takes them; the images show that they then add. A drift of temperature "
             f"that all glass shares would break it: the plain sum of the lines is {plain / ARCSEC:.3f} arcsec."
         )
-        yield context.check("001.eq12").evaluate(measured, noise, how, inputs=[drawn])
+        yield context.check("001.eq12").evaluate(measured, noise, how, inputs=[independent])
     if "001.eq12.frames" in context.selected:
         assert images.scatter is not None
         (single, s_sigma), (mean, m_sigma) = images.scatter

@@ -309,14 +309,14 @@ def _findings(images: SingleMotions) -> Iterator[_Finding]:
 
 def _show(context: Context, ratios: Mapping[str, Ratio]) -> None:
     """Figure, table and data of what was found."""
-    drawn = {i: (context.check(i).equation, r.value) for i, r in ratios.items() if context.check(i).printed == 1.0}
-    if drawn:
+    exact = {i: (context.check(i).equation, r.value) for i, r in ratios.items() if context.check(i).printed == 1.0}
+    if exact:
         context.add(
             SvgFigure(
                 "ratios",
                 "Readings of paper 001's formulas over what they should be",
                 "Measured from images, mean of both cameras; the noise is below the size of the marks.",
-                ratios_svg(drawn),
+                ratios_svg(exact),
             )
         )
     cameras = list(next(iter(ratios.values())).cameras)

@@ -131,11 +131,11 @@ def run(context: Context) -> Iterator[CheckResult]:
         result = _angle(context, images)
         shown[result.id] = float(result.measured or 0.0)
         yield result
-    drawn = {i: (context.check(i).equation, v) for i, v in shown.items() if context.check(i).printed == 1.0}
-    if drawn:
+    exact = {i: (context.check(i).equation, v) for i, v in shown.items() if context.check(i).printed == 1.0}
+    if exact:
         caption = "Measured from images, mean of both cameras; the noise is below the size of the marks."
         title = "The joint form: what was found over what should be"
-        context.add(SvgFigure("joint-ratios", title, caption, ratios_svg(drawn)))
+        context.add(SvgFigure("joint-ratios", title, caption, ratios_svg(exact)))
 
 
 def measured(context: Context) -> JointMotions:

@@ -164,8 +164,8 @@ def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> De
                 seen = places_seen(setup, one, line, change[:3], bias + change[3:])
                 sides.append(misclosure(model, rays_at(base, one.trajectory, pitch, *seen), ground, bias, still))
             coefficient = -(sides[0] - sides[1]) / (2.0 * step)
-            told = by.interior[:, :, k] if k < 3 else by.bias[:, :, k - 3]
-            row[name] = float(np.abs(coefficient - told).max() / np.abs(coefficient).max())
+            expected = by.interior[:, :, k] if k < 3 else by.bias[:, :, k - 3]
+            row[name] = float(np.abs(coefficient - expected).max() / np.abs(coefficient).max())
         found[line] = FrozenMap(row)
     return Derivatives(FrozenMap(found))
 

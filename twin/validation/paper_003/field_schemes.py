@@ -154,8 +154,8 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
             check = context.check(f"003.scheme{k}.height")
             # what an interior of its own in every field would add to the heights in square
             more = np.sqrt((1.0 + check.tolerance + SIGMAS * sigma) ** 2 - 1.0) * float(np.median(height[:, 0]))
-            said = f"holds while x of the forward line wanders by up to {1e6 * more / _per_shift(setup):.2g} µm"
-            yield check.evaluate(value, sigma, how, 1.0, inputs=[Supposed("one interior for all fields", said)])
+            limit_text = f"holds while x of the forward line wanders by up to {1e6 * more / _per_shift(setup):.2g} µm"
+            yield check.evaluate(value, sigma, how, 1.0, inputs=[Supposed("one interior for all fields", limit_text)])
 
 
 def _per_shift(setup: CalibrationSetup) -> float:

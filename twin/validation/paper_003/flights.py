@@ -54,7 +54,7 @@ class Flights:
     expected: np.ndarray
     fits: tuple[tuple[LatitudeFit, ...], ...]
     true_amplitude: np.ndarray
-    true_told: np.ndarray
+    true_significance: np.ndarray
 
     @property
     def count(self) -> int:

@@ -188,7 +188,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     if {"003.model", "003.equations", "003.equations.exact"} & context.selected:
         yield from _exact(context, seed)
     if {"003.model.rank", "003.model.stepwise"} & context.selected:
-        yield from _drawn(context, stream(seed, 2))
+        yield from _simulated(context, stream(seed, 2))
     images = [i for i in context.selected if i in _IMAGES]
     if images:
         yield from _rendered(context, stream(seed, 3))
@@ -242,7 +242,7 @@ def exact_misses(setup: CalibrationSetup, campaign: Campaign, seed: np.random.Se
     return marks.missed(setup, campaign, marks.rendered_marks(setup, campaign, seed))
 
 
-def _drawn(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
+def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
     setup = without_light(setup_of(FIELDS, (FIELD,)))
     campaign = fly_fields(setup, seed).independent
     if "003.model.rank" in context.selected:
@@ -322,7 +322,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
     ):
         if identifier in context.selected:
             rms, sigma = _worst(found, names)
-            said = " ".join(rendered.told(f, names) for f in found)
+            said = " ".join(rendered.summary(f, names) for f in found)
             how = f"{size}. Error and sigma: {said} The worst field counts. Rounds of the stepwise solution: {rounds}."
             yield context.check(identifier).evaluate(rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)])
     if "003.model.bias.yaw" in context.selected:
@@ -330,7 +330,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
         sigma = max(f.together.sigma[f"{f.name} {n}"] for f in found for n in YAW) / ARCSEC
         how = (
             f"{size}. "
-            + " ".join(rendered.told(f, YAW) for f in found)
+            + " ".join(rendered.summary(f, YAW) for f in found)
             + f" Yaw of one field by itself is known to {sigma:.1f}″ only: it goes with y of the forward and aft "
             "lines. In plan that does not show, for the two cancel."
         )

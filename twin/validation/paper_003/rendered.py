@@ -182,10 +182,10 @@ class FromImages:
 def measured(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Campaign:
     """Render the fields and match their points; what the adjustment rejects is left out."""
 
-    def told(_: str, done: int, total: int) -> None:
+    def progress(_: str, done: int, total: int) -> None:
         advance(done / total)
 
-    return screened(fly_fields(setup, seed, told))
+    return screened(fly_fields(setup, seed, progress))
 
 
 def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
@@ -232,7 +232,7 @@ def _field(campaign: Campaign, one: FieldPass) -> FromImages:
     )
 
 
-def told(found: FromImages, names: tuple[str, ...]) -> str:
+def summary(found: FromImages, names: tuple[str, ...]) -> str:
     """Errors and sigmas of some unknowns of a field, in words."""
     sigma = dict(zip(found.error, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
     parts = []

@@ -22,7 +22,7 @@ from twin.validation.paper_003.flights import MEDIAN, Flights, lines_of, median
 _EDGE = 1e-9
 SLOW = 1.5 * ARCSEC, 10.0
 """Slow errors of the attitude that third differences are tried on: sigma of a value, seconds between values."""
-_TOLD = 3.0
+_SIGNIFICANT = 3.0
 _QUARTILE = 0.6745
 """Sigmas from the median of normal noise."""
 
@@ -217,10 +217,10 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
         )
 
 
-def _orbit(context: Context, told: np.ndarray, error: np.ndarray, setup: CalibrationSetup) -> CheckResult:
+def _orbit(context: Context, significance: np.ndarray, error: np.ndarray, setup: CalibrationSetup) -> CheckResult:
     gps = setup.test.errors.gps
     noise, drift = (float(np.sqrt(np.mean(np.square(v)))) for v in (gps.noise, gps.drift))
-    implied, true = (float(np.sqrt(np.mean(v**2))) for v in (told, error))
+    implied, true = (float(np.sqrt(np.mean(v**2))) for v in (significance, error))
     passes = error.shape[0] * error.shape[1] * error.shape[2]
     # the slow error hardly changes during a pass: one value each
     sigma = implied / true / float(np.sqrt(2.0 * passes))
@@ -265,10 +265,10 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
         value, sigma = median(values)
         yield context.check("003.table3.truth").evaluate(value, sigma, how, inputs=[all_errors(value)])
     if "003.table3.latitude" in context.selected:
-        told = np.array([[abs(f.amplitude) / f.amplitude_sigma for f in row[:2]] for row in flights.fits])
-        share = float(np.mean(told >= _TOLD))
+        significance = np.array([[abs(f.amplitude) / f.amplitude_sigma for f in row[:2]] for row in flights.fits])
+        share = float(np.mean(significance >= _SIGNIFICANT))
         reason = Explanation(
-            float(np.median(flights.true_told[:, :2])),
+            float(np.median(flights.true_significance[:, :2])),
             CORRECTED,
             "The biases do differ by the class of 1″, but seven fields, each at another date, cannot tell latitude "
             "from season: the true biases themselves, fitted alike, show no more.",
@@ -278,9 +278,9 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
             f"latitude is there, beside seasons of 1″. {100.0 * share:.0f} % of the slopes reach three sigmas."
         )
         # quartiles, for few fields make long tails; roll and pitch are drawn apart
-        low, value, high = np.percentile(told, [25.0, 50.0, 75.0])
-        sigma = MEDIAN * (high - low) / (2.0 * _QUARTILE) / float(np.sqrt(told.size))
-        yield context.check("003.table3.latitude").evaluate(float(value), float(sigma), how, _TOLD, (reason,))
+        low, value, high = np.percentile(significance, [25.0, 50.0, 75.0])
+        sigma = MEDIAN * (high - low) / (2.0 * _QUARTILE) / float(np.sqrt(significance.size))
+        yield context.check("003.table3.latitude").evaluate(float(value), float(sigma), how, _SIGNIFICANT, (reason,))
 
 
 def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResult:

@@ -10,7 +10,7 @@ from analysis.units import ARCSEC
 from scenes.specs.channel import BASE
 from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.spot_plots import marks
-from twin.monitor.time_series import CourseRun
+from twin.monitor.time_series import TimeSeries
 from twin.run.artefact import MINUS
 from twin.run.svg import (
     BLUE,
@@ -36,23 +36,23 @@ UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.
 """From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
 
 
-def time_axis(course: CourseRun) -> tuple[np.ndarray, str]:
+def time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
     """Times of a course in a unit that suits its length, and the axis label."""
-    span = float(course.times[-1] - course.times[0])
+    span = float(series.times[-1] - series.times[0])
     size, unit = next((size, unit) for least, size, unit in UNITS if span >= least)
-    return course.times / size, f"time [{unit}]"
+    return series.times / size, f"time [{unit}]"
 
 
-def temperatures_svg(course: CourseRun) -> str:
+def temperatures_svg(series: TimeSeries) -> str:
     """Change at the origin and gradient along each axis of every node of the course."""
     with look("temperatures"):
-        time, label = time_axis(course)
-        figure = new_figure(4.1 + 0.2 * -(-len(course.temperatures) // 3))
+        time, label = time_axis(series)
+        figure = new_figure(4.1 + 0.2 * -(-len(series.temperatures) // 3))
         panels = figure.subplots(2, 2, sharex=True)
         panels[0, 1].sharey(panels[1, 0])
         panels[1, 1].sharey(panels[1, 0])
         handles = []
-        for number, (path, fields) in enumerate(course.temperatures.items()):
+        for number, (path, fields) in enumerate(series.temperatures.items()):
             colour, style = COLOURS[number % len(COLOURS)], STYLES[number // len(COLOURS) % len(STYLES)]
             change = np.array([[field.change] for field in fields])
             values = np.concatenate([change, 1e3 * np.array([field.gradient for field in fields])], axis=1)
@@ -61,7 +61,7 @@ def temperatures_svg(course: CourseRun) -> str:
             handles.append(panels[0, 0].get_lines()[-1])
         titles = ("change at the origin [K]", *(f"gradient along {axis} [mK/m]" for axis in "XYZ"))
         for axes, title in zip(panels.flat, titles, strict=True):
-            _frame(axes, course, time)
+            _frame(axes, series, time)
             axes.set_title(title, loc="left")
         for axes in panels[1]:
             axes.set_xlabel(label)
@@ -69,17 +69,17 @@ def temperatures_svg(course: CourseRun) -> str:
         return to_svg(figure)
 
 
-def parameters_svg(course: CourseRun, names: dict[str, str]) -> str:
+def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
     """True parameters as lines, recovered ones as marks, camera by camera, and the angle between two cameras.
 
     Args:
-        course: the course.
+        series: the course.
         names: estimator -> its name for readers.
     """
     with look("course"):
-        time, label = time_axis(course)
-        cameras = list(course.parameters)
-        rows = len(PARAMETERS) + bool(course.recovered_angle)
+        time, label = time_axis(series)
+        cameras = list(series.parameters)
+        rows = len(PARAMETERS) + bool(series.recovered_angle)
         figure = new_figure(0.7 + 1.5 * rows)
         grid = figure.add_gridspec(rows, len(cameras))
         for column, name in enumerate(cameras):
@@ -87,9 +87,9 @@ def parameters_svg(course: CourseRun, names: dict[str, str]) -> str:
                 axes = figure.add_subplot(grid[row, column])
                 size = PER_SI[row]
                 values = {
-                    e: (size * p.vector[:, row], size * p.sigma[:, row]) for e, p in course.parameters[name].items()
+                    e: (size * p.vector[:, row], size * p.sigma[:, row]) for e, p in series.parameters[name].items()
                 }
-                _panel(axes, course, time, size * course.truth[name][row], values, names)
+                _panel(axes, series, time, size * series.truth[name][row], values, names)
                 if column == 0:
                     axes.set_ylabel(f"{parameter.symbol} [{parameter.unit}]")
                 if row == 0:
@@ -97,10 +97,10 @@ def parameters_svg(course: CourseRun, names: dict[str, str]) -> str:
                 axes.tick_params(labelbottom=row == rows - 1)
                 if row == rows - 1:
                     axes.set_xlabel(label)
-        if course.recovered_angle:
+        if series.recovered_angle:
             axes = figure.add_subplot(grid[-1, :])
-            angles = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in course.recovered_angle.items()}
-            _panel(axes, course, time, course.angle_change / ARCSEC, angles, names)
+            angles = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in series.recovered_angle.items()}
+            _panel(axes, series, time, series.angle_change / ARCSEC, angles, names)
             axes.set_ylabel("Δθ [arcsec]")
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(label)
@@ -112,13 +112,13 @@ def parameters_svg(course: CourseRun, names: dict[str, str]) -> str:
 
 def _panel(
     axes: Axes,
-    course: CourseRun,
+    series: TimeSeries,
     time: np.ndarray,
     true: np.ndarray,
     values: dict[str, tuple[np.ndarray, np.ndarray]],
     names: dict[str, str],
 ) -> None:
-    _frame(axes, course, time)
+    _frame(axes, series, time)
     for estimator, (marker, colour) in marks().items():
         value, sigma = values[estimator]
         axes.errorbar(
@@ -134,9 +134,9 @@ def _panel(
         axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)
 
 
-def _frame(axes: Axes, course: CourseRun, time: np.ndarray) -> None:
+def _frame(axes: Axes, series: TimeSeries, time: np.ndarray) -> None:
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
-    axes.axvline(time[course.shown], color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+    axes.axvline(time[series.shown], color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
     plain_axes(axes)
     axes.grid(axis="y", color=LIGHT, lw=0.5)
     axes.set_axisbelow(True)
