@@ -322,6 +322,52 @@ def test_folders_are_small_enough_to_look_through() -> None:
     assert {folder: number for folder, number in count.items() if number > MOST_FILES} == {}
 
 
+ARRAYS = re.compile(r"\b(ndarray|NDArray|ArrayLike|Array)\b")
+
+
+def arguments_not_described(source: str) -> list[str]:
+    """``function: argument`` of what public functions and methods with three arguments and more, that take or give
+    arrays, leave out under ``Args:``.
+    """
+    found = []
+    bodies = [body for body in ast.parse(source).body if not getattr(body, "name", "_").startswith("_")]
+    for node in (n for body in bodies for n in (body.body if isinstance(body, ast.ClassDef) else [body])):
+        if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+            continue
+        arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        given = [a for a in arguments if a.arg not in ("self", "cls")]
+        types = [ast.unparse(t) for t in (*(a.annotation for a in given), node.returns) if t is not None]
+        if len(given) > 2 and any(ARRAYS.search(t) for t in types):
+            listed = (ast.get_docstring(node) or "").partition("Args:\n")[2].partition("\n\n")[0]
+            known = set(re.findall(r"^    (\w+): \S", listed, re.M))
+            found += [f"{node.name}: {a.arg}" for a in given if a.arg not in known]
+    return found
+
+
+@pytest.mark.parametrize("path", [p for p in source_files() if p.relative_to(ROOT).parts[0] in ("optics", "analysis")])
+def test_arrays_of_public_functions_are_described(path: Path) -> None:
+    """Shapes, units and signs stand with the arguments."""
+    assert arguments_not_described(path.read_text("utf-8")) == []
+
+
+def test_an_argument_that_is_not_described_would_be_found() -> None:
+    source = '''
+def f(a: Array, b: int, c: int) -> int:
+    """Text that names a, b and c.
+
+    Args:
+        a: (N,), metres.
+        c: of it.
+
+    Returns:
+        b: something.
+    """
+'''
+    assert arguments_not_described(source) == ["f: b"]
+    assert arguments_not_described(source.replace("a: Array", "a: int")) == []
+    assert arguments_not_described(source.replace("def f", "def _f")) == []
+
+
 def test_no_folder_of_the_source_is_ignored_by_git() -> None:
     """What .gitignore hides, ruff does not check, and a new file in it is never committed."""
     ignored = {line.strip("/") for line in (ROOT / ".gitignore").read_text("utf-8").split() if not line.startswith("/")}

@@ -40,7 +40,13 @@ class RigidMotion:
 
     @classmethod
     def of(cls, rotation: ArrayLike, shift: ArrayLike, covariance: ArrayLike | None = None) -> RigidMotion:
-        """The motion, with its input checked. Raises ValueError for wrong shapes or numbers that are not finite."""
+        """The motion, with its input checked. Raises ValueError for wrong shapes or numbers that are not finite.
+
+        Args:
+            rotation: small, about X', Y', Z', (3,), radians.
+            shift: (3,), metres.
+            covariance: (6, 6) of both, radians and metres; exact by default.
+        """
         turn, move = np.asarray(rotation, np.float64), np.asarray(shift, np.float64)
         spread = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, np.float64)
         if turn.shape != (3,) or move.shape != (3,) or spread.shape != (6, 6):
@@ -193,11 +199,15 @@ def fit_focal_plane(
 ) -> FocalPlaneFit:
     """Weighted least-squares plane through the defocus of N places.
 
-    place: (N, 2) X', Y', metres. defocus: (N,) metres, best focus minus CCD along +Z'. sigma: (N,) or a number, metres.
-    hold: slopes taken as zero, "slope_x" or "slope_y", where the places cannot tell them.
-    estimate_extra: when the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and
-        Mandel, J. Res. NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
     Raises ObservabilityError when the places lie so that a slope cannot be told; ValueError for bad input.
+
+    Args:
+        place: (N, 2) X', Y', metres.
+        defocus: (N,) metres, best focus minus CCD along +Z'.
+        sigma: (N,) or a number, metres.
+        hold: slopes taken as zero, "slope_x" or "slope_y", where the places cannot tell them.
+        estimate_extra: when the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and
+            Mandel, J. Res. NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
     """
     spots, height = np.asarray(place, np.float64), np.asarray(defocus, np.float64)
     if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:
@@ -251,9 +261,12 @@ def fit_focal_plane(
 def line_level(along: ArrayLike, across: ArrayLike, sigma: ArrayLike) -> LineLevel:
     """Level of the line CCD from positions measured along it, for example pixels sighted with a theodolite.
 
-    along: (N,) Y', across: (N,) X' of N >= 2 points of the line, metres in the frame that the line has to be level in.
-    sigma: of `across`, (N,) or a number, metres; `along` is taken as exact.
     A line turned by g about +Z' has X' = -tan(g) Y' + constant. Raises ValueError for bad input.
+
+    Args:
+        along: Y' of N >= 2 points of the line, (N,), metres, in the frame that the line has to be level in; exact.
+        across: X' of the same points, (N,), metres.
+        sigma: of `across`, (N,) or a number, metres.
     """
     y, x = np.asarray(along, np.float64), np.asarray(across, np.float64)
     if y.ndim != 1 or x.shape != y.shape or y.size < 2:

@@ -64,6 +64,12 @@ class Mount:
         """The mount, checked; the normal of any length.
 
         Raises ShimError when the holes cannot carry a tilt; ValueError for bad input.
+
+        Args:
+            holes: centres of the pads in O'-X'Y'Z', (H, 3), metres.
+            normal: from the structure into the assembly, (3,), of any length.
+            clearance: how far a hole may slide against its screw, radius, metres.
+            step: the workshop grinds shims to multiples of this, metres.
         """
         place, up = np.asarray(holes, np.float64), np.asarray(normal, np.float64)
         if place.ndim != 2 or place.shape[1] != 3 or up.shape != (3,):
@@ -147,10 +153,14 @@ def shim_plan(
 ) -> ShimPlan:
     """Shims for a rigid motion of the assembly about O'.
 
-    correction: for example FocalPlaneFit.correction(). present: (H,) or a number, thickness of the shims now, metres.
-    least_thickness: the thinnest shim that can be ground, metres.
     A hole that moves by d needs n . d more shim; what is left of d lies in the mounting surface.
     Raises ShimError when a hole would slide beyond its clearance or a shim would become too thin.
+
+    Args:
+        correction: for example FocalPlaneFit.correction().
+        mount: where the shims are.
+        present: (H,) or a number, thickness of the shims now, metres.
+        least_thickness: the thinnest shim that can be ground, metres.
     """
     up, holes = mount.normal, mount.holes
     move = correction.displacement(holes)

@@ -48,6 +48,12 @@ def main_peak(z: Array, v: Array, weight: Array, fraction: float) -> tuple[NDArr
     """Where the smoothed curve is largest, (B,), and the points from there on that stay above the fraction, (B, Z).
 
     The smoothing is a binomial of a twelfth of the scan's points, at least 1-2-1, weighted by the inverse variances.
+
+    Args:
+        z: positions in rising order, (B, Z).
+        v: values there, (B, Z).
+        weight: inverse variances, (B, Z).
+        fraction: of the peak.
     """
     count, size = z.shape
     top, bottom = v * weight, weight
@@ -291,6 +297,14 @@ def focus_vertex(
     """Vertex of one through-focus curve of Z points, in any order; see focus_vertices for the arguments.
 
     Raises FocusError when the curve has no peak to measure; ValueError for bad arguments.
+
+    Args:
+        position: (Z,), a length.
+        value: (Z,), MTF.
+        sigma: of the values, (Z,) or a number.
+        fraction: points count where the fitted curve is above this part of its peak.
+        quartic: q of the module's formula.
+        lowest_peak: a peak below this is spurious resolution.
     """
     if np.ndim(value) != 1:
         raise ValueError(f"through focus: one curve must be (Z,), found {np.shape(value)}")
@@ -309,13 +323,15 @@ def focus_vertices(
 ) -> FocusVertices:
     """Vertices of many through-focus curves at once.
 
-    position: (..., Z) or (Z,), length. value: (..., Z), MTF. sigma: of the values, broadcast to them, positive;
-        infinite for a point that was not measured.
-    fraction: points count where the fitted curve is above this part of its peak, 0.25 to 0.95.
-    quartic: q of the module's formula, 0 to 0.33; 0 is the plain parabola.
-    lowest_peak: a peak below this is spurious resolution, and the scan has missed the main one. Within a scan the
-        highest smoothed value decides, but only the user can know that the scan went past the main peak.
-    strict: raise FocusError for the first faults found; else return them in `fault`.
+    Args:
+        position: (..., Z) or (Z,), length.
+        value: (..., Z), MTF.
+        sigma: of the values, broadcast to them, positive; infinite for a point that was not measured.
+        fraction: points count where the fitted curve is above this part of its peak, 0.25 to 0.95.
+        quartic: q of the module's formula, 0 to 0.33; 0 is the plain parabola.
+        lowest_peak: a peak below this is spurious resolution, and the scan has missed the main one. Within a scan the
+            highest smoothed value decides, but only the user can know that the scan went past the main peak.
+        strict: raise FocusError for the first faults found; else return them in `fault`.
     """
     where, data, spread = (np.asarray(item, dtype=np.float64) for item in (position, value, sigma))
     _check(where, data, spread, fraction, quartic)

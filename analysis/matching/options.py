@@ -36,6 +36,11 @@ def checked_image(image: ArrayLike, what: str) -> NDArray[np.generic]:
 def checked_places(places: ArrayLike, count: int | None, what: str) -> Array:
     """Places (n, 2) row and column as float64; they may be NaN.
 
+    Args:
+        places: (n, 2), px.
+        count: n that is asked for, None for any.
+        what: what they are, for the message.
+
     Raises:
         ValueError: another shape, or another number than count.
     """

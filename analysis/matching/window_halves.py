@@ -78,7 +78,13 @@ def risk(share: float, power: Array) -> Array:
 
 
 def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
-    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit."""
+    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
+
+    Args:
+        design: derivatives of the model, (n, q, p), the first two by place.
+        residual: (n, p), grey values; NaN where there is no fit.
+        side: of the windows, px, with p = side^2.
+    """
     count = len(design)
     apart = np.full((count, SPLITS, 2), np.nan)
     white, effect = np.full((2, count, SPLITS, 2, 2), np.nan)

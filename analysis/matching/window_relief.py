@@ -78,7 +78,13 @@ class ResidualCorrelation:
 
 
 def residual_correlation(design: Array, residual: Array, side: int) -> ResidualCorrelation:
-    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit."""
+    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
+
+    Args:
+        design: derivatives of the model, (n, q, p), the first two by place.
+        residual: (n, p), grey values; NaN where there is no fit.
+        side: of the windows, px, with p = side^2.
+    """
     count, unknowns, pixels = design.shape
     variance = np.full(count, np.nan)
     white = np.full((count, 2, 2), np.nan)
@@ -179,7 +185,13 @@ def _not_negative(value: float, error: float) -> float:
 
 
 def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
-    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit."""
+    """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
+
+    Args:
+        design: derivatives of the model, (n, q, p), the first two by place.
+        residual: (n, p), grey values; NaN where there is no fit.
+        side: of the windows, px, with p = side^2.
+    """
     count, unknowns, pixels = design.shape
     score, first, second, redundancy = np.full((4, count), np.nan)
     effect = np.full((count, 2, 2), np.nan)

@@ -82,6 +82,12 @@ def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Arr
     With u the axis in the autocollimator's frame, n = n0 cos a + (u x n0) sin a + u (u . n0)(1 - cos a), n0 = -Z. What
     it adds to the relations: about Y2 a relative -sin^2(b) a^2 / 6 for a turn about Y1 (-cos^2(b) a^2 / 6 about Z1),
     0.0003" at 720"; but about X2 a second-order sin(b) cos(b) a^2 / 2 in size, 0.54" at 720" and 30 or 60 deg.
+
+    Args:
+        axis: of the turn: X, Y or Z.
+        angle: (...), radians.
+        unit: which autocollimator, 1 or 2.
+        between: angle b between the two, radians.
     """
     a = np.asarray(angle, np.float64)
     b = between if unit == 2 else 0.0
@@ -130,8 +136,12 @@ class ReadingMap:
     def fit(cls, place: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
         """Least squares over P known turns.
 
-        place: (P, 2) spots (row, column), px. reading: (P, 2) about X, about Y, radians.
         Raises ValueError when there are too few of them.
+
+        Args:
+            place: (P, 2) spots (row, column), px.
+            reading: (P, 2) about X, about Y, radians.
+            degree: of the polynomials.
         """
         spots, known = np.asarray(place, np.float64), np.asarray(reading, np.float64)
         if spots.ndim != 2 or spots.shape[1] != 2 or known.shape != spots.shape:

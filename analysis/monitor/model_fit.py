@@ -58,12 +58,15 @@ def fit(
 ) -> CameraParameters:
     """Parameters from spot shifts.
 
-    shift: (..., 4) px. covariance: (..., 4, 4) px^2, positive definite, or all zero (no noise: equal weights, zero
-        sigma).
-    spot_jacobian: (4, P) px per unit of motion. parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to
-        4.
-    rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
+
+    Args:
+        shift: (..., 4) px.
+        covariance: (..., 4, 4) px^2, positive definite, or all zero (no noise: equal weights, zero sigma).
+        spot_jacobian: (4, P) px per unit of motion.
+        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to 4.
+        motion_names: of the P motions, for messages.
+        rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     """
     data, spread = np.asarray(shift, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
@@ -141,11 +144,19 @@ def observability(
     family: Sequence[int],
     rank_tolerance: float = 1e-8,
 ) -> ObservabilityReport:
-    """What can be told apart. motion_names: M names. spot_jacobian, parameter_jacobian: (4, M) per SI unit of motion.
+    """What can be told apart.
 
-    scales: (M,) size of one unit of each motion in SI (1e-6 for one micrometre). covariance: (4, 4) px^2 of the
-        shifts, positive
-    definite. family: indices of the motions that the model fits. Raises RankError if the family itself is degenerate.
+    Raises RankError if the family itself is degenerate.
+
+    Args:
+        motion_names: M names.
+        spot_jacobian: (4, M), px per SI unit of motion.
+        parameter_jacobian: (4, M), rad and m per SI unit of motion.
+        scales: (M,) size of one unit of each motion in SI (1e-6 for one micrometre).
+        covariance: (4, 4) px^2 of the shifts, positive definite.
+        family: indices of the motions that the model fits.
+        rank_tolerance: least ratio of singular values of the family's spot Jacobian with its columns scaled to length
+            one.
     """
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limit=None)
     names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)

@@ -182,9 +182,12 @@ def paper_single(
 ) -> CameraParameters:
     """Eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
 
-    before, after: (..., 2 sides, 2) spot positions (row, column), px. covariance: (..., 4, 4) of after - before, px^2,
-        in order
-    [left row, left column, right row, right column]; zeros where there is no noise.
+    Args:
+        before: (..., 2 sides, 2) spot positions (row, column) of the nominal state, px.
+        after: of the changed state, likewise.
+        covariance: (..., 4, 4) of after - before, px^2, in order [left row, left column, right row, right column];
+            zeros where there is no noise.
+        geometry: of the camera.
     """
     argument, spread = linear(coefficients("paper_single", geometry), before, after, covariance)
     values = argument.copy()
@@ -197,18 +200,41 @@ def paper_single(
 def paper_joint(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module."""
+    """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module.
+
+    Args:
+        before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+        after: of the changed state, likewise.
+        covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
+            zeros where there is no noise.
+        geometry: of the camera.
+    """
     return CameraParameters.from_vector(*linear(coefficients("paper_joint", geometry), before, after, covariance))
 
 
 def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry) -> CameraParameters:
-    """The corrected factors (see the module's text); arguments as `paper_single`."""
+    """The corrected factors (see the module's text); arguments as `paper_single`.
+
+    Args:
+        before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+        after: of the changed state, likewise.
+        covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
+            zeros where there is no noise.
+        geometry: of the camera.
+    """
     return CameraParameters.from_vector(*linear(coefficients("derived", geometry), before, after, covariance))
 
 
 def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
     """What a matrix (4, 4) as of `coefficients` makes of the shifts, (..., 4), and its covariance (..., 4, 4); the
     other arguments as `paper_single`.
+
+    Args:
+        matrix: as of `coefficients`, (4, 4).
+        before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+        after: of the changed state, likewise.
+        covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
+            zeros where there is no noise.
     """
     start, end = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     spread = np.asarray(covariance, dtype=np.float64)

@@ -42,7 +42,14 @@ class Estimator:
     reading: Reading | None = None
 
     def parameters(self, before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
-        """The camera's changes, see `Reading`."""
+        """The camera's changes, see `Reading`.
+
+        Args:
+            before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+            after: of the states, likewise.
+            covariance: of after - before, (..., 4, 4), px^2.
+            camera: its calibration.
+        """
         if self.reading is not None:
             return self.reading(before, after, covariance, camera)
         return CameraParameters.from_vector(*monitoring.linear(self.coefficients(camera), before, after, covariance))
@@ -124,8 +131,14 @@ def measure_spots(
 ) -> SpotPositions:
     """Centre of every spot of mean frames (B, H, W), B a multiple of the number of spots, in the calibration's order.
 
-    centroid: `ml` (the calibrated shape), `gaussian` or `energy` (the paper's).
     Raises SpotError for spots that cannot be measured.
+
+    Args:
+        mean: mean frames, (B, H, W), grey values.
+        frames: number of frames of each mean.
+        calibration: of the nominal instrument.
+        centroid: `ml` (the calibrated shape), `gaussian` or `energy` (the paper's).
+        threads: for the fits; results do not depend on it.
     """
     if centroid == "ml":
         return maximum_likelihood_fit(mean, frames, calibration.noise, calibration.template, threads=threads)
@@ -145,9 +158,12 @@ def recover(
 ) -> Recovery:
     """Recover all parameters.
 
-    before: (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state.
-    after: (S, C, frames, H, W) grey values of the states to be measured.
-    calibration: of the nominal instrument; C must be its number of spots.
+    Args:
+        before: (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state.
+        after: (S, C, frames, H, W) grey values of the states to be measured.
+        calibration: of the nominal instrument; C must be its number of spots.
+        centroid: `ml`, `gaussian` or `energy`.
+        threads: for the fits; results do not depend on it.
     """
     states, spots, frames = after.shape[0], after.shape[1], after.shape[2]
     if spots != calibration.spots or before.shape[-4] != spots:
@@ -175,10 +191,13 @@ def estimates(
 ) -> dict[str, dict[str, CameraParameters]]:
     """All estimators on spot positions.
 
-    start, end: (S, C, 2) spot positions (row, column) before and after, px, two of each camera in their order.
-    joint: (S, cameras, 4, 4) covariance of after - before, px^2; all zero for positions without noise.
-    cameras: what is calibrated of each.
     Returns camera -> estimator -> changes with arrays of shape (S,).
+
+    Args:
+        start: (S, C, 2) spot positions (row, column) before, px, two of each camera in their order.
+        end: those after, likewise.
+        joint: (S, cameras, 4, 4) covariance of after - before, px^2; all zero for positions without noise.
+        cameras: what is calibrated of each.
     """
     parameters: dict[str, dict[str, CameraParameters]] = {}
     for k, (name, camera) in enumerate(cameras.items()):

@@ -101,13 +101,17 @@ def measure_bars(
 ) -> BarMtf:
     """MTF from the bars that fill a region.
 
-    region: (H, W) grey values, linear in light, inside the group. dark, bright: pixels, any shape, with the levels of
-        the spaces and of the bars: the same region in frames of an even field, or even patches far from edges.
-    frequency: about what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row),
-        or one number, its length, or None for the strongest below Nyquist.
-    noise, frames: the detector's model and the number of averaged frames; without a model the variance is that of the
-        residuals and of the patches. saturation: as in `slanted_edge.measure_edge`. offset: grey value without
-        light, for the contrast only.
+    Args:
+        region: (H, W) grey values, linear in light, inside the group.
+        dark: pixels, any shape, with the level of the spaces: the same region in frames of an even field, or even
+            patches far from edges.
+        bright: likewise with that of the bars.
+        frequency: about what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the
+            row), or one number, its length, or None for the strongest below Nyquist.
+        noise: the detector's model; without one the variance is that of the residuals and of the patches.
+        frames: number of averaged frames.
+        saturation: as in `slanted_edge.measure_edge`.
+        offset: grey value without light, for the contrast only.
 
     Raises:
         BarError: no bars, saturated, too small, not filled, at Nyquist without tilt, or patches without contrast.

@@ -54,7 +54,13 @@ class EdgeDesign:
 
     @staticmethod
     def of(x: Array, core: float, oversampling: int) -> EdgeDesign:
-        """core: half width of the spline, px, rounded up to whole knots. oversampling: knots per pixel."""
+        """The design for pixels at given distances.
+
+        Args:
+            x: distances from the edge, (N,), px.
+            core: half width of the spline, px, rounded up to whole knots.
+            oversampling: knots per pixel.
+        """
         half = math.ceil(core * oversampling)
         place = x * oversampling + half
         inside = np.flatnonzero((place >= 0.0) & (place < 2 * half))

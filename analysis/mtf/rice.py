@@ -39,6 +39,11 @@ def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLi
     """Standard deviation of |m + noise|.
 
     Exact for equal noise along and across m, and in the limit of a large m, where only the noise along it counts.
+
+    Args:
+        modulus: |m|, any shape.
+        sigma_along: of the noise along m, of that shape.
+        sigma_across: across m, likewise.
     """
     m, along, across = np.broadcast_arrays(
         np.asarray(modulus, dtype=np.float64), np.asarray(sigma_along), np.asarray(sigma_across)
@@ -50,6 +55,12 @@ def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLi
 
 
 def signal_modulus(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLike) -> Array:
-    """Best guess of |m| from a measured |m + noise|: its square less the mean square of the noise, not below 0."""
+    """Best guess of |m| from a measured |m + noise|: its square less the mean square of the noise, not below 0.
+
+    Args:
+        modulus: |m + noise|, any shape.
+        sigma_along: of the noise along m, of that shape.
+        sigma_across: across m, likewise.
+    """
     square = np.square(modulus) - np.square(sigma_along) - np.square(sigma_across)
     return np.sqrt(np.maximum(square, 0.0))

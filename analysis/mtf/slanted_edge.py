@@ -55,13 +55,14 @@ def measure_edge(
 ) -> EdgeMtf:
     """MTF of the one edge in a region.
 
-    region: (H, W) grey values, linear in light.
-    noise: the detector's model; its fixed pattern counts as independent from pixel to pixel. Without a model the
-        variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
-    frames: how many frames the region is the mean of, used with `noise` only.
-    saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
-    oversampling: knots of the edge-spread function per pixel.
-    frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
+    Args:
+        region: (H, W) grey values, linear in light.
+        noise: the detector's model; its fixed pattern counts as independent from pixel to pixel. Without a model the
+            variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
+        frames: how many frames the region is the mean of, used with `noise` only.
+        saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
+        oversampling: knots of the edge-spread function per pixel.
+        frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
 
     Raises:
         EdgeError: the region does not show one measurable edge.

@@ -182,11 +182,13 @@ class LineFrame:
 def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFrame:
     """The line of sight of a CCD line's centre and the line's direction, from the plane and the interior orientation.
 
-    tangent: as for `central_ray`.
-    bend: how far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
-        sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
-
     Raises AngleError for bad tangents.
+
+    Args:
+        plane: fitted to the line.
+        tangent: as for `central_ray`.
+        bend: how far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
+            sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
     """
     if plane.method == "printed":
         raise AngleError("central ray: the printed plane does not contain its points")
@@ -250,6 +252,12 @@ def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayL
 
     Unit vectors (3,). Positive where the first looks ahead of the second, sides pointing to the right of the track.
     Raises AngleError for lines that run in opposite directions.
+
+    Args:
+        central_a: central ray of the first line, unit, (3,).
+        side_a: direction of the first line, unit, (3,).
+        central_b: of the second line, likewise.
+        side_b: likewise.
     """
     first, second = np.asarray(central_a, np.float64), np.asarray(central_b, np.float64)
     axis = np.asarray(side_a, np.float64) + np.asarray(side_b, np.float64)
@@ -289,6 +297,12 @@ def height_error(
     The wrong ray passes the ground point at slant_range * angle_error and so meets the other ray, at the angle
     `convergence` on the ground, farther along by that over sin(convergence); `zenith`: zenith angle of the other ray.
     For a camera at height H over flat ground, against nadir: H * angle_error / (sin a cos a). Radians, metres.
+
+    Args:
+        angle_error: of the look angle, radians, any shape.
+        slant_range: to the ground point, metres.
+        convergence: angle between the rays on the ground, radians.
+        zenith: zenith angle of the other ray, radians.
     """
     along = np.asarray(slant_range) * np.asarray(angle_error) / np.sin(np.asarray(convergence, np.float64))
     return np.asarray(along * np.cos(np.asarray(zenith, np.float64)))

@@ -133,7 +133,14 @@ class CalibrationField:
         sigma: float | tuple[float, float],
         control: ArrayLike | None = None,
     ) -> CalibrationField:
-        """sigma: of control points, one for all axes or (each axis in plan, height), metres, 0 for exact.
+        """The field, checked.
+
+        Args:
+            name: of the field.
+            rays: line -> its image points.
+            ground: of the points, ITRS, (P, 3), metres.
+            sigma: of control points, one for all axes or (each axis in plan, height), metres, 0 for exact.
+            control: which points are control, (P,); all by default.
 
         Raises:
             CalibrationError: shapes, values that are not finite, points far from the ellipsoid, rays of points that do
@@ -243,8 +250,12 @@ class Prior:
 def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike, group: str = "monitor") -> list[Prior]:
     """What an on-board monitor of one camera tells of its drift during one field.
 
-    reading, sigma: (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state; where
-    sigma is infinite nothing is told.
+    Args:
+        field: its name.
+        line: of the camera.
+        reading: (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state.
+        sigma: of each, (4,); infinite where nothing is told.
+        group: of variance that the priors belong to.
 
     Raises:
         CalibrationError: other shapes.
@@ -350,7 +361,14 @@ class Parameters:
         return np.asarray(rays.time - self.middles[name])
 
     def turned(self, values: Array, name: str, line: str, rays: Rays) -> Rays:
-        """Rays with the drift of the bias since the middle of the field taken into their attitude."""
+        """Rays with the drift of the bias since the middle of the field taken into their attitude.
+
+        Args:
+            values: of all unknowns, (U,), SI.
+            name: of the field.
+            line: of the camera.
+            rays: of that line.
+        """
         columns = self.columns[name, line][4]
         if columns[0] < 0 or not len(rays.point):
             return rays
@@ -358,7 +376,14 @@ class Parameters:
         return replace(rays, attitude=rays.attitude @ Rotation.from_rotvec(turn).as_matrix())
 
     def parts(self, values: Array, name: str, line: str, camera: LineModel) -> tuple[LineModel, Array, Array]:
-        """Camera with interior and drift, bias (3,) and offset (3,) (field axes) of one line of one field."""
+        """Camera with interior and drift, bias (3,) and offset (3,) (field axes) of one line of one field.
+
+        Args:
+            values: of all unknowns, (U,), SI.
+            name: of the field.
+            line: of the camera.
+            camera: as the laboratory knows it.
+        """
         inner, turn, shift, drift, _ = self.columns[name, line]
         bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
         camera = camera.with_interior(values[inner]) if inner[0] >= 0 else camera

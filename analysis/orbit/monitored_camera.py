@@ -136,7 +136,13 @@ def intersect_pair(
 
 
 def between(times: ArrayLike, measured: ArrayLike, values: ArrayLike) -> Array:
-    """(T, 4) changes at times (T,) from those (m, 4) measured at ascending times (m,): linear, held beyond the ends."""
+    """(T, 4) changes at times (T,) from those (m, 4) measured at ascending times (m,): linear, held beyond the ends.
+
+    Args:
+        times: (T,), seconds.
+        measured: (m,), ascending, seconds.
+        values: (m, 4) changes then.
+    """
     wanted, at, known = (np.asarray(v, np.float64) for v in (times, measured, values))
     return np.stack([np.interp(wanted, at, column) for column in known.T], axis=-1)
 

@@ -142,7 +142,11 @@ def null_vectors(reduced: Array, scale: Array) -> Array:
 def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> Array:
     """(P, k) combinations within `basis` whose strength is below `WEAK`, in units of `scale`.
 
-    length: (P,) of the columns of the normal matrix before the ground points were eliminated.
+    Args:
+        reduced: normal matrix without the ground points, (P, P).
+        length: (P,) of the columns of the normal matrix before the ground points were eliminated.
+        scale: a-priori sigmas of the unknowns, (P,), SI.
+        basis: of what may be solved for, (P, r), in units of `scale`.
     """
     unit = scale * np.where(length > 0, length, 1.0)
     squares = basis.T @ (unit[:, None] ** 2 * basis)
@@ -155,6 +159,13 @@ def combinations(
 ) -> tuple[Combination, ...]:
     """The space of vectors (P, k), in units of `scale`, by name: what takes part with a hundredth of the largest motion
     or more. Each combination has an unknown that is in no other one.
+
+    Args:
+        names: of the P unknowns.
+        scale: their units, (P,), SI.
+        vectors: (P, k), in units of `scale`.
+        reduced: normal matrix without the ground points, (P, P).
+        length: of the columns before the ground points were eliminated, (P,).
     """
     found = []
     for vector in _echelon(vectors).T:
@@ -174,6 +185,13 @@ def combinations(
 
 def free_basis(reduced: Array, length: Array, scale: Array, names: Sequence[str], gauge: Gauge | None) -> Freedom:
     """What may be solved for. `reduced` (P, P) is of the a-priori sigmas.
+
+    Args:
+        reduced: normal matrix without the ground points, (P, P), of the a-priori sigmas.
+        length: of the columns before they were eliminated, (P,).
+        scale: units of the unknowns, (P,), SI.
+        names: of the P unknowns.
+        gauge: what closes open combinations, None for nothing.
 
     Raises:
         RankError: open combinations that the gauge does not close.

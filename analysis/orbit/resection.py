@@ -77,7 +77,17 @@ class ObservedLine:
         look: float = float("nan"),
         offset: ArrayLike = (0.0, 0.0, 0.0),
     ) -> ObservedLine:
-        """tangent: (n,) along the line, or (n, 2). offset: (n, 3) or (3,). Raises ResectionError for bad input."""
+        """The line, checked.
+
+        Raises ResectionError for bad input.
+
+        Args:
+            strip: ground points that the line sees, n of them.
+            tangent: (n,) along the line, or (n, 2).
+            sigma: of the tangents.
+            look: the laboratory's look angle, radians; NaN where it is not known.
+            offset: (n, 3) or (3,).
+        """
         given = np.array(tangent, np.float64)
         if given.ndim == 1:
             given = np.column_stack([np.zeros_like(given), given])

@@ -48,6 +48,11 @@ def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Ar
     variance is (1 - w G / C) (C + (1 - w) G): less than C with full weight, C + G without any. So the standardised
     residual does not depend on the observation's own weight, which could otherwise swing for ever where others hardly
     check it. It is exact where the weights of the others stand for their variances.
+
+    Args:
+        equations: of M image points.
+        cofactors: of the adjusted image points, (M, 2, 2), metres^2.
+        weights: of the observations.
     """
     values, axes = np.linalg.eigh(cofactors)
     along = np.einsum("nji,nj->ni", axes, equations.residuals.image)
@@ -94,6 +99,13 @@ def variance_components(
 
     factor' = factor v'Pv / r with r the redundancy of the group, within 1 / `LARGEST_FACTOR` and `LARGEST_FACTOR`. It
     is unbiased for image points of weight 1 and 0; a weight that falls with the residual makes it too small.
+
+    Args:
+        equations: of M image points.
+        covariance: of the P unknowns, (P, P), SI.
+        cofactors: of the adjusted image points, (M, 2, 2), metres^2.
+        weights: of the observations.
+        priors: further observations of the unknowns.
     """
     residuals, factor = equations.residuals, weights.factor
     adjusted = np.trace(cofactors, axis1=1, axis2=2) / factor["image"]

@@ -57,8 +57,14 @@ def sensitivity(
 ) -> tuple[Sensitivity, ...]:
     """Rows for the station and the points of each strip, each along x, y, z of the coordinates' frame.
 
-    strips: line -> its points. pairs: angle -> the two lines that it lies between.
-    amounts: (k,) metres, first 0; 0 to 10 m in steps of 1 m by default. Raises PlaneError and AngleError.
+    Raises PlaneError and AngleError.
+
+    Args:
+        station: from which the strips are seen.
+        strips: line -> its points.
+        pairs: angle -> the two lines that it lies between.
+        method: of the planes' fit.
+        amounts: (k,) metres, first 0; 0 to 10 m in steps of 1 m by default.
     """
     steps = np.linspace(0.0, 10.0, 11) if amounts is None else np.asarray(amounts, np.float64)
     if steps.ndim != 1 or len(steps) < 3 or steps[0] != 0 or not np.all(np.diff(steps) > 0):

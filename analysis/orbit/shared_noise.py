@@ -44,7 +44,11 @@ def reading_variance(time: Array, interval: float) -> Array:
 def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> Array:
     """(n, 2, 2) covariance of image points, metres^2.
 
-    shared: with the noise that they share, as for one point alone; otherwise without what SharedNoise carries.
+    Args:
+        noise: model of the errors.
+        rays: n image points.
+        by: derivatives of their misclosures.
+        shared: with the noise that they share, as for one point alone; otherwise without what SharedNoise carries.
     """
     unit = np.eye(2) if rays.spread is None else rays.spread
     spread = np.broadcast_to(noise.image**2 * unit, (len(rays.point), 2, 2))
@@ -158,17 +162,37 @@ class SharedNoise:
         return self.precision.shape[0]
 
     def corrected(self, name: str, line: str, rays: Rays, shared: Array) -> Rays:
-        """Rays of a line of a field with the corrections (K,) applied."""
+        """Rays of a line of a field with the corrections (K,) applied.
+
+        Args:
+            name: of the field.
+            line: of the camera.
+            rays: of that line.
+            shared: corrections of the noise that points share, (K,).
+        """
         mine = [s for s in self.series[name] if line in s.places]
         return _moved(rays, [(s.term.kind, s.correction(line, shared)) for s in mine])
 
     def corrected_at(self, name: str, rays: Rays, shared: Array) -> Rays:
-        """Other rays of a field, with times."""
+        """Other rays of a field, with times.
+
+        Args:
+            name: of the field.
+            rays: with times.
+            shared: corrections of the noise that points share, (K,).
+        """
         assert rays.time is not None
         return _moved(rays, [(s.term.kind, s.correction_at(rays.time, shared)) for s in self.series[name]])
 
     def rows(self, name: str, line: str, white: Array, by: Partials) -> sparse.csr_matrix:
-        """(2n, K) derivatives of the misclosures of a line by the unknowns, whitened by white (n, 2, 2)."""
+        """(2n, K) derivatives of the misclosures of a line by the unknowns, whitened by white (n, 2, 2).
+
+        Args:
+            name: of the field.
+            line: of the camera.
+            white: whitens the misclosures, (n, 2, 2).
+            by: derivatives of the misclosures.
+        """
         count, data, columns = len(white), [], []
         for one in self.series[name]:
             if line not in one.places:

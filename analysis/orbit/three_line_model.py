@@ -71,7 +71,17 @@ class LineModel:
     def of(
         cls, to_body: ArrayLike, interior: ArrayLike, position: ArrayLike = (0, 0, 0), k1: float = 0.0, k2: float = 0.0
     ) -> LineModel:
-        """Raises ValueError for shapes, values that are not finite, f <= 0 and a to_body that is no rotation."""
+        """The model, checked.
+
+        Raises ValueError for shapes, values that are not finite, f <= 0 and a to_body that is no rotation.
+
+        Args:
+            to_body: rotation from the camera's axes to the body's, (3, 3).
+            interior: f, x0 and y0, (3,), metres.
+            position: projection centre in the body frame, (3,), metres.
+            k1: radial distortion, 1/m^2.
+            k2: likewise, 1/m^4.
+        """
         turn, inner, place = (np.array(v, np.float64) for v in (to_body, interior, position))
         if turn.shape != (3, 3) or inner.shape != (3,) or place.shape != (3,):
             raise ValueError("line model: to_body must be (3, 3), interior and position (3,)")
@@ -151,7 +161,17 @@ class Rays:
         attitude: ArrayLike,
         time: ArrayLike | None = None,
     ) -> Rays:
-        """Raises ValueError for shapes that do not match, values that are not finite, points shown twice."""
+        """The rays, checked.
+
+        Raises ValueError for shapes that do not match, values that are not finite, points shown twice.
+
+        Args:
+            point: which ground point each of n rays shows, (n,).
+            image: x and y in the focal plane, (n, 2), metres.
+            station: of the body's origin, ITRS, (n, 3), metres.
+            attitude: body to ITRS, (n, 3, 3).
+            time: of the exposures, (n,), seconds; None where unknown.
+        """
         which = np.array(point)
         if which.ndim != 1 or (which.size and not np.issubdtype(which.dtype, np.integer)):
             raise ValueError("rays: point must be a row of whole numbers")
@@ -200,7 +220,12 @@ def bias_rotation(bias: ArrayLike) -> Array:
 def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Array:
     """Left sides of the two conditions, metres in the image: (n, 2), zero for perfect data.
 
-    ground: (n, 3) of each ray's point, ITRS. bias: (3,) radians. offset: (3,) of the station, ITRS, metres.
+    Args:
+        camera: interior and mounting of the line.
+        rays: n image points.
+        ground: (n, 3) of each ray's point, ITRS.
+        bias: (3,) radians.
+        offset: (3,) of the station, ITRS, metres.
     """
     f, (x0, y0) = camera.focal_length, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
@@ -213,6 +238,13 @@ def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset
 
 def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Partials:
     """Derivatives of `misclosure` in closed form.
+
+    Args:
+        camera: interior and mounting of the line.
+        rays: n image points.
+        ground: (n, 3) of each ray's point, ITRS, metres.
+        bias: of the attitude, (3,), radians.
+        offset: of the station, (3,), ITRS, metres.
 
     Raises:
         ValueError: a ground point behind a camera.

@@ -120,8 +120,13 @@ def distortion(
 ) -> Array:
     """Distortion (..., N), m, of each point: paper 004, eq. (1).
 
-    position, angle: (..., N) m, rad. principal_distance, principal_point: (...) m, one per set.
     Raises OrientationError for bad readings.
+
+    Args:
+        position: (..., N), m.
+        angle: (..., N), rad.
+        principal_distance: (...) m, one per set.
+        principal_point: likewise.
     """
     where, turned = readings(position, angle)
     t = np.tan(turned)
@@ -173,7 +178,12 @@ def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
 def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike) -> Array:
     """Principal point p (...), m, for a known f (...), m: paper 004, eq. (4).
 
-    position, angle: (..., N) m, rad. Raises OrientationError for bad readings and angles that are all zero.
+    Raises OrientationError for bad readings and angles that are all zero.
+
+    Args:
+        position: (..., N), m.
+        angle: (..., N), rad.
+        principal_distance: (...), m, one per set.
     """
     where, turned = readings(position, angle)
     t = np.tan(turned)
@@ -199,7 +209,13 @@ def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
 
 
 def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
-    """dL/dW (...), m/rad, of the model with these terms and values (P,) at angles (...), rad."""
+    """dL/dW (...), m/rad, of the model with these terms and values (P,) at angles (...), rad.
+
+    Args:
+        angle: (...), rad.
+        terms: names out of `TERMS`.
+        values: of the terms, (P,), m.
+    """
     t = np.tan(np.asarray(angle, dtype=np.float64))
     powers = [_POWER[term] for term in terms]
     steps = np.stack([sign * power * t ** max(power - 1, 0) for power, sign in powers], axis=-1)

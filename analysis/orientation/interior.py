@@ -47,6 +47,11 @@ def condition_number(columns: Array, names: tuple[str, ...], angle: Array) -> fl
     """Condition number of columns (N, P) of these terms at angles (N,), rad, scaled to length one.
 
     Raises InseparableTermsError, naming the terms that take part in the worst combination, when it is too large.
+
+    Args:
+        columns: of the design, (N, P).
+        names: of the terms.
+        angle: (N,), rad.
     """
     length = np.linalg.norm(columns, axis=0)
     _, values, vt = np.linalg.svd(columns / np.where(length > 0, length, 1.0))
@@ -71,6 +76,11 @@ def noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
     """Covariance (N, N) from a covariance (N, N) or sigmas (N,) or ().
 
     Raises OrientationError, with the given name, for another shape, values that are not finite, negative sigmas.
+
+    Args:
+        given: covariance (N, N), or sigmas (N,) or ().
+        count: N.
+        name: of what it is the noise, for messages.
     """
     noise = np.asarray(given, dtype=np.float64)
     if not np.all(np.isfinite(noise)):
@@ -136,8 +146,13 @@ def point_report(
 ) -> PointReport:
     """What a fit of these terms says of p, or would say with p beside them.
 
-    names, values: P terms and their values, m. angle: (N,) rad. noise: (N, N) m^2. weighted: generalised least squares.
-    tolerance: m, largest sigma of an observable p.
+    Args:
+        names: of P terms.
+        values: of the terms, (P,), m.
+        angle: (N,) rad.
+        noise: (N, N) m^2.
+        weighted: generalised least squares.
+        tolerance: m, largest sigma of an observable p.
     """
     fitted = "principal_point" in names
     asked = names if fitted or "decentring" in names else (*names, "principal_point")
@@ -345,14 +360,19 @@ def fit_interior_orientation(
 ) -> InteriorOrientation:
     """Least squares for the terms of the model, linear in all of them.
 
-    position, angle: (N,) m, rad. terms: names out of `TERMS`, with principal_distance among them.
-    covariance: noise of the positions: (N, N) m^2, or sigmas (N,) or one sigma, m.
-    angle_covariance: the same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself
-        (attenuation) is of the order (sigma_W / W)^2, below 1e-8, and left out.
-    weighted: generalised least squares instead of equal weights.
-    point_tolerance: m, sigma up to which p counts as observable; about a pixel, the size that paper 004 expects of p.
     Raises OrientationError for bad readings or noise, fewer angles than terms, nearly constant angles, angles that
     count against the positions; InseparableTermsError for terms that these angles cannot tell apart.
+
+    Args:
+        position: (N,), m.
+        angle: (N,), rad.
+        covariance: noise of the positions: (N, N) m^2, or sigmas (N,) or one sigma, m.
+        terms: names out of `TERMS`, with principal_distance among them.
+        angle_covariance: the same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself
+            (attenuation) is of the order (sigma_W / W)^2, below 1e-8, and left out.
+        weighted: generalised least squares instead of equal weights.
+        point_tolerance: m, sigma up to which p counts as observable; about a pixel, the size that paper 004 expects of
+            p.
     """
     where, turned = readings(position, angle)
     names = tuple(terms)

@@ -61,10 +61,16 @@ def energy_centroid(
     """First moment over the energy inside a window that is re-centred on the result until it rests (paper 001, Fig.
     4).
 
-    radius_px: radius of the circle or half side of the square; default a quarter of the image's smaller side.
-    window: "circle" or "square". Its edge is one pixel soft, so that the result is a smooth function of the image.
-    border_px: width of the frame at the image's edge whose mean is the background.
     The window must stay inside the image.
+
+    Args:
+        mean: mean frames, (B, H, W), DN.
+        frames: of each mean.
+        noise: of the detector.
+        radius_px: radius of the circle or half side of the square; default a quarter of the image's smaller side.
+        window: "circle" or "square". Its edge is one pixel soft, so that the result is a smooth function of the image.
+        border_px: width of the frame at the image's edge whose mean is the background.
+        keep_maps: keep the influence of every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -147,6 +153,14 @@ def gaussian_fit(
     covariance is the sandwich of the estimating equation with its full derivative (White, Econometrica 50, 1 (1982)),
     not the inverse of the normal matrix. radius_px: default an eighth of the image's smaller side; about the first
     dark ring is best.
+
+    Args:
+        mean: mean frames, (B, H, W), DN.
+        frames: of each mean.
+        noise: of the detector.
+        radius_px: of the window; default an eighth of the image's smaller side; about the first dark ring is best.
+        elliptical: fit a, b and c.
+        keep_maps: keep the influence of every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape

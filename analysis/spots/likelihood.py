@@ -42,12 +42,19 @@ def maximum_likelihood_fit(
     The variance of a pixel is temporal / frames + fixed pattern, at the model's grey value; the score is that of a
     normal likelihood with known variance, which for shot noise equals the Poisson score.
 
-    template, index: shapes, and which of them each spot has (default: spot b has shape b modulo the number of shapes).
-    edge_px: least distance of a centre from the image's outermost pixel centres.
-    weights: "total" weighs by temporal and fixed variance (best for one image by itself); "temporal" leaves out the
-        fixed pattern (best for the difference of two images in which the spot has hardly moved). The covariance is
-        right for both.
-    threads: the batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
+    Args:
+        mean: mean frames, (B, H, W), DN.
+        frames: of each mean.
+        noise: of the detector.
+        template: T shapes.
+        index: which of them each spot has, (B,); default: spot b has shape b modulo T.
+        edge_px: least distance of a centre from the image's outermost pixel centres.
+        weights: "total" weighs by temporal and fixed variance (best for one image by itself); "temporal" leaves out the
+            fixed pattern (best for the difference of two images in which the spot has hardly moved). The covariance is
+            right for both.
+        keep_maps: keep the influence of every pixel, for covariances of differences.
+        threads: the batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
+        max_iterations: of the scoring; a spot that needs more is marked.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -175,10 +182,18 @@ def cramer_rao_bound(
     """Least covariance (B, 2, 2) px^2 of (row, column) that any unbiased estimator can reach when all four are
     unknown.
 
-    flux: (B,) DN; background: (B,) DN with black level. The fixed pattern counts as noise: the bound is for one image
-        by itself.
     Inverse Fisher information of the normal likelihood (Kay, Estimation Theory, 1993, eq. 3.31) without the term of
     the variance's own derivative, which Poisson noise does not have.
+
+    Args:
+        template: T shapes.
+        row: (B,), px.
+        column: (B,), px.
+        flux: (B,), DN.
+        background: (B,), DN with black level.
+        noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
+        frames: of which an image is the mean.
+        index: which shape each spot has, (B,); default: spot b has shape b modulo T.
     """
     values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, np.float64)) for v in (row, column, flux, background)))
     theta = np.stack(values, axis=1)

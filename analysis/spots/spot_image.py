@@ -80,7 +80,14 @@ def reject(bad: NDArray[np.bool_], reason: str) -> None:
 
 
 def check_edge(place: Array, height: int, width: int, distance: float) -> None:
-    """Raise SpotError for centres nearer than `distance` px to the outermost pixel centres."""
+    """Raise SpotError for centres nearer than `distance` px to the outermost pixel centres.
+
+    Args:
+        place: row and column, (B, 2), px.
+        height: H, px.
+        width: W, px.
+        distance: least, px.
+    """
     high = np.array([height, width]) - 1 - distance
     bad = ~np.all((place >= distance) & (place <= high), axis=1)
     if np.any(bad):
@@ -101,6 +108,11 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
 
     Works on 4 x 4 bins, so that one hot pixel does not make a spot. Raises SpotError for saturated and for absent
     spots.
+
+    Args:
+        image: mean frames, (B, H, W), DN.
+        frames: of each mean.
+        noise: of the detector.
     """
     count, height, width = image.shape
     rows, columns = height // _BIN, width // _BIN
@@ -142,7 +154,13 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
 
 
 def arms(place: Array, height: int, width: int) -> Array:
-    """(B, 2, H, W) px, each pixel's row and column minus the centre's."""
+    """(B, 2, H, W) px, each pixel's row and column minus the centre's.
+
+    Args:
+        place: row and column, (B, 2), px.
+        height: H, px.
+        width: W, px.
+    """
     out = np.empty((place.shape[0], 2, height, width))
     out[:, 0] = (np.arange(height) - place[:, :1])[:, :, None]
     out[:, 1] = (np.arange(width) - place[:, 1:])[:, None, :]
@@ -152,6 +170,13 @@ def arms(place: Array, height: int, width: int) -> Array:
 def soft_window(place: Array, height: int, width: int, radius: float, kind: str) -> tuple[Array, Array]:
     """Window about each centre, falling from 1 to 0 over one pixel at `radius`: (B, H, W), and d window / d centre (B,
     2, H, W).
+
+    Args:
+        place: row and column, (B, 2), px.
+        height: H, px.
+        width: W, px.
+        radius: of the circle or half side of the square, px.
+        kind: `circle` or `square`.
     """
     arm = arms(place, height, width)
     if kind == "circle":
@@ -181,6 +206,14 @@ def gaussian(
     (B, P).
 
     The weight is the soft circular window over the model's total variance.
+
+    Args:
+        theta: the parameters, (B, 5) or (B, 7), px and DN.
+        height: H, px.
+        width: W, px.
+        radius: of the window, px.
+        noise: of the detector.
+        frames: of which an image is the mean.
     """
     count, size = theta.shape
     arm = arms(theta[:, :2], height, width).reshape(count, 2, -1)
@@ -200,7 +233,14 @@ def gaussian(
 
 
 def variance(level: Array, noise: NoiseModel, frames: int, weights: str) -> Array:
-    """Variance of a mean of frames at grey value `level`, DN^2: "temporal" only, or "total" with the fixed pattern."""
+    """Variance of a mean of frames at grey value `level`, DN^2: "temporal" only, or "total" with the fixed pattern.
+
+    Args:
+        level: grey values, any shape, DN.
+        noise: of the detector.
+        frames: of which an image is the mean.
+        weights: `temporal` or `total`.
+    """
     if weights not in ("total", "temporal"):
         raise ValueError(f"weights must be 'total' or 'temporal', found {weights!r}")
     out: Array = noise.temporal_variance_dn2(level, frames)
@@ -218,7 +258,12 @@ def template_model(
 ) -> tuple[Array, Array]:
     """Model of row, column, flux, background (B, 4): its design (B, 4, P) and grey values (B, P).
 
-    part: as for `SpotTemplate.evaluate`. out: where the design goes, if given.
+    Args:
+        theta: row, column (px), flux and background (DN), (B, 4).
+        which: shape of each spot, (B,).
+        template: the shapes.
+        part: as for `SpotTemplate.evaluate`.
+        out: where the design goes, if given.
     """
     count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
     design = np.empty((count, 4, height * width)) if out is None else out
@@ -231,6 +276,12 @@ def template_model(
 def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tuple[Array, Array]:
     """Temporal and fixed covariance (B, 2, 2) px^2 of estimators with influence `maps` (B, 2, P) at grey values
     `level` (B, P).
+
+    Args:
+        maps: derivative of row and column by each pixel, (B, 2, P), px/DN.
+        level: grey values, (B, P), DN.
+        noise: of the detector.
+        frames: of which an image is the mean.
     """
     turned = maps.transpose(0, 2, 1)
     temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ turned
@@ -255,6 +306,19 @@ def positions(
 
     The noise is taken at the measured image itself: the variance is nearly linear in the grey value, so pixel noise
     averages out, while smoothing would fill the dark rings, where a Gaussian fit puts much weight.
+
+    Args:
+        place: row and column, (B, 2), px.
+        maps: derivative of the place by each pixel, (B, 2, P), px/DN.
+        image: mean frames, (B, H, W), DN.
+        frames: of each mean.
+        noise: of the detector.
+        keep_maps: keep `maps` in the result.
+        flux: (B,), DN.
+        background: (B,), DN.
+        converged: (B,).
+        iterations: of the slowest spot.
+        chi: reduced chi-square of each fit, (B,).
     """
     count = place.shape[0]
     temporal, fixed = propagate(maps.reshape(count, 2, -1), image.reshape(count, -1), noise, frames)

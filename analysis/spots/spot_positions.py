@@ -91,6 +91,11 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
     `before` may hold fewer spots, B0 with B = S * B0: it is then taken once for each of S states (spot b against b
     modulo B0). Each result is for one difference; differences that share a `before` are correlated with one another.
     Raises ValueError when the maps were not kept, or the batches do not fit.
+
+    Args:
+        before: measured with maps.
+        after: likewise.
+        noise: of the detector.
     """
     if before.gain_maps is None or after.gain_maps is None or before.light_dn is None or after.light_dn is None:
         raise ValueError("difference covariance: both positions need their gain maps; measure with keep_maps=True")

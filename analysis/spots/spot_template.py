@@ -82,14 +82,18 @@ class SpotTemplate:
     ) -> SpotTemplate:
         """Calibrate from one image.
 
-        image: (M, N) samples at the detector's pitch / oversampling, larger than the detector by a margin on every
-            side that covers the shifts to be measured (16 to 32 px).
-        row, column: the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
-        shape: (H, W) of the detector.
-        background: constant level to be taken off the image.
-        tolerance: what the factorisation may drop, relative to the peak. For a measured image choose its relative
-            noise.
         Raises ValueError for an image that is not finite, not larger than the detector, or holds no flux.
+
+        Args:
+            image: (M, N) samples at the detector's pitch / oversampling, larger than the detector by a margin on every
+                side that covers the shifts to be measured (16 to 32 px).
+            row: of the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
+            column: of the centre, likewise.
+            shape: (H, W) of the detector.
+            oversampling: samples of `image` per pixel of the detector.
+            background: constant level to be taken off the image.
+            tolerance: what the factorisation may drop, relative to the peak. For a measured image choose its relative
+                noise.
         """
         data = np.asarray(image, dtype=np.float64)
         if data.ndim != 2 or not np.all(np.isfinite(data)):
@@ -187,12 +191,15 @@ class SpotTemplate:
     ) -> tuple[Array, Array, Array]:
         """The spot at (row, column), with its derivatives.
 
-        row, column: (B,) positions of the spot's centre in detector pixels.
-        index: (B,) which of the T shapes; default: spot b has shape b modulo T.
-        part: first pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector that is wanted;
-            default: all of it.
         Returns value, d value / d row, d value / d column, each (B, H, W) or (B, h, w); value is the fraction of the
         flux per pixel. Raises TemplateRangeError, naming the spots, for positions outside `supported`.
+
+        Args:
+            row: of the spots' centres, (B,), detector pixels.
+            column: likewise.
+            index: (B,) which of the T shapes; default: spot b has shape b modulo T.
+            part: first pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector that is wanted;
+                default: all of it.
         """
         rows = np.atleast_1d(np.asarray(row, dtype=np.float64))
         columns = np.atleast_1d(np.asarray(column, dtype=np.float64))
@@ -216,7 +223,13 @@ class SpotTemplate:
     ) -> None:
         """Fill ``out`` (B, 4, H, W) with the derivatives of a spot over a background by row, column, flux, background.
 
-        theta: (B, 4) these four. index, part: as for `evaluate`. Raises TemplateRangeError as `evaluate` does.
+        Raises TemplateRangeError as `evaluate` does.
+
+        Args:
+            out: what is filled, (B, 4, H, W), or (B, 4, h, w) of a part; per px, without unit, and 1.
+            theta: row, column (px), flux and background (DN), (B, 4).
+            index: as for `evaluate`.
+            part: as for `evaluate`.
         """
         self._check_range(theta[:, 0], theta[:, 1], index)
         place = theta[:, :2] - (0 if part is None else part[0])

@@ -175,6 +175,14 @@ def cross_validate(
     Fold k leaves out the inner points k, k + folds, ...: the neighbours of a left-out point stay, and the gap that is
     bridged is two steps. The first and the last point are never left out, for no fit is used outside of its points.
 
+    Args:
+        name: of the fit.
+        angle: of the points, (N,).
+        value: there, (N,).
+        sigma: of the values, (N,) or a number, in their unit.
+        seed: of fits that draw.
+        folds: K.
+
     Raises:
         ValueError, NotConvergedError: as `fit`; the fit needs enough points without a fold.
     """

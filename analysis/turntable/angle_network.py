@@ -109,6 +109,12 @@ def gradient(net: Any, x: Array) -> Array:
 def response(net: Any, x: Array, y: Array, weight: Array) -> Array:
     """Derivative (3 H + 1, N) of the trained weights with respect to the values, by the implicit function theorem at
     the minimum of 1/2 sum weight (net - y)^2 + DECAY/2 (|w|^2 + |v|^2).
+
+    Args:
+        net: trained, as for `gradient`.
+        x: inputs of the net, (N,).
+        y: values that it was trained with, (N,).
+        weight: of the values, (N,).
     """
     w, b, v, c = net.coefs_[0][0], net.intercepts_[0], net.coefs_[1][:, 0], net.intercepts_[1][0]
     n = len(w)

@@ -295,6 +295,11 @@ def step_kernel(first: Array, second: Array, step: float) -> Array:
 
     A model, not a measurement: the error between two points says little about that between the next two. The triangle
     is a valid correlation (its Fourier transform is not negative).
+
+    Args:
+        first: (M,).
+        second: (L,), in the same unit.
+        step: of the readings, in that unit.
     """
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(first[:, None] - second) / step))
 

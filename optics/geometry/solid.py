@@ -274,7 +274,13 @@ class SolidMesh:
 
 
 def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Point and outward unit normal of a face in the world, (3,) each."""
+    """Point and outward unit normal of a face in the world, (3,) each.
+
+    Args:
+        face: of a solid.
+        placed: bodies of S states.
+        state: which of them.
+    """
     pose = placed.pose(face.body, state)
     scale = float(placed.scale[state, placed.index[face.body]].real)
     return pose.apply(scale * face.pose.translation), pose.rotation @ face.pose.rotation[:, 2]

@@ -79,18 +79,37 @@ def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
 
 
 def zernike(index: int, x: Any, y: Any) -> np.ndarray:
-    """Value of Z_j at unit-disk coordinates x, y (same shape)."""
+    """Value of Z_j at unit-disk coordinates x, y (same shape).
+
+    Args:
+        index: Noll's j.
+        x: on the unit disk, any shape.
+        y: of the same shape.
+    """
     x, y = np.asarray(x), np.asarray(y)
     return np.asarray(sum(c * x**a * y**b for a, b, c in cartesian_terms(index)))
 
 
 def basis(last: int, x: Any, y: Any) -> np.ndarray:
-    """Z_1..Z_last at points (N,) as columns, shape (N, last)."""
+    """Z_1..Z_last at points (N,) as columns, shape (N, last).
+
+    Args:
+        last: highest Noll index.
+        x: on the unit disk, (N,).
+        y: likewise.
+    """
     return np.stack([zernike(j, x, y) * np.ones_like(x) for j in range(1, last + 1)], axis=-1)
 
 
 def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
-    """Derivatives of Z_1..Z_last along x (axis 0) or y (axis 1) at points (N,), shape (N, last)."""
+    """Derivatives of Z_1..Z_last along x (axis 0) or y (axis 1) at points (N,), shape (N, last).
+
+    Args:
+        last: highest Noll index.
+        x: on the unit disk, (N,).
+        y: likewise.
+        axis: 0: by x, 1: by y.
+    """
     columns = []
     for j in range(1, last + 1):
         column = np.zeros_like(x)
@@ -170,6 +189,11 @@ def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int)
 def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.ndarray:
     """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape
     (triangle_size(order),).
+
+    Args:
+        coefficients: Noll index j -> a_j, metres rms; complex ones, too.
+        order: highest degree a + b, at least that of the terms.
+        radius: of the disk, metres.
     """
     out = np.zeros(triangle_size(order), np.result_type(float, *coefficients.values()))
     for j, amplitude in coefficients.items():

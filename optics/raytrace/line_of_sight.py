@@ -53,7 +53,16 @@ def chief_directions(
     guess: np.ndarray,
     transverse: np.ndarray,
 ) -> np.ndarray:
-    """Object-space directions of ``chief_rays``, toward the scene, world, (B, M, 3)."""
+    """Object-space directions of ``chief_rays``, toward the scene, world, (B, M, 3).
+
+    Args:
+        backend: where to trace.
+        to_stop: B systems from the image to the stop.
+        to_object: the same systems from the image to the scene.
+        points: image points, world, (B, M, 3), metres.
+        guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
+        transverse: direction near which the first transverse axis is taken, (3,).
+    """
     return chief_rays(backend, to_stop, to_object, points, guess, transverse)[1]
 
 

@@ -100,6 +100,12 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
 
     Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own. A direction (3,)
     is kept as one vector: a trace through conics is held up by the memory that it reads.
+
+    Args:
+        backend: where to.
+        position: (3,), (N, 3) or (B, N, 3), metres.
+        direction: unit vectors, likewise.
+        path: optical path so far, metres, one for each ray; 0 by default.
     """
     import drjit as dr
 

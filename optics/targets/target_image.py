@@ -112,6 +112,11 @@ class EdgeProfile:
     def image(self, edge: HalfPlane, x: Grid, y: Grid) -> np.ndarray:
         """Irradiance at pixel centres, (R, C), for any edge with the profile's normal.
 
+        Args:
+            edge: half plane with the profile's normal.
+            x: pixel centres along columns, (C,), metres.
+            y: along rows, (R,), metres.
+
         Raises:
             ValueError: an edge with another normal, or pixels beyond the reach.
         """

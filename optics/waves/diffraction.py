@@ -136,7 +136,14 @@ def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: 
 
 
 def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid) -> np.ndarray:
-    """Derivative of ``image`` by the parameter of ``tangent``, exact, (B, R, C)."""
+    """Derivative of ``image`` by the parameter of ``tangent``, exact, (B, R, C).
+
+    Args:
+        field: of B images.
+        tangent: its derivative by a parameter.
+        x: places along columns, C, metres.
+        y: along rows, R, metres.
+    """
     k = 2.0 * np.pi / field.wavelength
     out = np.empty((len(field.u), y.count, x.count))
     for i in range(len(field.u)):
@@ -219,7 +226,13 @@ def huygens(
 
 
 def airy(radius: np.ndarray, wavelength: float, f_number: float) -> np.ndarray:
-    """Airy pattern of a clear circular pupil, 1 at the centre; ``radius`` in metres."""
+    """Airy pattern of a clear circular pupil, 1 at the centre; ``radius`` in metres.
+
+    Args:
+        radius: from the middle of the image, any shape, metres.
+        wavelength: metres.
+        f_number: of the beam.
+    """
     z = np.pi * np.asarray(radius) / (wavelength * f_number)
     safe = np.where(z == 0.0, 1.0, z)
     return np.where(z == 0.0, 1.0, (2.0 * j1(safe) / safe) ** 2)

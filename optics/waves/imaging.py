@@ -102,7 +102,18 @@ def imaging_rays(
     nodes: PupilNodes,
     first: np.ndarray | None = None,
 ) -> ImagingRays:
-    """Trace the beams of ``imaging_field``; arguments and exceptions as there."""
+    """Trace the beams of ``imaging_field``; arguments and exceptions as there.
+
+    Args:
+        backend: where to trace.
+        systems: B systems from the scene to the detector.
+        to_stop: the same systems, only as far as the stop.
+        direction: of the light, world, unit, (3,) or (B, 3).
+        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres.
+        stop: clear aperture of the stop.
+        nodes: N nodes of a quadrature over the unit disk.
+        first: as for ``aim_collimated``.
+    """
     target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
     launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
     count = len(launched)
@@ -170,7 +181,14 @@ def pupil_field(
     origin: np.ndarray | None = None,
     incoming: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> PupilField:
-    """Plane waves of traced beams; arguments as ``imaging_field``."""
+    """Plane waves of traced beams; arguments as ``imaging_field``.
+
+    Args:
+        rays: B traced beams.
+        wavelength: metres.
+        origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
+        incoming: what the beam brings along beyond a plane wave, as for ``imaging_field``; nothing by default.
+    """
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]
     leaving = rays.direction
     phase = eikonal(rays.position, leaving, rays.path, centre)

@@ -67,7 +67,13 @@ class PupilShadow:
 
     @classmethod
     def within(cls, polygons: np.ndarray, harmonics: np.ndarray, rim_sides: int = RIM_SIDES) -> PupilShadow:
-        """What polygons (B, K, V, 2), which do not overlap, take of pupils with edges of ``harmonics`` (2H + 1, B)."""
+        """What polygons (B, K, V, 2), which do not overlap, take of pupils with edges of ``harmonics`` (2H + 1, B).
+
+        Args:
+            polygons: in the pupils, which do not overlap, (B, K, V, 2).
+            harmonics: of the pupils' edges, complex (2H + 1, B).
+            rim_sides: of the polygon that stands for an edge.
+        """
         radius = edge_radius(harmonics)
         return cls(tiled(cut(polygons, radius, rim_sides))[0], radius)
 
@@ -271,6 +277,11 @@ def _radius(terms: np.ndarray, turn: np.ndarray) -> np.ndarray:
 def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
     """The part of each polygon (B, K, V, 2) inside of edges with Fourier terms ``radius`` (B, H), for which polygons of
     the same area with so many sides stand; counterclockwise.
+
+    Args:
+        polygons: (B, K, V, 2), in p.
+        radius: of the edges as Fourier terms over the angle, complex (B, H).
+        rim_sides: of the polygon of the same area that stands for an edge.
     """
     number = polygons.shape[1]
     flat = polygons.reshape(-1, *polygons.shape[2:])
@@ -305,6 +316,11 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     Whatever of a polygon's boundary lies outside of the edge is drawn in along the radius. That changes no winding
     number of a point inside of the edge, so that the new boundary goes once around the intersection and around nothing
     else. Each side becomes an arc, a straight piece and an arc; most of them are of no length.
+
+    Args:
+        polygons: (F, V, 2), in p.
+        radius: of the edge of each as Fourier terms over the angle, complex (F, H).
+        count: nodes along each of the two directions.
     """
     start = polygons[..., 0] + 1j * polygons[..., 1]
     after = np.roll(start, -1, axis=1)

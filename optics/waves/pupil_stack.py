@@ -321,7 +321,13 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
 
 
 def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
-    """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K)."""
+    """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K).
+
+    Args:
+        x: in [-1, 1], any shape.
+        y: of the same shape.
+        degree: highest i + j.
+    """
     tx, ty = chebyshev.chebvander(x, degree), chebyshev.chebvander(y, degree)
     out = np.empty((*np.shape(x), (degree + 1) * (degree + 2) // 2))
     first = 0

@@ -240,6 +240,12 @@ class TransferTable:
     ) -> TransferTable:
         """Table of one image; arguments as ``polychromatic_transfer``, with one defocus (metres).
 
+        Args:
+            pupil: of the image.
+            wavelengths: (K,), metres.
+            weights: (K,) share of the signal at each.
+            defocus: of the detector along its normal, metres, positive downstream.
+
         Raises:
             ValueError: as there, or a wavefront of so many waves that the table would grow out of hand.
         """

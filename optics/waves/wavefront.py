@@ -91,6 +91,13 @@ def fit_wavefront(
     """Fit Z1..Z_last to path differences at pupil coordinates x, y (unit disk) with quadrature weights.
 
     Piston and tilt are removed from ``rms`` (they move the image, they do not blur it); defocus is kept.
+
+    Args:
+        x: on the unit disk, (N,).
+        y: likewise.
+        weight: of a quadrature, (N,).
+        difference: of optical paths, (..., N), metres.
+        last: highest Noll index.
     """
     coefficients = zernike.fit(last, x, y, difference, weight)
     share = weight / np.sum(weight)
