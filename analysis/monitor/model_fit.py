@@ -122,8 +122,16 @@ class MotionReport:
 
 @dataclass(frozen=True, eq=False)
 class ObservabilityReport:
-    """rank and singular values (of noise-weighted, unit-scaled signatures) of all motions and of the family; one
-    report per motion; statements in plain English that name what cannot be separated.
+    """What M motions look like to the spots, and which of them can be told apart.
+
+    Attributes:
+        rank: of the noise-weighted, unit-scaled signatures of all motions.
+        singular_values: of the same, (min(4, M),), falling, 1.
+        family: names of the P motions that the model fits.
+        family_rank: the rank of these alone.
+        family_singular_values: of these alone, (P,).
+        motions: a report on each.
+        statements: plain English that names what cannot be separated.
     """
 
     rank: int
