@@ -2,14 +2,18 @@
 them without a traceback from the first moment on.
 """
 
+import multiprocessing
 import re
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
 from tests.twin.study_bench import ROOT
+from twin.study.runs.cluster import _children_deaf_to_ctrl_c, _ending_later
 
 HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
@@ -60,3 +64,44 @@ def test_ctrl_c_during_imports_leaves_no_traceback(program: str, tmp_path: Path)
     done = run("-m", program, "--help", env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"})
     assert done.returncode in (130, -2)  # by the signal, which a shell shows as 130
     assert done.stderr == "interrupted\n"
+
+
+def hears() -> None:
+    """In a process of its own: exit code 1 where SIGINT reaches it, else 0."""
+    sys.exit(signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+def exit_code_of_a_worker() -> int:
+    """Started by a thread, as Dask starts its workers."""
+    codes = []
+
+    def start() -> None:
+        process = multiprocessing.get_context("spawn").Process(target=hears)
+        process.start()
+        process.join(60)
+        codes.append(process.exitcode)
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    return codes[0]
+
+
+def test_workers_leave_ctrl_c_to_their_command() -> None:
+    with _children_deaf_to_ctrl_c():
+        assert exit_code_of_a_worker() == 0
+    assert exit_code_of_a_worker() == 1
+
+
+def test_a_signal_waits_for_the_end_of_what_cannot_be_broken_off() -> None:
+    done = []
+
+    def work() -> None:
+        with _ending_later():
+            signal.raise_signal(signal.SIGINT)
+            done.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert done
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

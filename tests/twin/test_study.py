@@ -5,6 +5,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -258,6 +259,23 @@ def test_a_scheduler_that_is_not_there(tmp_path) -> None:
     result = run(path, "--out", tmp_path / "run", "--scheduler", "nowhere")
     assert result.exit_code == 2
     assert "tcp://" in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("later", [0.0, 0.5, 1.5])
+def test_ctrl_c_while_workers_start_is_one_sentence(tmp_path, later) -> None:
+    """To the whole group: the workers are importing, and the command waits for them."""
+    process = start(write_study(tmp_path / "in"), "--out", tmp_path / "run", "--workers", 2, "--quiet")
+    try:
+        wait_for(lambda: len(children(process.pid)) >= 1)
+        time.sleep(later)
+        os.killpg(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, errors
+    assert output == ""
+    assert re.fullmatch(r"error: interrupted; what is done is kept, .*--resume\n", errors), errors
 
 
 @pytest.mark.slow

@@ -6,16 +6,19 @@ import logging
 import os
 import queue
 import shutil
+import signal
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin.run.cli import InputErrorText
+from twin.run.cli import InputErrorText, ending_signals
 from twin.run.versions import source_digest, versions
 from twin.study.runs.task import ONE_THREAD
 
@@ -131,28 +134,61 @@ def local_workers(count: int) -> Iterator[Workers]:
     with _kept_environment():
         _silence()
         try:
-            with (
-                dask.config.set(settings),
-                LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    protocol="tls",
-                    security=Security.temporary(),
-                    # no dashboard; the port for it cannot be left out, so it is a free one, seen by this machine only
-                    dashboard_address="127.0.0.1:0",
-                    worker_dashboard_address="127.0.0.1:0",
-                    scheduler_kwargs={"dashboard": False},
-                    local_directory=str(place),
-                    memory_limit=0,
-                    silence_logs=logging.CRITICAL,
-                ) as cluster,
-                Client(cluster, set_as_default=False) as client,
-            ):
-                yield Workers(client, True)
+            with dask.config.set(settings), ExitStack() as stack:
+                with _ending_later(), _children_deaf_to_ctrl_c():
+                    cluster = LocalCluster(
+                        n_workers=count,
+                        threads_per_worker=1,
+                        processes=True,
+                        host="127.0.0.1",
+                        protocol="tls",
+                        security=Security.temporary(),
+                        # no dashboard; its port cannot be left out, so it is a free one, seen by this machine only
+                        dashboard_address="127.0.0.1:0",
+                        worker_dashboard_address="127.0.0.1:0",
+                        scheduler_kwargs={"dashboard": False},
+                        local_directory=str(place),
+                        memory_limit=0,
+                        silence_logs=logging.CRITICAL,
+                    )
+                    stack.enter_context(cluster)
+                yield Workers(stack.enter_context(Client(cluster, set_as_default=False)), True)
         finally:
             shutil.rmtree(place, ignore_errors=True)
+
+
+@contextmanager
+def _ending_later() -> Iterator[None]:
+    """Signals that ask the program to end are heeded when the block is over: Dask cannot close what has half begun."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    got: list[int] = []
+    asked = (signal.SIGINT, *ending_signals())
+    before = {number: signal.signal(number, lambda number, frame: got.append(number)) for number in asked}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for number in got:
+        signal.raise_signal(number)
+
+
+@contextmanager
+def _children_deaf_to_ctrl_c() -> Iterator[None]:
+    """Threads that begin inside the block, and the processes that they start, do not hear SIGINT.
+
+    A terminal sends it to all processes of a command. This one ends its workers, which otherwise, while they import
+    and while they compute, would each tell of it with a traceback.
+    """
+    # whoever starts the tracker unblocks the signal, so that it is started before
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
