@@ -194,12 +194,14 @@ def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
 def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None) -> SpecType:
     path = _candidate(folder, name_or_path, Path(relative_to) if relative_to is not None else Path())
     if path is None:
-        name, names = str(name_or_path), library_names(folder)
-        allowed = f"{names_text(names)}, or the path of a .yaml file"
-        raise InputError(
-            Issue(f"no such name in {folder}", found=shown(name), allowed=allowed, suggestion=nearest(name, names))
-        )
+        name, allowed = str(name_or_path), _names_and_paths(folder)
+        meant = nearest(name, library_names(folder))
+        raise InputError(Issue(f"no such name in {folder}", found=shown(name), allowed=allowed, suggestion=meant))
     return validate(model, read_yaml(path))
+
+
+def _names_and_paths(folder: str) -> str:
+    return f"{names_text(library_names(folder))}, or the path of a .yaml file"
 
 
 def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
@@ -207,13 +209,12 @@ def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
     file = owner.source.file
     path = _candidate(folder, reference, Path(file).parent if file else Path())
     if path is None:
-        names = library_names(folder)
-        allowed = f"{names_text(names)}, or the path of a .yaml file"
-        raise owner.error(
-            f"no such name in {folder}", key, found=reference, allowed=allowed, suggestion=nearest(reference, names)
-        )
+        meant = nearest(reference, library_names(folder))
+        problem, allowed = f"no such name in {folder}", _names_and_paths(folder)
+        raise owner.error(problem, key, found=reference, allowed=allowed, suggestion=meant)
     if not path.is_file():
-        raise owner.error(f"no such file: {path}", key)
+        meant = nearest(path.stem, library_names(folder))
+        raise owner.error(f"no such file: {path}", key, allowed=_names_and_paths(folder), suggestion=meant)
     return path
 
 

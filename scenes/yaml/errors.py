@@ -44,12 +44,13 @@ class Issue:
         if self.key:
             place += f": {key_text(self.key)}"
         text = f"{place}: {self.problem}"
-        if self.found is not None:
-            text += f"; found {self.found}"
-        if self.allowed is not None:
-            text += f", allowed: {self.allowed}" if self.found is not None else f"; allowed: {self.allowed}"
-        if self.suggestion is not None:
-            text += f"; did you mean {self.suggestion!r}?"
+        known = [] if self.found is None else [f"found {self.found}"]
+        known += [] if self.allowed is None else [f"allowed: {self.allowed}"]
+        rest = ", ".join(known)
+        if self.suggestion is not None:  # first: the lists of what is allowed can be long
+            text += f"; did you mean {self.suggestion!r}?" + (f" {rest[0].upper()}{rest[1:]}" if rest else "")
+        elif rest:
+            text += f"; {rest}"
         return printable(text)
 
 
@@ -124,10 +125,19 @@ class Problem(ValueError):
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
-    """The one of `names` that `name` was probably meant to be, or None if none comes near. Case is ignored."""
+    """The one of `names` that `name` was probably meant to be, or None if none comes near. Case is ignored.
+
+    Of a path the last parts are enough: M2 is near to base/forward/M2.
+    """
+    wanted = name.casefold()
     folded = {candidate.casefold(): candidate for candidate in names}
-    matches = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.6)
-    return folded[matches[0]] if matches else None
+    parts = wanted.count("/") + 1
+    tails = {"/".join(candidate.split("/")[-parts:]): candidate for candidate in reversed(folded)}
+    for known in ({candidate: candidate for candidate in folded}, tails):
+        matches = difflib.get_close_matches(wanted, known, n=1, cutoff=0.6)
+        if matches:
+            return folded[known[matches[0]]]
+    return None
 
 
 def key_text(key: KeyPath) -> str:

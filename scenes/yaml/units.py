@@ -8,6 +8,7 @@ the same bits.
 
 import math
 import re
+import unicodedata
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation, localcontext
 from functools import cache
@@ -24,6 +25,8 @@ _QUANTITY = re.compile(rf"({_NUMBER})(?:\s+({_UNIT})|({_NAME}(?:[*/]{_NAME}){{0,
 _BARE = re.compile(_NUMBER)
 _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)\b.*", re.IGNORECASE | re.DOTALL)
 LONGEST_TEXT = 100
+OTHER_MINUS = tuple("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d")
+"""Signs that text processors put where a minus was typed; they look like it and are none."""
 PATTERN = rf"^{_NUMBER}\s*{_UNIT}$"
 """Regular expression of a quantity, for editors; the reader is stricter."""
 
@@ -158,6 +161,8 @@ def parse_quantity(text: object, kind: Kind) -> float:
         raise Problem("not a finite number", shown(text), kind.allowed)
     if _BARE.fullmatch(stripped):
         raise Problem("a number without a unit", stripped, kind.allowed)
+    if stripped[:1] in OTHER_MINUS:
+        raise foreign_minus(stripped)
     match = _QUANTITY.fullmatch(stripped) if len(stripped) <= LONGEST_TEXT else None
     if match is None:
         raise Problem("not a number with a unit", shown(text), kind.allowed)
@@ -165,6 +170,13 @@ def parse_quantity(text: object, kind: Kind) -> float:
     if not math.isfinite(value):
         raise Problem("not a finite number", shown(text), kind.allowed)
     return value
+
+
+def foreign_minus(text: str) -> Problem:
+    """What is wrong with a number that begins with one of `OTHER_MINUS`."""
+    sign = text[0]
+    remedy = f"the minus sign of the keyboard, '-': -{text[1:].lstrip()}"
+    return Problem(f"a number with the sign U+{ord(sign):04X} ({unicodedata.name(sign).lower()})", shown(text), remedy)
 
 
 def format_quantity(value: float, kind: Kind) -> str:

@@ -28,10 +28,12 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
-from scenes.yaml.errors import InputError, Issue, KeyPath, shown
+from scenes.yaml.errors import InputError, Issue, KeyPath, nearest, shown
+from scenes.yaml.units import OTHER_MINUS, foreign_minus
 
 LARGEST_BYTES = 1_000_000
 DEEPEST = 32
+SPACES = "spaces, for each level two more"
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,6})?")
@@ -76,6 +78,10 @@ def parse_yaml(text: str, file: str = "") -> YamlFile:
             builder.take(event)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
+        if mark and (line := _line_with_tab(text, mark.line, mark.column)) is not None:
+            raise InputError(
+                Issue("a TAB character, which YAML does not take here", file, line, allowed=SPACES)
+            ) from None
         problem = error.problem or error.context or "cannot be read"
         raise InputError(Issue(f"not valid YAML: {problem}", file, mark.line + 1 if mark else None)) from None
     except YAMLError as error:
@@ -83,6 +89,15 @@ def parse_yaml(text: str, file: str = "") -> YamlFile:
     if builder.root is None:
         raise InputError(Issue("the file is empty", file, 1))
     return YamlFile(file, builder.root, builder.lines)
+
+
+def _line_with_tab(text: str, last: int, column: int) -> int | None:
+    """Number of the line, counted from 1, whose TAB the parser stumbled over at a line and column counted from 0."""
+    lines = text.splitlines()[: last + 1]
+    if len(lines) > last and "\t" in lines[-1][: column + 1]:
+        return len(lines)
+    indented = (number for number, line in enumerate(lines, 1) if "\t" in line[: len(line) - len(line.lstrip())])
+    return next(indented, None)
 
 
 def dump_yaml(data: Any) -> str:
@@ -126,7 +141,7 @@ def _read_text(path: str | Path) -> str:
         with Path(path).open("rb") as stream:
             content = stream.read(LARGEST_BYTES + 1)
     except FileNotFoundError:
-        raise InputError(Issue("no such file", file)) from None
+        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path)))) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
@@ -137,6 +152,16 @@ def _read_text(path: str | Path) -> str:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise InputError(Issue(f"not UTF-8 text: byte 0x{content[error.start]:02x}", file, line)) from None
+
+
+def _file_beside(path: Path) -> str | None:
+    """The YAML file in the same folder that was probably meant."""
+    try:
+        names = [place.name for place in path.parent.iterdir() if place.suffix in (".yaml", ".yml")]
+    except (OSError, ValueError):
+        return None
+    meant = nearest(path.name, names)
+    return None if meant is None else str(path.parent / meant)
 
 
 class _Builder:
@@ -182,7 +207,7 @@ class _Builder:
             return
         value: Any
         if isinstance(event, ScalarEvent):
-            value = _scalar(event)
+            value = self._plain(event, line)
         else:
             value = {} if isinstance(event, MappingStartEvent) else []
         path = self._place(value, line)
@@ -191,6 +216,20 @@ class _Builder:
                 self._refuse("nested too deeply", line, f"at most {DEEPEST} levels")
             self._open.append((value, path))
             self._key.append(None)
+
+    def _plain(self, event: ScalarEvent, line: int) -> Any:
+        text = event.value
+        if event.implicit[0] and text[:1] in OTHER_MINUS and not isinstance(_number_or_text("-" + text[1:]), str):
+            wrong = foreign_minus(text)
+            raise InputError(Issue(wrong.problem, self._file, line, self._here(), wrong.found, wrong.allowed))
+        return _scalar(event)
+
+    def _here(self) -> KeyPath:
+        """Where the next value will stand."""
+        if not self._open:
+            return ()
+        container, path = self._open[-1]
+        return (*path, self._key[-1] or "") if isinstance(container, dict) else (*path, len(container))
 
     def _take_key(self, event: Event, line: int) -> None:
         mapping, path = self._open[-1]

@@ -12,9 +12,11 @@ def test_message() -> None:
         "no such node", "job.yaml", 4, ("perturb", "base/M9", "shift", 2), "'base/M9'", "base/M1, base/M2", "base/M1"
     )
     assert str(issue) == (
-        "job.yaml:4: perturb.base/M9.shift[2]: no such node; "
-        "found 'base/M9', allowed: base/M1, base/M2; did you mean 'base/M1'?"
+        "job.yaml:4: perturb.base/M9.shift[2]: no such node; did you mean 'base/M1'? "
+        "Found 'base/M9', allowed: base/M1, base/M2"
     )
+    assert str(Issue("wrong", "a.yaml", found="x", allowed="y")) == "a.yaml: wrong; found x, allowed: y"
+    assert str(Issue("wrong", "a.yaml", suggestion="y")) == "a.yaml: wrong; did you mean 'y'?"
     assert str(Issue("no such file", "job.yaml")) == "job.yaml: no such file"
     assert str(Issue("wrong", allowed="right")) == "input: wrong; allowed: right"
 
@@ -29,7 +31,7 @@ def test_error_gives_the_first_issue_and_all_of_them() -> None:
         "g",
         "h",
     )
-    assert str(error).splitlines() == ["a.yaml:1: x: one; found f, allowed: g; did you mean 'h'?", "a.yaml:2: two"]
+    assert str(error).splitlines() == ["a.yaml:1: x: one; did you mean 'h'? Found f, allowed: g", "a.yaml:2: two"]
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
     with pytest.raises(ValueError, match="at least one issue"):
         InputError()
@@ -39,6 +41,14 @@ def test_nearest() -> None:
     assert nearest("ARCSEK", ["arcsec", "deg"]) == "arcsec"
     assert nearest("zzz", ["arcsec", "deg"]) is None
     assert nearest("x", []) is None
+
+
+def test_of_a_path_the_last_parts_are_enough() -> None:
+    nodes = ["base", "base/forward/M1", "base/forward/M2", "base/backward/M2", "base/forward/focal_plane"]
+    assert nearest("M2", nodes) == "base/forward/M2"
+    assert nearest("backward/m2", nodes) == "base/backward/M2"
+    assert nearest("focalplane", nodes) == "base/forward/focal_plane"
+    assert nearest("nothing/like/it", nodes) is None
 
 
 def test_shown_is_one_short_line() -> None:

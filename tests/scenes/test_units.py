@@ -157,3 +157,11 @@ def test_the_units_that_are_suggested_are_those_of_pint() -> None:
         assert asked is not None
         assert asked[1] == base
         assert abs(asked[0] / factor - 1) < 1e-26
+
+
+@pytest.mark.parametrize("sign", units.OTHER_MINUS)
+def test_a_minus_that_is_none_is_named(sign: str) -> None:
+    with pytest.raises(Problem, match=f"U\\+{ord(sign):04X}") as caught:
+        parse_quantity(f"{sign} 3 um", LENGTH)
+    assert caught.value.allowed is not None
+    assert caught.value.allowed.endswith(": -3 um")

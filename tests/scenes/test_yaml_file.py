@@ -27,7 +27,14 @@ BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
         ("x: 1\n---\ny: 2\n", 2, "a second document"),
         ("x: 1\n? [1, 2]\n: 3\n", 2, "a key must be a plain name"),
         ("x: [1, 2\ny: 3\n", 2, "not valid YAML"),
-        ("x: 1\n\ty: 3\n", 2, "not valid YAML"),
+        ("x: 1\n\ty: 3\n", 2, "a TAB character, which YAML does not take here; allowed: spaces"),
+        ("x:\n\ty: 3\n", 2, "a TAB character"),
+        ("x:\t1\ny: [\n", 1, "a TAB character"),
+        ("x:\n  - y: 1\n\t  z: 2\n", 3, "a TAB character"),
+        ("x: [1 # a\tcomment\ny: 2\n", 2, "not valid YAML"),
+        ("a: 1\nx: \u22123\n", 2, "x: a number with the sign U+2212 (minus sign); found"),
+        ("a: 1\nx: [1, \u20132.5e-3]\n", 2, "x[1]: a number with the sign U+2013 (en dash)"),
+        ("\u22123\n", 1, "minus sign of the keyboard, '-': -3"),
         ("x: \x01\n", None, "not valid YAML"),
         ("", 1, "the file is empty"),
         ("# only a comment\n", 1, "the file is empty"),
@@ -45,6 +52,21 @@ def test_refused(text: str, line: int | None, words: str, tmp_path: Path) -> Non
     assert words in str(caught.value)
     assert str(caught.value).startswith(str(path) + (f":{line}: " if line else ": "))
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_text_with_tabs_and_minus_signs_is_text() -> None:
+    text = "name: '3\tum'\nsaid: \u22123 K and more\nquoted: '\u22123'\n# a\tcomment\n"
+    assert parse_yaml(text).data == {"name": "3\tum", "said": "\u22123 K and more", "quoted": "\u22123"}
+
+
+def test_a_file_that_is_not_there_names_the_nearest(tmp_path: Path) -> None:
+    (tmp_path / "perturb.yaml").touch()
+    with pytest.raises(InputError) as caught:
+        read_yaml(tmp_path / "pertub.yaml")
+    assert caught.value.suggestion == str(tmp_path / "perturb.yaml")
+    with pytest.raises(InputError) as caught:
+        read_yaml(tmp_path / "none" / "perturb.yaml")
+    assert caught.value.suggestion is None
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
