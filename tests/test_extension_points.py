@@ -251,7 +251,7 @@ def test_an_unknown_noise_is_told_with_file_line_key_and_remedy(tmp_path: Path) 
     with pytest.raises(InputError) as caught:
         EmvaDetector.from_sheet(load_detector(path), 0.01)
     line = len(path.read_text("utf-8").splitlines())
-    said = f"{path}:{line}: noise.raed: no such noise; found 'raed', allowed: read, offset; did you mean 'read'?"
+    said = f"{path}:{line}: noise.raed: no such noise; did you mean 'read'? Found 'raed', allowed: read, offset"
     assert str(caught.value) == said
 
 
@@ -783,8 +783,8 @@ def test_a_sampler_must_keep_to_the_unit_cube(points: np.ndarray, monkeypatch: p
         (
             DesignSpec,
             "{kind: sobl, runs: 3}",
-            "kind: not one of the choices; found 'sobl', allowed: grid, latin_hypercube, sobol, monte_carlo; "
-            "did you mean 'sobol'?",
+            "kind: not one of the choices; did you mean 'sobol'? "
+            "Found 'sobl', allowed: grid, latin_hypercube, sobol, monte_carlo",
         ),
         (
             JobSpec,

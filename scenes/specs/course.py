@@ -11,7 +11,8 @@ from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.units import MOMENT, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT, format_quantity
 
-TemperatureChange = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="1000 K")]
+TemperatureChange = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]
+"""Kelvin. Nothing in an instrument at work becomes 100 K warmer; 250 K without a sign is an absolute temperature."""
 TemperatureGradient = Annotated[tuple[float, float, float], Vector(Quantity(TEMPERATURE_GRADIENT, largest="1000 K/m"))]
 Moment = Annotated[float, Quantity(MOMENT, largest="100000 h")]
 

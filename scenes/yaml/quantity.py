@@ -43,12 +43,14 @@ class Quantity:
         largest: limit on its size (its absolute value), with unit; None for no limit.
         smallest: limit from below on the signed value, with unit.
         above_zero: it must be greater than zero.
+        unsigned: of a difference: a larger one is written with its sign, since without it is hardly meant as one.
     """
 
     kind: Kind
     largest: str | None = None
     smallest: str | None = None
     above_zero: bool = False
+    unsigned: str | None = None
 
     @cached_property
     def limits(self) -> str:
@@ -60,6 +62,8 @@ class Quantity:
             parts.append(f"at least {self.smallest}")
         if self.largest is not None:
             parts.append(f"at most {self.largest} in size")
+        if self.unsigned is not None:
+            parts.append(f"with a sign if greater than {self.unsigned}")
         return " and ".join(parts)
 
     def parse(self, text: object) -> float:
@@ -76,11 +80,17 @@ class Quantity:
         )
         if outside:
             raise Problem("outside the limits", shown(text), self.limits)
+        if self._lacks_sign(value) and not str(text).lstrip().startswith("+"):
+            meant = f"+{str(text).strip()} if it is meant as a change; at most {self.unsigned} without a sign"
+            raise Problem(f"hardly meant as {self.kind.name}", shown(text), meant)
         return value
+
+    def _lacks_sign(self, value: float) -> bool:
+        return self.unsigned is not None and value > parse_quantity(self.unsigned, self.kind)
 
     def format(self, value: float) -> str:
         """Text with unit that `parse` reads back to exactly this value."""
-        return format_quantity(value, self.kind)
+        return ("+" if self._lacks_sign(value) else "") + format_quantity(value, self.kind)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(

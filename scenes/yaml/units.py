@@ -221,6 +221,11 @@ def row_pattern(length: int) -> str:
     return rf"^(?:{_NUMBER}\s+){{{length}}}{_UNIT}$"
 
 
+def with_unit(value: float, unit: str) -> str:
+    """The quantity of a computed number, with its sign: as a difference it is meant as it stands."""
+    return f"{value:+} {unit}"
+
+
 def unit_ratio(unit: str, other: str) -> float:
     """What a number in ``unit`` is multiplied by to be one in ``other``; degrees Celsius are differences here.
 

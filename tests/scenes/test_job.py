@@ -7,6 +7,7 @@ import pytest
 from scenes.specs.job import NodeInfo, check_nodes, noll
 from scenes.specs.load import EXAMPLES, load_job
 from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
 
 ARCSEC = 4.84813681109536e-06
 NODES = {
@@ -34,6 +35,35 @@ def test_the_example() -> None:
     assert (job.render.images, job.render.frames, job.render.seed) == (("spots",), 9, 1)
     assert job.analysis.centroid == "ml"
     check_nodes(job, NODES)
+
+
+@pytest.mark.parametrize(
+    ("text", "kelvin"),
+    [
+        ("100 K", 100.0),
+        ("+250 K", 250.0),
+        (" +250 K", 250.0),
+        ("-250 K", -250.0),
+        ("250 mK", 0.25),
+        ("+1000 K", 1000.0),
+    ],
+)
+def test_changes_of_temperature(text: str, kelvin: float, tmp_path: Path) -> None:
+    path = write(tmp_path, f"{HEAD}  base: {{temperature: '{text}'}}\n")
+    job = load_job(path)
+    assert job.perturb["base"].temperature.change == kelvin
+    # what is written is read again
+    again = write(tmp_path, dump_yaml(job.plain()))
+    assert load_job(again).perturb["base"].temperature.change == kelvin
+
+
+@pytest.mark.parametrize("text", ["250 K", "100.001 K", "300000 mK"])
+def test_an_absolute_temperature_is_not_taken_for_a_change(text: str, tmp_path: Path) -> None:
+    path = write(tmp_path, f"{HEAD}  base:\n    temperature: {{change: {text}}}\n")
+    with pytest.raises(InputError) as caught:
+        load_job(path)
+    said = f"{path}:4: perturb.base.temperature.change: hardly meant as a temperature difference"
+    assert str(caught.value).startswith(f"{said}; found '{text}', allowed: +{text} if it is meant")
 
 
 @pytest.mark.parametrize(

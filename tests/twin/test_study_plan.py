@@ -70,8 +70,8 @@ def test_a_grid_is_every_combination(tmp_path) -> None:
     np.testing.assert_allclose(column(plan, "m2x"), [5, 1000] * 3)
     assert plan.columns[1].unit == "nm"
     values = dict(plan.run(5).values)
-    assert values["job", "perturb", "base/forward/M2", "shift", 2] == "2.0 um"
-    assert values["job", "perturb", "base/forward/M2", "shift", 0] == "1000.0 nm"
+    assert values["job", "perturb", "base/forward/M2", "shift", 2] == "+2.0 um"
+    assert values["job", "perturb", "base/forward/M2", "shift", 0] == "+1000.0 nm"
 
 
 def test_blocks_and_seeds(tmp_path) -> None:
@@ -156,8 +156,8 @@ def test_scaled_values(tmp_path) -> None:
     # the base has 50 mm, 20 um and 4e6 photons; the last factor changes fastest
     expected = [4e6 * a**2 * p**2 for a in (0.5, 1.0) for p in (0.5, 2.0) for _ in range(4)]
     assert [run[light] for run in found] == pytest.approx(expected, rel=1e-12)
-    assert {run[width] for run in found} == {"30.0 mm", "60.0 mm"}
-    assert [run[m2z] for run in found[:4]] == ["0.0 um", "6.0 um", "0.0 um", "8.0 um"]
+    assert {run[width] for run in found} == {"+30.0 mm", "+60.0 mm"}
+    assert [run[m2z] for run in found[:4]] == ["+0.0 um", "+6.0 um", "+0.0 um", "+8.0 um"]
     assert len({place for run in found for place in run}) == len(found[0])
 
 

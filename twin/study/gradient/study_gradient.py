@@ -23,7 +23,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import ResponseSpec
 from scenes.specs.study_factor import FactorSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
-from scenes.yaml.units import split_quantity, unit_ratio
+from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.spot_gradient import spot_gradient
@@ -93,7 +93,7 @@ class GradientFactor:
         Raises:
             InputError: a value that follows the factor cannot be worked out.
         """
-        cell = f"{value!r} {self.unit}" if self.unit else value
+        cell = with_unit(value, self.unit) if self.unit else value
         out: dict[KeyPath, Any] = dict.fromkeys(self.spec.places, cell)
         if self.spec.scales:
             tree = self.setup.tree

@@ -11,6 +11,7 @@ import numpy as np
 
 from scenes.yaml.errors import InputError, KeyPath, Problem
 from scenes.yaml.translate import validate
+from scenes.yaml.units import with_unit
 from scenes.yaml.yaml_file import YamlFile
 from twin.study.runs.base_job import Run
 from twin.study.runs.config_tree import leaf, with_values
@@ -35,7 +36,7 @@ class Column:
     def cell(self, run: int) -> Any:
         """The value of a run as it stands in the base's tree."""
         value = self.values[run].item()
-        return f"{value!r} {self.unit}" if self.unit else value
+        return with_unit(value, self.unit) if self.unit else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,7 @@ class Plan:
         for column in self.columns:
             factor = self.setup.study.factors[column.name]
             for value in _telling(column, extremes(factor)):
-                cell = f"{value!r} {column.unit}" if column.unit else value
+                cell = with_unit(value, column.unit) if column.unit else value
                 found = self._ratios(column, np.array([value]))
                 follow = [(place, scaled(self.scaling.base[place], float(ratio[0]))) for place, ratio in found.items()]
                 self._check_value(column.name, [*((place, cell) for place in factor.places), *follow])

@@ -12,7 +12,7 @@ from scipy.special import ndtr, ndtri
 from scenes.specs.study import GRID, StudySpec, unit_cube
 from scenes.specs.study_factor import FactorSpec
 from scenes.yaml.errors import KeyPath, Problem, shown
-from scenes.yaml.units import split_quantity, unit_ratio
+from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.study.runs.config_tree import Tree, leaf
 
 
@@ -119,7 +119,7 @@ def scaled(number: tuple[float | int, str], ratio: float) -> Any:
     """Number and unit, times a ratio, as they stand in a tree."""
     value = number[0] * ratio
     if number[1]:
-        return f"{value!r} {number[1]}"
+        return with_unit(value, number[1])
     # a count stays a whole number, or the schema refuses it
     return int(value) if isinstance(number[0], int) and value == int(value) else value
 
