@@ -20,41 +20,11 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
-from scenes.specs.autocollimator_test import AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
-from scenes.specs.detector import DetectorSpec
-from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.job import JobSpec
-from scenes.specs.orbit_angle import OrbitAngleSpec
-from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_monitor import OrbitMonitorSpec
-from scenes.specs.orbit_simulate import OrbitSimulateSpec
-from scenes.specs.study import StudySpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.file_kinds import FILE_KINDS
 from scenes.yaml.spec import Spec
 from scenes.yaml.standard_output import to_stdout
 
-MODELS: dict[str, type[Spec]] = {
-    "job": JobSpec,
-    "instrument": InstrumentSpec,
-    "camera": CameraSpec,
-    "camera_design": CameraDesignSpec,
-    "detector": DetectorSpec,
-    "error_budget": ErrorBudgetSpec,
-    "principle_experiment": AutocollimatorTestSpec,
-    "focus_test": FocusTestSpec,
-    "distortion_test": DistortionTestSpec,
-    "turntable_test": TurntableTestSpec,
-    "orbit_angle": OrbitAngleSpec,
-    "orbit_calibration": OrbitCalibrationSpec,
-    "orbit_simulate": OrbitSimulateSpec,
-    "orbit_monitor": OrbitMonitorSpec,
-    "three_line_camera": ThreeLineCameraSpec,
-    "study": StudySpec,
-}
+MODELS: dict[str, type[Spec]] = {kind.name: kind.model for kind in FILE_KINDS}
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

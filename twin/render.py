@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from scenes.specs.file_kinds import read_for
 from scenes.specs.resolved import ResolvedJob, resolve
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
 from twin.run.command import Result, Session, run_command
@@ -84,7 +85,12 @@ def main(
 
         return run_render(resolved, session, frames, seed, picture)
 
-    run_command(job.stem, Options(out, seed, backend, force, as_json, quiet), lambda: resolve(job), work)
+    run_command(
+        job.stem,
+        Options(out, seed, backend, force, as_json, quiet),
+        lambda: read_for("twin.render", job, resolve),
+        work,
+    )
 
 
 if __name__ == "__main__":

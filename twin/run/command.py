@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 
 from optics.numerics.backend import Backend, load_backend
+from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import InputError
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
@@ -215,7 +216,7 @@ def run_test(
         write_test(procedure.kind, numbers, shown, facts, session.folder)
         return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console))
 
-    run_command(file.stem, options, lambda: resolve(file), work)
+    run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
 
 
 def _explained_at(test: Any, error: BenchError) -> InputError:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from scenes.specs.file_kinds import read_for
 from twin.run.artefact import significant
 from twin.run.cli import InputErrorText, Options, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, run_command
@@ -41,7 +42,7 @@ def run_gradient(file: Path, options: StudyOptions, as_json: bool, quiet: bool) 
         ):
             if given:
                 raise InputErrorText(f"--gradient differentiates at the base in this process, so {name} has no meaning")
-        return resolve_study(file)
+        return read_for(PROGRAM, file, resolve_study)
 
     shared = Options(options.out, None, options.backend, options.force, as_json, quiet)
     run_command(f"{file.stem}-gradient", shared, resolve, _work)

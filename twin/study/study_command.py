@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from optics.numerics.threads import cores
+from scenes.specs.file_kinds import read_for
 from twin.run.cli import InputErrorText, check_backend, ending_signals
 from twin.run.run_folder import RunFolderError, chosen, write_manifest
 from twin.study.runs.chunk_store import ChunkStore
@@ -98,7 +99,7 @@ def run_study(
         raise InputErrorText("--resume goes on with a folder, --force replaces it; choose one of them")
     if options.resume and options.out is None:
         raise InputErrorText("--resume needs the folder to go on with: --out DIR")
-    setup = resolve_study(file)
+    setup = read_for(PROGRAM, file, resolve_study)
     _check_size(setup, options.confirmed)
     plan = Plan.of(setup)
     warnings: list[str] = []

@@ -1,0 +1,138 @@
+"""A file is told by its keys, whichever command it is given to."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from scenes.specs.file_kinds import FILE_KINDS, kind_of, read_for
+from scenes.specs.load import SCENES
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import read_yaml
+from tests.twin.commands import invoke
+from twin.design.__main__ import app as design
+from twin.lab import app as lab
+from twin.orbit.__main__ import app as orbit
+from twin.render import app as render
+from twin.study.__main__ import app as study
+
+FOLDERS = {
+    "examples/study": "study",
+    "examples/design": "camera_design",
+    "examples/": "job",
+    "lab/focus": "focus_test",
+    "lab/distortion": "distortion_test",
+    "lab/turntable": "turntable_test",
+    "lab/principle": "principle_experiment",
+    "library/budgets": "error_budget",
+    "library/cameras": "camera",
+    "library/detectors": "detector",
+    "library/instruments": "instrument",
+    "library/payloads": "three_line_camera",
+    "orbit/angle": "orbit_angle",
+    "orbit/calibrate": "orbit_calibration",
+    "orbit/monitor": "orbit_monitor",
+    "orbit/simulate": "orbit_simulate",
+}
+"""Beginning of a shipped file's place -> its kind."""
+FILES = sorted(path.relative_to(SCENES).as_posix() for path in SCENES.rglob("*.yaml"))
+
+
+def test_files_of_every_kind_are_shipped() -> None:
+    assert {kind.name for kind in FILE_KINDS} == set(FOLDERS.values())
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_shipped_file_is_recognised(file: str) -> None:
+    expected = next(name for start, name in FOLDERS.items() if file.startswith(start))
+    data = read_yaml(SCENES / file).data
+    kind = kind_of(data)
+    assert kind is not None
+    assert kind.name == expected
+    # a typing error does not make it another one
+    again = kind_of({**data, "no_such_key": 1})
+    assert again is None or again.name == expected
+
+
+@pytest.mark.parametrize(
+    "data", [None, 3, [], {}, {"name": "x"}, {"a": 1, "b": 2}, {"instrument": "x", "a": 1, "b": 2}]
+)
+def test_what_could_be_anything_is_nothing(data: object) -> None:
+    assert kind_of(data) is None
+
+
+def test_configs_of_runs_are_told_as_well() -> None:
+    test = read_yaml(SCENES / "lab/focus.yaml").data
+    found = [kind_of(data) for data in ({"job": {}, "cameras": {}}, {"study": {}, "base": {}}, {"test": test})]
+    assert [kind and kind.name for kind in found] == ["job", "study", "focus_test"]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FILE_KINDS if kind.command], ids=lambda kind: kind.name)
+def test_the_commands_are_there(kind) -> None:
+    program, *sub = kind.command.split()
+    try:
+        app = importlib.import_module(f"{program}.__main__").app
+    except ModuleNotFoundError:
+        app = importlib.import_module(program).app
+    assert {command.name for command in app.registered_commands} >= set(sub)
+
+
+@pytest.mark.parametrize(
+    ("app", "words", "file", "said"),
+    [
+        (
+            render,
+            (),
+            "examples/study_smoke.yaml",
+            "a study, which twin.render does not read; python -m twin.study {} does",
+        ),
+        (
+            study,
+            (),
+            "examples/perturb.yaml",
+            "a job of the monitor, which twin.study does not read; python -m twin.render {} d",
+        ),
+        (
+            study,
+            ("--gradient",),
+            "lab/focus.yaml",
+            "a focus test, which twin.study does not read; python -m twin.lab focus {} d",
+        ),
+        (
+            lab,
+            ("focus",),
+            "lab/distortion.yaml",
+            "which twin.lab focus does not read; python -m twin.lab distortion {} does",
+        ),
+        (
+            orbit,
+            ("angle",),
+            "library/cameras/gf7.yaml",
+            "a camera's prescription, which twin.orbit angle does not read; its na",
+        ),
+        (
+            design,
+            (),
+            "orbit/simulate.yaml",
+            "images of the ground, which twin.design does not read; python -m twin.orbit simu",
+        ),
+    ],
+)
+def test_a_file_given_to_the_wrong_command(app, words, file, said, tmp_path: Path) -> None:
+    path = SCENES / file
+    done = invoke(app, *words, path, "--out", tmp_path / "run")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"error: {path}: this is ")
+    assert said.format(path) in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_own_file_with_faults_is_told_its_faults(tmp_path: Path) -> None:
+    path = tmp_path / "job.yaml"
+    path.write_text("instrument: gf7_pair\npertrub: {}\n", "utf-8")
+    with pytest.raises(InputError, match="did you mean 'perturb'"):
+        read_for("twin.render", path, resolve)
+    path.write_text("instrument: gf7_pair\nperturb: [\n", "utf-8")
+    with pytest.raises(InputError, match="not valid YAML"):
+        read_for("twin.render", path, resolve)
