@@ -12,6 +12,7 @@ if __name__ == "__main__":
 import json
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,12 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
+from optics.numerics.backend import BackendUnavailable
+from optics.numerics.llvm import LibraryMissing
 from scenes.specs.file_kinds import FILE_KINDS
+from scenes.specs.job import ACTIONS, DEFAULT_PIVOT, JobSpec, NodeInfo
+from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.resolved import resolve_job
 from scenes.yaml.spec import Spec
 from scenes.yaml.standard_output import to_stdout
 
@@ -65,12 +71,67 @@ def _describe(model: dict[str, Any]) -> None:
         if item is not None:
             description = " ".join(description.split())
             # In the file a quantity has the unit that is written beside it.
-            unit = item.get("description") or item.get("items", {}).get("description")
+            one = item.get("anyOf", [item])[0]
+            unit = item.get("description") or one.get("description") or one.get("items", {}).get("description")
             item["description"] = f"{_SI_UNIT.sub('', description).rstrip('.')}: {unit}" if unit else description
 
 
-def write_schemas(folder: Path) -> list[Path]:
+def shipped_nodes() -> dict[str, Mapping[str, NodeInfo]]:
+    """Instrument of the library -> node path -> what may be done to it.
+
+    Raises:
+        BackendUnavailable, LibraryMissing: instruments cannot be traced on this machine.
+    """
+    from optics.numerics.backend import load_backend
+    from scenes.models.instrument_builder import build_instrument
+
+    backend, out = load_backend(), {}
+    for name in library_names(INSTRUMENTS):
+        resolved = resolve_job(JobSpec(instrument=name))
+        out[name] = build_instrument(resolved.instrument, resolved.cameras, backend).nodes
+    return out
+
+
+def with_nodes(schema: dict[str, Any], instruments: Mapping[str, Mapping[str, NodeInfo]]) -> dict[str, Any]:
+    """The schema of a job in which the nodes of known instruments, their pivots and what they allow are listed.
+
+    Args:
+        schema: of a job.
+        instruments: name -> node path -> what may be done to it. A job of another instrument may name any node.
+    """
+    named = {**schema["properties"]["instrument"], "examples": list(instruments)}
+    rules = []
+    for name, nodes in instruments.items():
+        warm = {path: info for path, info in nodes.items() if "temperature" in info.allows}
+        moved = {path: info for path, info in nodes.items() if info.allows - {"temperature"}}
+        course = {"temperature": _only(dict.fromkeys(warm, True)), "motion": _only(_of_nodes(moved))}
+        then = {"perturb": _only(_of_nodes(nodes)), "course": {"properties": course}}
+        condition = {"properties": {"instrument": {"const": name}}, "required": ["instrument"]}
+        rules.append({"if": condition, "then": {"properties": then}})
+    return {**schema, "properties": {**schema["properties"], "instrument": named}, "allOf": rules}
+
+
+def _only(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """A mapping with no other keys."""
+    return {"properties": dict(properties), "propertyNames": {"enum": list(properties)}}
+
+
+def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
+    """Node path -> what may stand below it."""
+    out = {}
+    for path, info in nodes.items():
+        pivots = [*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,))]
+        never = {action: False for action in ACTIONS if action not in info.allows}
+        out[path] = {"properties": {"pivot": {"enum": pivots}, **never}}
+    return out
+
+
+def write_schemas(folder: Path, instruments: Mapping[str, Mapping[str, NodeInfo]]) -> list[Path]:
     """Write all schemas as `<name>.schema.json` into a folder, which is made if need be, and return their paths.
+
+    Args:
+        folder: to write into.
+        instruments: those whose nodes the schema of jobs lists, as for ``with_nodes``.
 
     Raises:
         OSError: it cannot be written.
@@ -79,7 +140,9 @@ def write_schemas(folder: Path) -> list[Path]:
     paths = []
     for name in MODELS:
         path = folder / f"{name}.schema.json"
-        path.write_text(json.dumps(json_schema(name), indent=2, ensure_ascii=False) + "\n", "utf-8")
+        schema = json_schema(name)
+        schema = with_nodes(schema, instruments) if name == "job" else schema
+        path.write_text(json.dumps(schema, indent=2, ensure_ascii=False) + "\n", "utf-8")
         paths.append(path)
     return paths
 
@@ -87,9 +150,18 @@ def write_schemas(folder: Path) -> list[Path]:
 def main(
     out: Annotated[Path, typer.Option(help="Folder to write into; it is made if need be.")] = Path("schemas"),
 ) -> None:
-    """Write the JSON Schemas of the twin's YAML files, for editors."""
+    """Write the JSON Schemas of the twin's YAML files, for editors.
+
+    That of a job lists the nodes of the library's instruments, their pivots and what may be done to each; quantities
+    are checked for the usual units of their kind.
+    """
+    instruments: dict[str, Mapping[str, NodeInfo]] = {}
     try:
-        paths = write_schemas(out)
+        instruments = shipped_nodes()
+    except (BackendUnavailable, LibraryMissing) as error:
+        sys.stderr.write(f"the schema of jobs lists no nodes: {error}\n")
+    try:
+        paths = write_schemas(out, instruments)
     except OSError as error:
         sys.stderr.write(f"{out}: cannot be written: {error.strerror or error}\n")
         raise typer.Exit(2) from None

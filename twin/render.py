@@ -11,10 +11,26 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
+from optics.numerics.backend import load_backend
 from scenes.specs.file_kinds import read_for
+from scenes.specs.job import ACTIONS
 from scenes.specs.resolved import ResolvedJob, resolve
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
+from scenes.yaml.standard_output import Terminal, print_json, to_stdout
+from twin.run.cli import (
+    AsJson,
+    BackendName,
+    Force,
+    Options,
+    Out,
+    Quiet,
+    Seed,
+    check_backend,
+    explained,
+    print_whole,
+    result_table,
+)
 from twin.run.command import Result, Session, run_command
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
@@ -35,6 +51,13 @@ def main(
     picture: Annotated[
         bool,
         typer.Option("--picture", help="Also render pictures of the instrument itself: picture.png and two close-ups."),
+    ] = False,
+    list_nodes: Annotated[
+        bool,
+        typer.Option(
+            "--list-nodes",
+            help="Print the nodes of the job's instrument, their pivots and what each allows; run nothing.",
+        ),
     ] = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -79,6 +102,9 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    if list_nodes:
+        print_nodes(job, backend, as_json)
+        return
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.main_job.render_command import run_render
@@ -91,6 +117,36 @@ def main(
         lambda: read_for("twin.render", job, resolve),
         work,
     )
+
+
+def print_nodes(job: Path, backend: str, as_json: bool) -> None:
+    """Print what can be perturbed in the instrument of a job.
+
+    Raises:
+        typer.Exit: with the exit code of a failure, which has been told.
+    """
+    errors = Console(stderr=True)
+    with explained(errors):
+        check_backend(backend)
+        resolved = read_for("twin.render", job, resolve)
+        from scenes.models.instrument_builder import build_instrument
+
+        nodes = build_instrument(resolved.instrument, resolved.cameras, load_backend(backend)).nodes
+    with to_stdout(errors):
+        if as_json:
+            allowed = {
+                path: {"pivots": list(info.pivots), "allows": [action for action in ACTIONS if action in info.allows]}
+                for path, info in nodes.items()
+            }
+            print_json({"instrument": resolved.instrument.name, "nodes": allowed})
+            return
+        table = result_table(f"nodes of {resolved.instrument.name}")
+        for head in ("node", "pivots", "may be given"):
+            table.add_column(head, no_wrap=True)
+        for path, info in nodes.items():
+            actions = ", ".join(action for action in ACTIONS if action in info.allows)
+            table.add_row(path, ", ".join(info.pivots), actions)
+        print_whole(Terminal(), table)
 
 
 if __name__ == "__main__":

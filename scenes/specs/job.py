@@ -53,6 +53,8 @@ ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
 
 NO_MOTION = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
+ACTIONS = ("rotate", "shift", "figure", "scale", "temperature")
+"""What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 

@@ -19,7 +19,6 @@ from scenes.yaml.errors import Problem, shown
 from scenes.yaml.units import (
     ANGLE,
     LENGTH,
-    PATTERN,
     PER_LENGTH3,
     PER_LENGTH5,
     PER_LENGTH7,
@@ -29,7 +28,7 @@ from scenes.yaml.units import (
     Kind,
     format_quantity,
     parse_quantity,
-    row_pattern,
+    pattern,
     split_row,
 )
 
@@ -101,7 +100,7 @@ class Quantity:
         limits = f"; {self.limits}" if self.limits else ""
         return {
             "type": "string",
-            "pattern": PATTERN,
+            "pattern": pattern(self.kind),
             "description": f"{self.kind.allowed}{limits}",
             "examples": [self.kind.example],
         }
@@ -124,7 +123,7 @@ class Vector:
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         item = self.of.__get_pydantic_json_schema__(schema, handler)
         listed = {"type": "array", "items": item, "minItems": self.length, "maxItems": self.length}
-        text = {"type": "string", "pattern": row_pattern(self.length), "description": item["description"]}
+        text = {"type": "string", "pattern": pattern(self.of.kind, self.length), "description": item["description"]}
         return {"anyOf": [listed, text]}
 
     def _check_length(self, value: object) -> object:

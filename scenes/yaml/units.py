@@ -27,8 +27,6 @@ _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)\b.*", re.IGNORECASE | re.D
 LONGEST_TEXT = 100
 OTHER_MINUS = tuple("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d")
 """Signs that text processors put where a minus was typed; they look like it and are none."""
-PATTERN = rf"^{_NUMBER}\s*{_UNIT}$"
-"""Regular expression of a quantity, for editors; the reader is stricter."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +126,8 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "1/mm^7": (Decimal("1e21"), "1/m**7"),
 }
 """The units that are suggested, as `_look_up` gives them: to ask pint for one takes it half a second to start."""
+_ALIASES = ("µm", "μm", "µrad", "μrad", "%", "hour", "day")
+"""Further names that editors take."""
 
 
 def power_of_length(metre: int) -> Kind:
@@ -216,9 +216,17 @@ def split_row(text: str, length: int) -> list[str] | None:
     return None
 
 
-def row_pattern(length: int) -> str:
-    """Regular expression of a row of numbers with one unit, for editors."""
-    return rf"^(?:{_NUMBER}\s+){{{length}}}{_UNIT}$"
+def pattern(kind: Kind, length: int = 1) -> str:
+    """Regular expression of a quantity of a kind, for editors; of a row of numbers with one unit for ``length`` > 1.
+
+    It knows the usual units of that kind. The reader takes those that only pint knows as well.
+    """
+    looked_up = {unit: _look_up(unit) for unit in (*_KNOWN, *_ALIASES, *kind.units)}
+    units = [unit for unit, found in looked_up.items() if found is not None and found[1] == _base(kind)]
+    units += [unit for unit in _CELSIUS if kind == TEMPERATURE and unit not in units]
+    row = rf"(?:{_NUMBER}\s+){{{length - 1}}}{_NUMBER}" if length > 1 else _NUMBER
+    joined = "|".join(re.escape(unit).replace(r"\/", "/") for unit in units)
+    return rf"^\s*{row}\s*(?:{joined})\s*$"
 
 
 def with_unit(value: float, unit: str) -> str:

@@ -8,8 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from scenes.schema import MODELS, json_schema, main, write_schemas
-from scenes.yaml.quantity import PATTERN
+from scenes.schema import MODELS, json_schema, main, shipped_nodes, with_nodes, write_schemas
+from scenes.specs.load import EXAMPLES, INSTRUMENTS, library_names
+from scenes.yaml.units import (
+    ANGLE,
+    KINDS,
+    LENGTH,
+    PER_LENGTH3,
+    SCALE,
+    TEMPERATURE,
+    TEMPERATURE_DIFFERENCE,
+    Kind,
+    pattern,
+)
+from scenes.yaml.yaml_file import read_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,7 +38,7 @@ def test_command_writes_all(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
-        write_schemas(tmp_path / "file")
+        write_schemas(tmp_path / "file", {})
     command = [sys.executable, "-m", "scenes.schema", "--out", str(tmp_path / "file")]
     result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False)
     assert result.returncode == 2
@@ -37,9 +49,14 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
 
 def test_quantities_are_described() -> None:
     rotate = json_schema("job")["$defs"]["PerturbationSpec"]["properties"]["rotate"]
-    assert rotate["minItems"] == rotate["maxItems"] == 3
-    assert rotate["items"]["examples"] == ["2 arcsec"]
-    assert "at most 5 deg" in rotate["items"]["description"]
+    listed, row = rotate["anyOf"]
+    assert listed["minItems"] == listed["maxItems"] == 3
+    assert listed["items"]["examples"] == ["2 arcsec"]
+    assert "at most 5 deg" in listed["items"]["description"]
+    assert "at most 5 deg" in rotate["description"]
+    assert re.search(row["pattern"], "1 -2 .5e1 arcsec")
+    assert not re.search(row["pattern"], "1 2 arcsec")
+    assert not re.search(row["pattern"], "1 2 3 um")
     assert rotate["default"] == ["0 arcsec"] * 3
     camera = json_schema("camera")
     assert camera["properties"]["edge_margin"]["default"] == "5 mm"
@@ -47,14 +64,78 @@ def test_quantities_are_described() -> None:
     assert "focal_length" in camera["required"]
 
 
-@pytest.mark.parametrize("text", ["2 arcsec", "-1.5 arcsec", "20um", "1e-3 1/m^3", "1 %", "2 um/m"])
-def test_the_pattern_admits_quantities(text: str) -> None:
-    assert re.search(PATTERN, text)
+QUANTITIES = {
+    ANGLE: ("2 arcsec", "-1.5 arcsec", "1e-3 deg", "3 µrad"),
+    LENGTH: ("20um", "20 µm", "+.5 m", "1 km"),
+    SCALE: ("1 %", "2 um/m", "3 ppm"),
+    PER_LENGTH3: ("1e-3 1/m^3",),
+    TEMPERATURE: ("20 degC", "20 °C", "293 K"),
+    TEMPERATURE_DIFFERENCE: ("0.1 K", "+250 K"),
+}
 
 
-@pytest.mark.parametrize("text", ["2", "", "m", "two m", "2 m m"])
-def test_the_pattern_refuses_the_rest(text: str) -> None:
-    assert not re.search(PATTERN, text)
+@pytest.mark.parametrize("kind", QUANTITIES, ids=lambda kind: kind.name)
+def test_the_pattern_of_a_kind_admits_its_units_alone(kind: Kind) -> None:
+    for other, texts in QUANTITIES.items():
+        for text in texts:
+            same = (
+                other == kind
+                or (kind == TEMPERATURE and other == TEMPERATURE_DIFFERENCE)
+                or (text == "293 K" and kind.si == "K")
+            )
+            assert bool(re.search(pattern(kind), text)) == same, text
+    for text in ("2", "", "m", "two m", "2 m m", "2 arcse"):
+        assert not re.search(pattern(kind), text)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_the_pattern_admits_all_that_messages_suggest(kind: Kind) -> None:
+    for unit in (*kind.units, *kind.writes):
+        assert re.search(pattern(kind), f"-1.5e-3 {unit}"), unit
+    assert re.search(pattern(kind), kind.example)
+
+
+JOB = {"instrument": "gf7_pair", "perturb": {"base/forward/M2": {"shift": "0 0 3 um", "pivot": "origin"}}}
+FOCAL = "base/backward/focal_plane"
+FAULTS = {
+    "node": {"perturb": {"base/forward/M9": {"shift": "0 0 3 um"}}},
+    "pivot": {"perturb": {FOCAL: {"rotate": "0 0 3 arcsec", "pivot": "front_node"}}},
+    "unit": {"perturb": {"base/forward/M2": {"shift": "0 0 3 arcsec"}}},
+    "typing error": {"perturb": {"base/forward/M2": {"shift": ["0 um", "0 um", "3 umm"]}}},
+    "figure": {"perturb": {FOCAL: {"figure": {"Z5": "20 nm"}}}},
+    "course": {"course": {"times": ["0 min", "1 min"], "temperature": {"base/M2": {"change": ["0 K", "1 K"]}}}},
+}
+
+
+@pytest.fixture(scope="module")
+def nodes():
+    return shipped_nodes()
+
+
+def problems(schema, job) -> int:
+    jsonschema = pytest.importorskip("jsonschema")
+    return len(list(jsonschema.Draft202012Validator(schema).iter_errors(job)))
+
+
+def test_the_schema_of_jobs_knows_the_nodes_of_shipped_instruments(nodes) -> None:
+    assert set(nodes) == set(library_names(INSTRUMENTS))
+    schema = with_nodes(json_schema("job"), nodes)
+    assert problems(schema, JOB) == 0
+    assert problems(schema, {**JOB, "perturb": {FOCAL: {"rotate": "0 0 3 arcsec", "pivot": "rear_node"}}}) == 0
+    for name, fault in FAULTS.items():
+        assert problems(schema, {**JOB, **fault}) > 0, name
+    # of an own instrument nobody knows the nodes
+    assert problems(schema, {"instrument": "own.yaml", **FAULTS["node"]}) == 0
+    for path in (EXAMPLES / name for name in ("perturb.yaml", "orbit.yaml", "targets.yaml", "steady.yaml")):
+        assert problems(schema, read_yaml(path).data) == 0, path
+
+
+def test_an_editor_completes_what_the_instrument_has(nodes) -> None:
+    schema = with_nodes(json_schema("job"), nodes)
+    rule = next(r for r in schema["allOf"] if r["if"]["properties"]["instrument"]["const"] == "gf7_pair")
+    perturb = rule["then"]["properties"]["perturb"]
+    assert list(perturb["properties"]) == perturb["propertyNames"]["enum"] == list(nodes["gf7_pair"])
+    assert "rear_node" in perturb["properties"][FOCAL]["properties"]["pivot"]["enum"]
 
 
 def test_every_attribute_has_a_description() -> None:

@@ -455,3 +455,23 @@ def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     assert out == ""
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_nodes_of_an_instrument_are_listed(tmp_path) -> None:
+    done = run("--list-nodes", EXAMPLE, "--json")
+    assert done.exit_code == 0, done.stderr
+    data = json.loads(done.stdout)
+    assert data["instrument"] == "gf7_pair"
+    focal_plane = {"pivots": ["origin", "rear_node", "line_centre"], "allows": ["rotate", "shift", "temperature"]}
+    assert data["nodes"]["base/backward/focal_plane"] == focal_plane
+    assert data["nodes"]["base/forward/M2"]["allows"] == ["rotate", "shift", "figure", "temperature"]
+    # what a job may not name is not in the list, and what it may is
+    path = tmp_path / "job.yaml"
+    path.write_text("instrument: gf7_pair\nperturb: {base/forward/M9: {shift: 0 0 1 um}}\n", "utf-8")
+    refused = run(path, "--out", tmp_path / "run")
+    assert refused.exit_code == 2
+    assert all(name in refused.stderr for name in data["nodes"])
+    table = run("--list-nodes", path)
+    assert table.exit_code == 0
+    assert all(name in table.stdout for name in data["nodes"])
+    assert not (tmp_path / "run").exists()
