@@ -522,7 +522,7 @@ def test_a_surface(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert mirror.plain()["sag"] == {"cylinder": {"curvature": "0.25 1/m", "step": 0.001}}
     for wrong, said in (
         ("step: 1 m", "sag.cylinder.step: not a number; found '1 m', allowed: a plain number, without a unit"),
-        ("curvature: 1 m", "sag.cylinder.curvature: 'm' is a unit of a length, not of an inverse length; found m"),
+        ("curvature: 1 m", "sag.cylinder.curvature: 'm' is a unit of a length, not of an inverse length; did you mean '1/m'? Found m"),
         ("curvatur: 1 1/m", "unknown key; found 'curvatur', allowed: curvature, step; did you mean 'curvature'?"),
     ):
         with pytest.raises(InputError, match=re.escape(said)):

@@ -89,8 +89,8 @@ def _write(run: RenderRun, session: Session, picture: bool) -> str:
 def _numbers(run: RenderRun) -> dict[str, Any]:
     """What ``--json`` prints: contents of the files with the main results, by their kind."""
     parts = {"truth": run.truth_dict(), "recovered": stated(run.recovered_dict())}
-    if run.course is not None:
-        parts["course"] = run.course.to_dict()
+    if run.series is not None:
+        parts["course"] = run.series.to_dict()
     if run.targets is not None:
         parts["mtf"] = run.targets.to_dict()
     return {kind: described(kind, data) for kind, data in parts.items()}
@@ -108,8 +108,8 @@ def _print_result(run: RenderRun, console: Console) -> None:
         "see crosstalk in the report.",
         style="dim",
     )
-    if run.course is not None:
-        count, ends = len(run.course.times), [moment(float(run.course.times[k])) for k in (0, -1)]
+    if run.series is not None:
+        count, ends = len(run.series.times), [moment(float(run.series.times[k])) for k in (0, -1)]
         console.print(
             f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
             highlight=False,
@@ -149,8 +149,8 @@ def _table(run: RenderRun) -> Table:
     """What every estimator recovered, beside the truth."""
     truth, recovered = run.truth_dict(), run.recovered_dict()
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
-    if run.course is not None:
-        title += f"\nat {moment(float(run.course.times[run.course.shown]))} of the course"
+    if run.series is not None:
+        title += f"\nat {moment(float(run.series.times[run.series.shown]))} of the course"
     table = result_table(title)
     table.add_column("", no_wrap=True)
     names = (name.replace("_", "\n") for name in ESTIMATORS)

@@ -171,8 +171,8 @@ def _ending_later() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    for number in got:
-        signal.raise_signal(number)
+    for heard in got:
+        signal.raise_signal(heard)
 
 
 @contextmanager
