@@ -522,8 +522,8 @@ def test_a_surface(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert mirror.plain()["sag"] == {"cylinder": {"curvature": "0.25 1/m", "step": 0.001}}
     for wrong, said in (
         ("step: 1 m", "sag.cylinder.step: not a number; found '1 m', allowed: a plain number, without a unit"),
-        ("curvature: 1 m", "sag.cylinder.curvature: 'm' is a unit of a length, not of an inverse length; did you mean '1/m'? Found m"),
-        ("curvatur: 1 1/m", "unknown key; found 'curvatur', allowed: curvature, step; did you mean 'curvature'?"),
+        ("curvature: 1 m", "sag.cylinder.curvature: 'm' is a unit of a length, not of an inverse length"),
+        ("curvatur: 1 1/m", "unknown key; did you mean 'curvature'? Found 'curvatur', allowed: curvature, step"),
     ):
         with pytest.raises(InputError, match=re.escape(said)):
             validate(MirrorSpec, parse_yaml(f"{{z: 0 m, radius: 1 m, sag: {{cylinder: {{{wrong}}}}}}}"))
