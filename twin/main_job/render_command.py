@@ -81,8 +81,8 @@ def _write(run: RenderRun, session: Session, picture: bool) -> str:
             write_pictures(instrument, session.backend, run.state, write, run.seed, session.advance)
         except PictureError as error:  # what took minutes to compute is not thrown away for a picture
             problem = f"the pictures are not complete: {error}"
-    told = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": list(run.warnings)}
-    write_manifest(folder, PROGRAM, session.started, seconds, **told)
+    entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": list(run.warnings)}
+    write_manifest(folder, PROGRAM, session.started, seconds, **entries)
     return problem
 
 
