@@ -1,21 +1,37 @@
-"""A course: temperatures that change with time, as a job's file gives them in a table."""
+"""A course: temperatures and motions that change with time, as a job's file gives them in a table."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Paths, Spec
-from scenes.yaml.units import MOMENT, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT, format_quantity
+from scenes.yaml.spec import Name, Paths, Reference, Spec
+from scenes.yaml.units import (
+    ANGLE,
+    LENGTH,
+    MOMENT,
+    SCALE,
+    TEMPERATURE_DIFFERENCE,
+    TEMPERATURE_GRADIENT,
+    format_quantity,
+)
 
 TemperatureChange = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]
 """Kelvin. Nothing in an instrument at work becomes 100 K warmer; 250 K without a sign is an absolute temperature."""
 TemperatureGradient = Annotated[tuple[float, float, float], Vector(Quantity(TEMPERATURE_GRADIENT, largest="1000 K/m"))]
+Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
+Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
+ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
 Moment = Annotated[float, Quantity(MOMENT, largest="100000 h")]
 
+NO_MOTION = (0.0, 0.0, 0.0)
+DEFAULT_PIVOT = "origin"
 FEWEST, MOST = 2, 1000
 """Numbers of times that a course may have."""
 
@@ -47,47 +63,109 @@ class TemperatureCourse(Spec):
     gradient: tuple[TemperatureGradient, ...] | None = None
 
 
-class CourseSpec(Spec):
-    """A series of states: at each time the job's perturbation with these temperatures added.
+class MotionCourse(Spec):
+    """How a body moves: for each of the course's times what `perturb` says of one state. What is left out is zero at
+    all times.
 
-    A body that stands in the table has a temperature of its own at all times, also where the table says 0 K.
+    Attributes:
+        rotate: rotation vectors in the body's own frame about the pivot, radians; they come before the shifts.
+        shift: in the body's own frame, metres.
+        scale: relative growth of the body and all it carries.
+        pivot: name of the body's point that rotation and scale leave in place, at all times.
+    """
+
+    rotate: tuple[Rotation, ...] | None = None
+    shift: tuple[Shift, ...] | None = None
+    scale: tuple[ScaleChange, ...] | None = None
+    pivot: Name = DEFAULT_PIVOT
+
+    @property
+    def given(self) -> Mapping[str, tuple[Any, ...] | None]:
+        """Name -> values, one for each time."""
+        return {"rotate": self.rotate, "shift": self.shift, "scale": self.scale}
+
+    def at(self, k: int) -> "NodeMotion":
+        """The motion at time number ``k``."""
+        return NodeMotion(
+            NO_MOTION if self.rotate is None else self.rotate[k],
+            NO_MOTION if self.shift is None else self.shift[k],
+            0.0 if self.scale is None else self.scale[k],
+            self.pivot,
+        )
+
+
+@dataclass(frozen=True)
+class NodeMotion:
+    """A body's motion at one time: rotation vector (radians), shift (metres), relative growth, name of the pivot."""
+
+    rotate: tuple[float, float, float]
+    shift: tuple[float, float, float]
+    scale: float
+    pivot: str
+
+
+class CourseSpec(Spec):
+    """A series of states: at each time the job's perturbation with these temperatures and motions added.
+
+    A body that stands under `temperature` has a temperature of its own at all times, also where the table says 0 K.
+    Rotation vectors, shifts and scales are added, component by component, to what `perturb` says of the same node.
 
     Attributes:
         times: ascending, seconds; only their order matters to the instrument, which has no memory.
         temperature: node path -> its temperatures, one for each time.
+        motion: node path -> its motions, one for each time.
+        table: in place of times, temperatures and motions a CSV file with them, relative to the job's file. Heads name
+            what a column holds and its unit: `time [min]`, `base/forward/M2 shift z [um]`, `base/forward/M2 rotate x
+            [arcsec]`, `base/forward scale [ppm]`, `base/forward temperature [K]`, `base/forward gradient x [mK/m]`.
+            Under `motion` stand then only the pivots.
         detail: the one of the times that is shown in full, like the single state of a job without a course, seconds;
             the last one by default.
     """
 
-    times: Annotated[tuple[Moment, ...], AfterValidator(_ascending)]
-    temperature: Paths[TemperatureCourse]
+    times: Annotated[tuple[Moment, ...], AfterValidator(_ascending)] = ()
+    temperature: Paths[TemperatureCourse] = Field(default_factory=FrozenMap)
+    motion: Paths[MotionCourse] = Field(default_factory=FrozenMap)
+    table: Reference | None = None
     detail: Moment | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "CourseSpec":
-        if not self.temperature:
-            raise Problem(
-                "nothing changes", "no nodes", "at least one node with its temperatures", None, ("temperature",)
-            )
-        for path, table in self.temperature.items():
-            given = {"change": table.change, "gradient": table.gradient}
-            if all(values is None for values in given.values()):
-                raise Problem("nothing changes", None, "change, gradient or both", None, ("temperature", path))
-            for key, values in given.items():
-                if values is not None and len(values) != len(self.times):
-                    raise Problem(
-                        "not one entry for each time",
-                        f"{len(values)} entries",
-                        f"{len(self.times)}, as many as there are times",
-                        None,
-                        ("temperature", path, key),
-                    )
+        if self.table is not None:
+            return self._only_a_table()
+        if not self.times:
+            raise Problem("'times' is missing", None, "times: [0 min, 12 min], or the table of a CSV file")
+        if not (self.temperature or self.motion):
+            within = ("temperature",) if "temperature" in self.model_fields_set else ()
+            raise Problem("nothing changes", "no nodes", "a node with its temperatures or motions", None, within)
+        for path, heat in self.temperature.items():
+            self._one_for_each_time(("temperature", path), {"change": heat.change, "gradient": heat.gradient})
+        for path, moves in self.motion.items():
+            self._one_for_each_time(("motion", path), moves.given)
         if self.detail is not None and self.detail not in self.times:
             near = min(self.times, key=lambda time: abs(time - (self.detail or 0.0)))
             raise Problem(
                 "not one of the course's times", moment(self.detail), "one of times", moment(near), ("detail",)
             )
         return self
+
+    def _only_a_table(self) -> "CourseSpec":
+        for name in ("times", "temperature"):
+            if getattr(self, name):
+                raise Problem("the table has them", name, "the table, or what it has, not both", within=(name,))
+        for path, moves in self.motion.items():
+            for name, values in moves.given.items():
+                if values is not None:
+                    raise Problem("the table has them", name, "pivot", within=("motion", path, name))
+        return self
+
+    def _one_for_each_time(self, key: KeyPath, given: Mapping[str, tuple[Any, ...] | None]) -> None:
+        if all(values is None for values in given.values()):
+            *names, last = given
+            raise Problem("nothing changes", None, f"{', '.join(names)} or {last}", None, key)
+        for name, values in given.items():
+            if values is not None and len(values) != len(self.times):
+                found, allowed = f"{len(values)} entries", f"{len(self.times)}, as many as there are times"
+                raise Problem("not one entry for each time", found, allowed, None, (*key, name))
 
     @property
     def shown(self) -> int:
@@ -103,6 +181,10 @@ class CourseSpec(Spec):
             )
             for path, table in self.temperature.items()
         }
+
+    def motions(self, k: int) -> dict[str, NodeMotion]:
+        """Node path -> what the table adds to its motion at time number ``k``."""
+        return {path: moves.at(k) for path, moves in self.motion.items()}
 
     def key(self, path: str, k: int) -> tuple[str | int, ...]:
         """Where in the course the temperature of a node at time number ``k`` stands."""

@@ -12,10 +12,19 @@ from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
-from scenes.specs.course import CourseSpec, TemperatureChange, TemperatureGradient
+from scenes.specs.course import (
+    DEFAULT_PIVOT,
+    NO_MOTION,
+    CourseSpec,
+    Rotation,
+    ScaleChange,
+    Shift,
+    TemperatureChange,
+    TemperatureGradient,
+)
 from scenes.specs.instrument import Frames
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
@@ -46,13 +55,8 @@ class TargetsSpec(Spec):
     frames: Frames | None = None
 
 
-Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
-Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
-ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
 
-NO_MOTION = (0.0, 0.0, 0.0)
-DEFAULT_PIVOT = "origin"
 ACTIONS = ("rotate", "shift", "figure", "scale", "temperature")
 """What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
@@ -204,6 +208,22 @@ class AnalysisSpec(Spec):
     centroid: Literal["ml", "gaussian", "energy"] = "ml"
 
 
+def pivot_problem(perturb: Mapping[str, PerturbationSpec], course: CourseSpec, within: KeyPath = ()) -> Problem | None:
+    """What is wrong where a course turns a node about another pivot than the perturbation that it is added to.
+
+    Args:
+        perturb: of the job.
+        course: with its motions.
+        within: where the course stands.
+    """
+    for path, moves in course.motion.items():
+        own = perturb.get(path)
+        if own is not None and (any(own.rotate) or own.scale) and own.pivot != moves.pivot:
+            text = "another pivot than under perturb, to which the course is added"
+            return Problem(text, moves.pivot, own.pivot, within=(*within, "motion", path, "pivot"))
+    return None
+
+
 class JobSpec(Spec):
     """A job.
 
@@ -211,7 +231,7 @@ class JobSpec(Spec):
         instrument: name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's
             file.
         perturb: node path -> perturbation; empty for the nominal state.
-        course: temperatures that change with time, None for a single state.
+        course: temperatures and motions that change with time, None for a single state.
         render: what is rendered.
         analysis: how it is analysed.
     """
@@ -231,6 +251,16 @@ class JobSpec(Spec):
                 "one of them; put the temperatures of one time under perturb",
                 within=("render", "stray"),
             )
+        return self
+
+    @model_validator(mode="after")
+    def _one_pivot(self) -> "JobSpec":
+        # a table is added to when it has been read
+        problem = None
+        if self.course is not None and self.course.table is None:
+            problem = pivot_problem(self.perturb, self.course, ("course",))
+        if problem is not None:
+            raise problem
         return self
 
     def fields(self, time: int | None = None) -> dict[str, Temperature]:
@@ -270,14 +300,26 @@ def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
         for path, what in job.perturb.items()
         for issue in perturbation_issues(job, nodes, path, what, ("perturb", path))
     ]
-    for path in job.course.temperature if job.course is not None else ():
-        key = ("course", "temperature", path)
-        if path not in nodes:
-            issues.append(_no_such_node(job, nodes, path, key))
-        elif "temperature" not in nodes[path].allows:
-            issues.append(_not_allowed(job, nodes[path], "temperature", key))
+    if job.course is not None:
+        issues += _course_issues(job.course, nodes)
     if issues:
         raise InputError(*issues)
+
+
+def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Issue]:
+    issues = []
+    for path in course.temperature:
+        key: KeyPath = ("temperature", path)
+        if path not in nodes:
+            issues.append(_no_such_node(course, nodes, path, key))
+        elif "temperature" not in nodes[path].allows:
+            issues.append(_not_allowed(course, nodes[path], "temperature", key))
+    for path, moves in course.motion.items():
+        # what is given at any time counts, also where it is zero
+        does = {name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.given.items() if v is not None}
+        whole = PerturbationSpec.model_construct(**does, pivot=moves.pivot)
+        issues += perturbation_issues(course, nodes, path, whole, ("motion", path))
+    return issues
 
 
 def perturbation_issues(

@@ -11,6 +11,7 @@ from typing import TypeVar
 from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
+from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.error_budget import ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
@@ -52,7 +53,7 @@ def load_job(path: str | Path) -> JobSpec:
         InputError: the file cannot be read or is not a valid job, or there is no such instrument; one issue for each
             fault.
     """
-    job = validate(JobSpec, read_yaml(path))
+    job = with_table(validate(JobSpec, read_yaml(path)))
     instrument_path(job)
     return job
 

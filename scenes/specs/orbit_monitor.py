@@ -10,15 +10,13 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.course import CourseSpec, Moment, moment
+from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment
 from scenes.specs.job import (
     AnalysisSpec,
     JobSpec,
     NodeInfo,
     PerturbationSpec,
     RenderSpec,
-    Rotation,
-    Shift,
     check_nodes,
     perturbation_issues,
 )
@@ -186,6 +184,10 @@ class OrbitMonitorSpec(Spec):
 
     @model_validator(mode="after")
     def _times_fit(self) -> "OrbitMonitorSpec":
+        if self.course.motion or self.course.table is not None:
+            name = "motion" if self.course.motion else "table"
+            allowed = "times and temperature under course; motions under the test's own motion"
+            raise Problem(f"the course of this test has no {name}", None, allowed, within=("course", name))
         times = self.course.times
         steps = [b - a for a, b in pairwise(times)]
         for k, step in enumerate(steps):

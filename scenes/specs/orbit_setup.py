@@ -7,9 +7,9 @@ from pydantic import Field
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
+from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.job import DEFAULT_PIVOT
 from scenes.specs.load import (
     find_orbit_camera,
     find_payload,

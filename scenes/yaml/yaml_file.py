@@ -67,7 +67,7 @@ def read_yaml(path: str | Path) -> YamlFile:
         InputError: no such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several
             documents, nested deeper than 32, or with duplicate keys, anchors, aliases, merge keys or tags.
     """
-    return parse_yaml(_read_text(path), str(path))
+    return parse_yaml(read_text(path), str(path))
 
 
 def parse_yaml(text: str, file: str = "") -> YamlFile:
@@ -129,7 +129,8 @@ def _styled(value: Any) -> Any:
     return value
 
 
-def _read_text(path: str | Path) -> str:
+def read_text(path: str | Path) -> str:
+    """The text of a file that nobody has vetted. Raises InputError as `read_yaml` does before anything is parsed."""
     file = str(path)
     try:
         mode = Path(path).stat().st_mode

@@ -154,7 +154,8 @@ def setup(run: RenderRun) -> dict[str, Any]:
 def _perturbations(run: RenderRun) -> list[dict[str, str]]:
     """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
     job = run.resolved.job
-    motions, fields = motions_of(job), job.fields(None if run.series is None else run.series.shown)
+    shown = None if run.series is None else run.series.shown
+    motions, fields = motions_of(job, shown), job.fields(shown)
     out = []
     for path in dict.fromkeys((*motions, *fields)):
         motion = motions.get(path, Motion())

@@ -44,27 +44,45 @@ def time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
 
 
 def temperatures_svg(series: TimeSeries) -> str:
-    """Change at the origin and gradient along each axis of every node of the course."""
+    """Temperatures that were given, change at the origin and gradient along each axis of every node of the course, and
+    below them its motions, rotation and shift.
+    """
     with look("temperatures"):
         time, label = time_axis(series)
-        figure = new_figure(4.1 + 0.2 * -(-len(series.temperatures) // 3))
-        panels = figure.subplots(2, 2, sharex=True)
-        panels[0, 1].sharey(panels[1, 0])
-        panels[1, 1].sharey(panels[1, 0])
-        handles = []
-        for number, (path, fields) in enumerate(series.temperatures.items()):
-            colour, style = COLOURS[number % len(COLOURS)], STYLES[number // len(COLOURS) % len(STYLES)]
+        nodes = list(dict.fromkeys((*series.temperatures, *series.motions)))
+        looks = {
+            path: {"color": COLOURS[k % len(COLOURS)], "ls": STYLES[k // len(COLOURS) % len(STYLES)], "lw": 1.4}
+            for k, path in enumerate(nodes)
+        }
+        rows = 2 * bool(series.temperatures) + bool(series.motions)
+        figure = new_figure(0.6 + 1.75 * rows + 0.2 * -(-len(nodes) // 3))
+        panels = figure.subplots(rows, 2, sharex=True, squeeze=False)
+        titles: list[str] = []
+        if series.temperatures:
+            panels[0, 1].sharey(panels[1, 0])
+            panels[1, 1].sharey(panels[1, 0])
+            titles += ["change at the origin [K]", *(f"gradient along {axis} [mK/m]" for axis in "XYZ")]
+        for path, fields in series.temperatures.items():
             change = np.array([[field.change] for field in fields])
             values = np.concatenate([change, 1e3 * np.array([field.gradient for field in fields])], axis=1)
-            for axes, value in zip(panels.flat, values.T, strict=True):
-                axes.plot(time, value, color=colour, ls=style, lw=1.4, label=path.removeprefix(f"{BASE}/"))
-            handles.append(panels[0, 0].get_lines()[-1])
-        titles = ("change at the origin [K]", *(f"gradient along {axis} [mK/m]" for axis in "XYZ"))
+            for axes, value in zip(panels.flat, values.T, strict=False):
+                axes.plot(time, value, **looks[path])
+        if series.motions:
+            titles += ["rotation [arcsec]", "shift [µm]"]
+        for path, moves in series.motions.items():
+            turns = np.array([motion.rotate for motion in moves]) / ARCSEC
+            shifts = 1e6 * np.array([motion.shift for motion in moves])
+            for axes, values in zip(panels[-1], (turns, shifts), strict=True):
+                for axis in np.flatnonzero(values.any(axis=0)):
+                    axes.plot(time, values[:, axis], **looks[path])
+                    place = {"xytext": (3, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.0}
+                    axes.annotate("XYZ"[axis], (time[-1], values[-1, axis]), color=looks[path]["color"], **place)
         for axes, title in zip(panels.flat, titles, strict=True):
             _frame(axes, series, time)
             axes.set_title(title, loc="left")
-        for axes in panels[1]:
+        for axes in panels[-1]:
             axes.set_xlabel(label)
+        handles = [panels[0, 0].plot([], [], label=path.removeprefix(f"{BASE}/"), **looks[path])[0] for path in nodes]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return to_svg(figure)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +15,7 @@ from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_template import SpotTemplate
+from optics.geometry.pose import triple
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
@@ -210,9 +212,21 @@ class MonitorExperiment:
         return self.detector.expected_dn(photons, self.exposure)
 
 
-def motions_of(job: JobSpec) -> State:
-    """The rigid motions, scales and figures that a job asks for; its temperatures come on top of them."""
-    return {
+def motions_of(job: JobSpec, time: int | None = None) -> State:
+    """The rigid motions, scales and figures that a job asks for; its temperatures come on top of them.
+
+    Args:
+        job: its perturbation.
+        time: number of a time of its course, whose motions are added; None for none.
+    """
+    out = {
         path: Motion(p.rotate, p.shift, p.pivot, p.scale, {noll(term): value for term, value in p.figure.items()})
         for path, p in job.perturb.items()
     }
+    if job.course is not None and time is not None:
+        for path, added in job.course.motions(time).items():
+            own = out.get(path, Motion())
+            rotate = triple(a + b for a, b in zip(own.rotate, added.rotate, strict=True))
+            shift = triple(a + b for a, b in zip(own.shift, added.shift, strict=True))
+            out[path] = replace(own, rotate=rotate, shift=shift, pivot=added.pivot, scale=own.scale + added.scale)
+    return out

@@ -1,4 +1,4 @@
-"""A course of temperatures: the state at each time, what the monitor records and what the analysis makes of it."""
+"""A course: the state at each time, what the monitor records and what the analysis makes of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
 from analysis.monitor.recovery import ESTIMATORS, Recovery, recover
 from analysis.spots.spot_positions import SpotError
 from analysis.units import ARCSEC
-from optics.geometry.tree import State
+from optics.geometry.tree import Motion, State
 from optics.numerics.threads import cores, one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -41,6 +41,7 @@ class TimeSeries:
     Attributes:
         times: (T,) seconds.
         temperatures: node path -> its change of temperature at each time, perturbation included.
+        motions: node path -> its motion at each time, perturbation included; of the nodes that the course moves.
         shown: number of the time that the rest of the run shows in full.
         truth: camera -> (4, T) true d_alpha, d_beta, d_gamma (rad) and d_f (m).
         angle: of the nominal state, radians, NaN unless there are two cameras; angle_change: (T,), radians.
@@ -54,6 +55,7 @@ class TimeSeries:
 
     times: np.ndarray
     temperatures: Mapping[str, tuple[Temperature, ...]]
+    motions: Mapping[str, tuple[Motion, ...]]
     shown: int
     truth: Mapping[str, np.ndarray]
     angle: float
@@ -83,6 +85,16 @@ class TimeSeries:
             },
             "cameras": cameras,
         }
+        if self.motions:
+            out["motions"] = {
+                path: {
+                    "pivot": moves[0].pivot,
+                    "rotate_arcsec": [[angle / ARCSEC for angle in motion.rotate] for motion in moves],
+                    "shift_um": [[1e6 * length for length in motion.shift] for motion in moves],
+                    "scale_ppm": [1e6 * motion.scale for motion in moves],
+                }
+                for path, moves in self.motions.items()
+            }
         if self.recovered_angle:
             out["intersection_angle"] = {
                 "nominal_deg": float(np.degrees(self.angle)),
@@ -103,17 +115,17 @@ def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
         InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.
     """
     course = _course(job)
-    motions = motions_of(job)
     out = []
     for k, time in enumerate(course.times):
         fields = job.fields(k)
         try:
             experiment.thermal.check(fields)
         except TemperatureError as error:
-            own = error.origin in course.temperature
-            key = ("course", *course.key(error.origin, k)) if own else ("perturb", error.origin, "temperature")
-            raise job.error(f"{error} at {moment(time)}", key, allowed=error.allowed) from error
-        out.append(experiment.thermal.state(fields, motions))
+            text = f"{error} at {moment(time)}"
+            if error.origin in course.temperature:
+                raise course.error(text, course.key(error.origin, k), allowed=error.allowed) from error
+            raise job.error(text, ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
+        out.append(experiment.thermal.state(fields, motions_of(job, k)))
     return out
 
 
@@ -139,9 +151,9 @@ def run_series(
     channels, shape = experiment.path.channels, experiment.path.shape
     each = len(channels) * shape[0] * shape[1]
     if len(states) * each > LARGEST_SERIES:
-        raise job.error(
+        raise course.error(
             "the images of all times do not fit into memory",
-            ("course", "times"),
+            ("times",),
             found=f"{len(states)} times",
             allowed=f"at most {LARGEST_SERIES // each} with area CCDs of {shape[0]} x {shape[1]} pixels",
         )
@@ -178,10 +190,12 @@ def run_series(
         share[piece] = expected.sum(axis=(2, 3)) / experiment.nominal_photons.sum(axis=(1, 2))
         advance(piece.stop)
     names = list(experiment.instrument.cameras)
+    moves = [motions_of(job, k) for k in range(len(states))]
     changes = {name: [t.cameras[name] for t in truths] for name in names}
     return TimeSeries(
         times=np.array(course.times),
         temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
+        motions={path: tuple(every[path] for every in moves) for path in course.motion},
         shown=course.shown,
         truth={
             name: np.concatenate([np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f]) for c in every], axis=1)
@@ -203,10 +217,12 @@ def run_series(
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:
     """What to say when the state at time number ``k`` cannot be rendered."""
     course = _course(job)
-    return job.error(
+    given = {"temperature": course.temperature, "motion": course.motion}
+    parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in given.items() if nodes}
+    return course.error(
         f"the instrument at {moment(course.times[k])} of the course cannot be rendered: {reason}",
-        ("course", "temperature"),
-        found=f"temperatures of {', '.join(course.temperature)}",
+        (next(iter(parts)),),
+        found=" and ".join(parts.values()),
         allowed="temperatures and motions that keep the beams on the mirrors and the spots on their CCDs",
     )
 

@@ -40,7 +40,11 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
     {
         "truth": _CHANGES,
         "recovered": {**_CHANGES, "spots": _SPOT},
-        "course": {**_CHANGES, "times_s": "seconds from the beginning of the course"},
+        "course": {
+            **_CHANGES,
+            "times_s": "seconds from the beginning of the course",
+            "motions": "in the moved body's own nominal axes, about its pivot",
+        },
         "crosstalk": {"rows and columns": _CAMERA, "motions": "in the moved body's own nominal axes"},
         "stray": {"sources": "shares of light, of no frame", "detector": "by the name of the channel"},
         "quality": {"fields": "shares of half the line, +1 at its left end, +Y of the focal plane"},

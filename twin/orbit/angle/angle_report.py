@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.units import ARCSEC
-from scenes.specs.job import DEFAULT_PIVOT, PerturbationSpec
+from scenes.specs.course import DEFAULT_PIVOT
+from scenes.specs.job import PerturbationSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.orbit.angle.angle_plots import signs
 from twin.orbit.angle.angle_run import AngleRun, values_of
