@@ -7,6 +7,7 @@ if __name__ == "__main__":
 
     end_quietly()
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,12 +24,14 @@ from twin.run.cli import (
     LARGEST_SEED,
     BackendName,
     Force,
+    Heartbeat,
     InputErrorText,
     check_backend,
     exit_on_terminate,
     explained,
     print_whole,
     result_table,
+    time_text,
 )
 from twin.run.run_folder import RunFolder
 from twin.validation.checks.check import (
@@ -172,12 +175,20 @@ def _run(
         total = rough_seconds(selections, fast)
         task = bar.add_task("start", total=total)
 
+        begun, at = time.monotonic(), "start"
+
         def show(done: float, text: str) -> None:
+            nonlocal at
+            left = (time.monotonic() - begun) * (total - done) / done if done > 0.05 * total else total - done
+            at = f"{text}, about {time_text(left)} left"
             bar.update(task, completed=done, description=text)
 
+        beat = Heartbeat(errors, lambda: at, silent=False)
+
         if folder is None:
-            return run_checks(selections, tracer, seed, only, fast, show)
-        with folder:
+            with beat:
+                return run_checks(selections, tracer, seed, only, fast, show)
+        with folder, beat:
             validation = run_checks(selections, tracer, seed, only, fast, show, folder.path)
             show(total, "write the run folder")
             write_validation(validation, folder)

@@ -56,8 +56,8 @@ DURATIONS = (
     re.compile(r"(?<=\d checks, )\d+ (s|min)\b"),
 )
 """In a report's last table, in the validation's summary and in the lead of its report."""
-PACE = re.compile(r"^(\d+ runs .*; about .* a run|\d+ of \d+ runs, .* left)$")
-"""Lines on stderr by which a study tells its pace."""
+PACE = re.compile(r"^(\d+ runs .*; about .* a run|progress: .*)$")
+"""Lines on stderr that tell how fast and how far a command is."""
 
 
 def digest(data: bytes) -> str:

@@ -1,13 +1,18 @@
 """A test of one's own, from outside: what it takes to make a command and a base of studies of it."""
 
+import io
 import json
+import re
+import sys
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
+from rich.console import Console
 
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
@@ -16,8 +21,9 @@ from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
-from twin.run import reference_frames
+from twin.run import cli, reference_frames
 from twin.run.artefact import SvgFigure, Table
+from twin.run.cli import Heartbeat
 from twin.run.command import add_test
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Advance, BenchError, Procedure
@@ -103,6 +109,33 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
 
     add_test(app, "own.bench", "level", resolve, lambda: (LEVEL, report), "Read a level.")
     return lambda *arguments: invoke(app, *arguments)
+
+
+def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Path, monkeypatch) -> None:
+    """Also while one part of the work takes long."""
+    monkeypatch.setattr(cli, "TICK_SECONDS", 0.05)
+    path = tmp_path / "level.yaml"
+    path.write_text(FILE, "utf-8")
+    measured = LEVEL.run
+    slow = replace(LEVEL, run=lambda *given: (given[3]("read", 2, 5), time.sleep(0.4), measured(*given))[-1])
+    monkeypatch.setattr(sys.modules[__name__], "LEVEL", slow)
+    said = run("level", path, "--out", tmp_path / "run").stderr.splitlines()
+    assert len(said) >= 3
+    for line in said:
+        assert re.fullmatch(r"progress: (start|write.*|read: \d of 5), \d+ s so far(, about \d+ s left)?", line), line
+    assert "progress: read: 2 of 5, 0 s so far, about 1 s left" in said
+    for option in ("--quiet", "--json"):
+        assert run("level", path, "--out", tmp_path / option.strip("-"), option).stderr == ""
+
+
+def test_a_terminal_shows_progress_itself() -> None:
+    shown = io.StringIO()
+    with Heartbeat(Console(file=shown, force_terminal=True), lambda: "far", False, 0.02):
+        time.sleep(0.1)
+    assert shown.getvalue() == ""
+    with Heartbeat(Console(file=shown), lambda: "far", False, 0.02):
+        time.sleep(0.1)
+    assert set(shown.getvalue().splitlines()) == {"progress: far"}
 
 
 def test_command(run: Callable, tmp_path: Path) -> None:

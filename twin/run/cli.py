@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -94,6 +95,76 @@ def explained(errors: Console) -> Iterator[None]:
     except KeyboardInterrupt:
         errors.print("interrupted: nothing was kept", style="bold red")
         raise typer.Exit(INTERRUPTED) from None
+
+
+TICK_SECONDS = 8.0
+"""From one line of progress to the next where there is no terminal: nobody waits longer than 10 s for a word."""
+
+
+class Heartbeat:
+    """Context manager: inside the block a line now and then says how far a command is, where no terminal shows it.
+
+    Args:
+        console: where it is said; nothing is where it is a terminal, which shows progress itself.
+        says: one line.
+        silent: whether nothing shall be said.
+        seconds: from one line to the next, None for TICK_SECONDS.
+    """
+
+    def __init__(self, console: Console, says: Callable[[], str], silent: bool, seconds: float | None = None) -> None:
+        self._console, self._says = console, says
+        self._seconds = TICK_SECONDS if seconds is None else seconds
+        self._ended = threading.Event()
+        self._thread = None if silent or console.is_terminal else threading.Thread(target=self._beat, daemon=True)
+
+    def __enter__(self) -> Heartbeat:
+        """Begin."""
+        if self._thread is not None:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End; no line comes after it."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _beat(self) -> None:
+        while not self._ended.wait(self._seconds):
+            self._console.print(f"progress: {self._says()}", markup=False, highlight=False, soft_wrap=True)
+
+
+@dataclass
+class Standing:
+    """How far a piece of work is; ``advance`` is what it calls."""
+
+    part: str = "start"
+    done: int = 0
+    total: int = 1
+    begun: float = field(default_factory=time.monotonic)
+
+    def advance(self, part: str, done: int, total: int) -> None:
+        """So many of so many parts of this are done."""
+        if part != self.part:
+            self.begun = time.monotonic()
+        self.part, self.done, self.total = part, done, total
+
+    def __str__(self) -> str:
+        spent = time.monotonic() - self.begun
+        text = f"{self.part}: {self.done} of {self.total}" if self.total > 1 else self.part
+        text += f", {time_text(spent)} so far"
+        if 0 < self.done < self.total:
+            text += f", about {time_text(spent * (self.total - self.done) / self.done)} left"
+        return text
+
+
+def time_text(seconds: float | None) -> str:
+    """A time in the unit that suits it."""
+    if seconds is None:
+        return "an unknown time"
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def progress_columns(width: int) -> tuple[ProgressColumn, ...]:

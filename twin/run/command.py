@@ -21,10 +21,12 @@ from twin.run.cli import (
     BackendName,
     File,
     Force,
+    Heartbeat,
     Options,
     Out,
     Quiet,
     Seed,
+    Standing,
     check_backend,
     exit_on_terminate,
     explained,
@@ -114,13 +116,15 @@ def run_command(
         folder = RunFolder(chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
-        hidden = options.as_json or options.quiet or not errors.is_terminal
+        silent, standing = options.as_json or options.quiet, Standing()
+        hidden = silent or not errors.is_terminal
         with (
             exit_on_terminate(),
             folder,
             Progress(*progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+            Heartbeat(errors, standing.__str__, silent),
         ):
-            result = work(given, Session(folder, tracer, _advance(bar), started, clock))
+            result = work(given, Session(folder, tracer, _advance(bar, standing), started, clock))
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if options.as_json:
             print_json(result.numbers)
@@ -135,7 +139,7 @@ def run_command(
         raise typer.Exit(result.code)
 
 
-def _advance(bar: Progress) -> Advance:
+def _advance(bar: Progress, standing: Standing) -> Advance:
     """Shows every part of the work as a line, from its beginning on."""
     parts: dict[str, TaskID] = {}
 
@@ -143,6 +147,7 @@ def _advance(bar: Progress) -> Advance:
         if part not in parts:
             parts[part] = bar.add_task(part, total=total)
         bar.update(parts[part], completed=done, total=total)
+        standing.advance(part, done, total)
 
     return advance
 

@@ -16,14 +16,22 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import AsJson, BackendName, Force, explained, print_place, print_whole, result_table
+from twin.run.cli import (
+    AsJson,
+    BackendName,
+    Force,
+    Heartbeat,
+    Standing,
+    explained,
+    print_place,
+    print_whole,
+    result_table,
+    time_text,
+)
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError
 from twin.study.runs.engine import Progress as EngineProgress
 from twin.study.study_command import Broken, StudyOptions, StudyRun, run_study
-
-TICK_SECONDS = 10.0
-"""How often a line of progress is written where there is no terminal."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -128,13 +136,16 @@ class _Display:
         )
         self._task = self.bar.add_task("runs", total=None, rate="")
         self._began: tuple[float, int] | None = None
-        self._last_text = time.monotonic()
+        self._standing = Standing("start the workers and a pilot")
+        self._heartbeat = Heartbeat(console, lambda: str(self._standing), silent)
 
     def __enter__(self) -> _Display:
         self.bar.start()
+        self._heartbeat.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._heartbeat.__exit__()
         self.bar.stop()
 
     def progress(self) -> EngineProgress:
@@ -152,7 +163,7 @@ class _Display:
         there = f" ({estimate.there} are there already)" if estimate.there else ""
         self._say(
             f"{estimate.runs} runs{there} in {estimate.blocks} blocks and {estimate.chunks} chunks on "
-            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {_time_text(estimate.seconds)}, "
+            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {time_text(estimate.seconds)}, "
             f"{1e-9 * estimate.memory:.1f} GB; {1e3 * estimate.state_seconds:.3g} ms a run"
         )
 
@@ -163,17 +174,10 @@ class _Display:
         rate = (done - self._began[1]) / max(now - self._began[0], 1e-9)
         text = f"{rate:.3g}/s" if done > self._began[1] else ""
         self.bar.update(self._task, completed=done, total=total, rate=text)
-        if not self.console.is_terminal and text and now - self._last_text > TICK_SECONDS:
-            self._last_text = now
-            self._say(f"{done} of {total} runs, {text}, {_time_text((total - done) / rate)} left")
-
-
-def _time_text(seconds: float | None) -> str:
-    if seconds is None:
-        return "an unknown time"
-    if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+        if done < total:
+            self._standing.advance("runs", done, total)
+        else:
+            self._standing.advance("write the results", 0, 1)
 
 
 def _print_result(run: StudyRun) -> None:
