@@ -73,6 +73,7 @@ from twin.path_tracing.source import RaySource
 from twin.path_tracing.stray_rays import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.run.artefact import Table
+from twin.run.data_files import FrameFacts
 from twin.run.page import RunFacts, write_test
 from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder, write_manifest
@@ -282,7 +283,7 @@ def brightest(run: Any) -> Section:
     return Section("How bright the spots are", ("One pixel < all pixels.",), (table,))
 
 
-def as_npy(frames: np.ndarray) -> bytes:
+def as_npy(frames: np.ndarray, facts: FrameFacts) -> bytes:
     out = io.BytesIO()
     np.save(out, frames)
     return out.getvalue()

@@ -184,6 +184,10 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
     assert files >= FILES | {"recovered.json", "report.html", "manifest.json"}
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest["sha256"]) >= FILES
+    with tifffile.TiffFile(folder / "images/forward_left_course.tiff") as file:
+        said = [json.loads(page.description) for page in file.pages]
+    assert [page["time_s"] for page in said] == [0.0, 720.0, 1800.0]
+    assert {page["camera"] for page in said} == {"forward, left area CCD"}
     about = {"schema", "reference_frames"}
     assert set(found) == about | {"times_s", "detail", "temperatures", "cameras", "intersection_angle"}
     assert (found["times_s"], found["detail"]) == ([0.0, 720.0, 1800.0], 1)

@@ -146,7 +146,7 @@ def test_config_repeats_the_run(folder, mtf, backend):
     assert again.to_yaml() == (folder / "run" / "config.yaml").read_text()
     experiment = MonitorExperiment(again, backend)
     repeated = render_targets(again, experiment.instrument, backend, experiment.state(again.job), 1)
-    images = {stem: frames for stem, _, frames in repeated.images()}
+    images = {stem: frames for stem, _, frames, _ in repeated.images()}
     for name in IMAGES:
         np.testing.assert_array_equal(
             images[name.removeprefix("images/")], tifffile.imread(folder / "run" / f"{name}.tiff")

@@ -16,6 +16,7 @@ from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.data_files import FrameFacts
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 
@@ -124,6 +125,7 @@ def distortion_report(run: DistortionRun) -> Report:
     count, sets = run.record.reading.shape
     numbers = np.linspace(0, count - 1, SHOWN).astype(int)
     width = run.bench.images.width
+    facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
     return Report(
         title="Interior orientation and distortion",
         lead=(
@@ -153,6 +155,7 @@ def distortion_report(run: DistortionRun) -> Report:
         summary=_summary(data),
         sections=(_curve(run), _compensation(run), _estimates(run), _noise(run, data)),
         images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
+        image_facts=FrozenMap({f"spot-{i + 1:02d}": facts for i in numbers}),
         warnings=_warnings(run),
     )
 

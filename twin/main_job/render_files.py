@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from scenes.specs.channel import Channel
 from twin.main_job.render_results import RenderRun, quality_dict, stated
 from twin.monitor.time_series import TimeSeries
-from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, frame_files, netcdf
+from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun
@@ -32,7 +34,10 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
         _write_numbers(folder, kind, data)
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
-            for file, content in frame_files(f"{channel.camera}_{channel.side}_{when}", frames):
+            facts = _spot_facts(run, channel, "nominal" if when == "before" else "perturbed")
+            if when == "after" and run.series is not None:
+                facts = replace(facts, times=(float(run.series.times[run.series.shown]),) * len(frames))
+            for file, content in frame_files(f"{channel.camera}_{channel.side}_{when}", frames, facts):
                 folder.write_bytes(file, content)
     folder.write_bytes("irradiance.nc", netcdf(irradiance(run)))
     if run.stray is not None:
@@ -50,13 +55,21 @@ def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> Non
     folder.write_json(f"{kind}.json", described(kind, data))
 
 
+def _spot_facts(run: RenderRun, channel: Channel, note: str) -> FrameFacts:
+    """What is known of frames of a monitor's area CCD."""
+    camera = f"{channel.camera}, {channel.side} area CCD"
+    return FrameFacts(camera, run.experiment.path.pitch, run.experiment.exposure, note=note)
+
+
 def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None:
     """Numbers, expected images, and of each channel the first frame of every time as one page."""
     _write_numbers(folder, "course", series.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
+        times = tuple(float(time) for time in series.times)
+        facts = replace(_spot_facts(run, channel, "first frame at each time of the course"), times=times)
         for ending, contents in FRAME_FORMATS.items():
             name = f"images/{channel.camera}_{channel.side}_course.{ending}"
-            folder.write_bytes(name, contents(series.frames[:, i]))
+            folder.write_bytes(name, contents(series.frames[:, i], facts))
     time = ("time", series.times, {"units": "s", "long_name": "time of the course"})
     folder.write_bytes("course.nc", netcdf(_images(run, "time", time, series.photons)))
 
@@ -64,8 +77,8 @@ def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
     """MTF and frames; the faint rings of a pinhole are stretched in its preview, levels of the others are not."""
     _write_numbers(folder, "mtf", targets.to_dict())
-    for stem, name, frames in targets.images():
-        for file, content in frame_files(stem, frames, SPOT_STRETCH if name == "pinhole" else None):
+    for stem, name, frames, facts in targets.images():
+        for file, content in frame_files(stem, frames, facts, SPOT_STRETCH if name == "pinhole" else None):
             folder.write_bytes(file, content)
 
 

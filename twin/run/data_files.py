@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -43,28 +45,94 @@ LARGEST_ENLARGED = 600
 """Rows or columns from which a picture is shown as large as it is."""
 
 
-def tiff(frames: np.ndarray) -> bytes:
-    """Frames (N, H, W) as a TIFF file of N pages."""
+@dataclass(frozen=True)
+class FrameFacts:
+    """What recorded frames are, for whoever has nothing but their file.
+
+    Attributes:
+        camera: whose CCD it is, for people: ``forward, left area CCD``; empty if nobody says.
+        pitch: of the pixels, metres; None if nobody says, as the others.
+        exposure: of each frame, seconds.
+        times: of each frame in the course, seconds.
+        note: what else is to be known.
+    """
+
+    camera: str = ""
+    pitch: float | None = None
+    exposure: float | None = None
+    times: tuple[float, ...] | None = None
+    note: str = ""
+
+    def page(self, k: int) -> dict[str, Any]:
+        """What is known of frame number ``k``, as plain data."""
+        known = {
+            "camera": self.camera or None,
+            "frame": k + 1,
+            "pitch_um": None if self.pitch is None else round(1e6 * self.pitch, 9),
+            "exposure_s": self.exposure,
+            "time_s": None if self.times is None else self.times[k],
+            "note": self.note or None,
+        }
+        return {key: value for key, value in known.items() if value is not None}
+
+
+_MODEL, _EXPOSURE_TIME = 272, 33434
+_RATIONAL = 10**6
+"""Denominator of exposure times in tags."""
+WRITER = "space-camera-twin"
+
+
+def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
+    """Frames (N, H, W) as a TIFF file of N pages, each with what is known of it in its tags.
+
+    ImageDescription holds all as JSON; XResolution and YResolution are pixels per centimetre; Model is the camera,
+    ExposureTime in seconds as in Exif. Row 0 is the first of the CCD.
+    """
     # made in memory: on a full disk NumPy's writer does not say why it failed
     stream = io.BytesIO()
-    tifffile.imwrite(stream, frames, photometric="minisblack")
+    tags: list[tuple[Any, ...]] = []
+    if facts.camera:
+        tags.append((_MODEL, "s", 0, facts.camera, True))
+    if facts.exposure is not None:
+        tags.append((_EXPOSURE_TIME, "2I", 1, (round(_RATIONAL * facts.exposure), _RATIONAL), True))
+    scale: dict[str, Any] = {}
+    if facts.pitch is not None:
+        scale = {"resolution": (1e-2 / facts.pitch,) * 2, "resolutionunit": "CENTIMETER"}
+    with tifffile.TiffWriter(stream) as file:
+        for k, frame in enumerate(frames):
+            about = json.dumps(facts.page(k))
+            file.write(
+                frame,
+                photometric="minisblack",
+                contiguous=False,
+                description=about,
+                metadata=None,
+                software=WRITER,
+                extratags=tags,
+                **scale,
+            )
     return stream.getvalue()
 
 
-FRAME_FORMATS: dict[str, Callable[[np.ndarray], bytes]] = {"tiff": tiff}
-"""Ending of a file of recorded frames -> its contents, of frames uint16 (N, H, W). A new one is added here."""
+FRAME_FORMATS: dict[str, Callable[[np.ndarray, FrameFacts], bytes]] = {"tiff": tiff}
+"""Ending of a file of recorded frames -> its contents, of frames uint16 (N, H, W) and what is known of them. A new one
+is added here.
+"""
 
 
-def frame_files(name: str, frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> Iterator[tuple[str, bytes]]:
+def frame_files(
+    name: str, frames: np.ndarray, facts: FrameFacts, stretch: float | None = SPOT_STRETCH
+) -> Iterator[tuple[str, bytes]]:
     """(file, contents) of everything that a run folder has of recorded frames: all formats, and a picture to look at.
 
     Args:
         name: of the frames.
         frames: uint16 (N, H, W).
+        facts: what is known of them.
         stretch: of the picture, see ``preview``.
     """
     for ending, contents in FRAME_FORMATS.items():
-        yield f"images/{name}.{ending}", contents(frames)
+        yield f"images/{name}.{ending}", contents(frames, facts)
     yield f"images/{name}.png", preview_png(frames, stretch)
 
 

@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, plain, significant
-from twin.run.data_files import frame_files
+from twin.run.data_files import FrameFacts, frame_files
 from twin.run.further_sections import further_sections
 from twin.run.reference_frames import described
 from twin.run.report import Report, Section
@@ -152,7 +152,7 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
     folder.write_json(f"{kind}.json", described(kind, numbers))
     write_artefacts((report.summary, *(a for section in report.sections for a in section.artefacts)), folder)
     for name, frames in report.images.items():
-        for file, content in frame_files(name, frames, stretch=None):
+        for file, content in frame_files(name, frames, report.image_facts.get(name, FrameFacts()), stretch=None):
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
     entries = {"test": kind, "backend": facts.backend, "seed": facts.seed, "warnings": list(report.warnings)}

@@ -9,6 +9,7 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from twin.run.artefact import Artefact, Table
+from twin.run.data_files import FrameFacts
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,7 @@ class Report:
         summary: the main table, also printed in the terminal.
         sections: the rest of the report.
         images: name -> recorded frames, uint16 (frames, rows, columns).
+        image_facts: name -> what is known of these frames; of some or all.
         warnings: what the user should know before using the numbers.
     """
 
@@ -46,6 +48,7 @@ class Report:
     summary: Table
     sections: tuple[Section, ...]
     images: Mapping[str, np.ndarray] = field(default_factory=FrozenMap)
+    image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.mtf.bar_contrast import BarMtf
 from analysis.mtf.edge_mtf import EdgeMtf
+from twin.run.data_files import FrameFacts
 
 NYQUIST = 0.5
 """Of any pixel, cycles/pixel."""
@@ -133,13 +134,16 @@ class TargetRun:
     frames: int
     obstruction: bool = True
 
-    def images(self) -> Iterator[tuple[str, str, np.ndarray]]:
-        """Stem of its file, name of the image, and the frames (N, H, W) of every image."""
+    def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
+        """Of every image the stem of its file, its name, the frames (N, H, W) and what is known of them."""
         for camera, found in self.cameras.items():
             for place, targets in found.places.items():
                 for when, shots in targets.shots.items():
                     for name, frames in shots.frames.items():
-                        yield f"{camera}_{place}_{name}_{when}", name, frames
+                        facts = FrameFacts(
+                            f"{camera}, line CCD {found.band}", found.pitch, note=f"{name}, {place}, {when}"
+                        )
+                        yield f"{camera}_{place}_{name}_{when}", name, frames, facts
 
     @property
     def has_edges(self) -> bool:
