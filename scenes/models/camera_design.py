@@ -50,10 +50,9 @@ def resolve_design(path: str | Path) -> CameraDesignSetup:
 def prescription_of(camera: CameraSpec) -> Prescription:
     """The prescription of a camera's file."""
     surfaces = {name: surface_of(mirror) for name, mirror in camera.mirrors.items()}
+    image = Stand(camera.image.z, tilt=camera.image.tilt or 0.0)
     stands = {n: Stand(m.z) for n, m in camera.mirrors.items()}
-    return Prescription(
-        {**surfaces, IMAGE: plane()}, {**stands, IMAGE: Stand(camera.image.z)}, camera.stop, camera.field_bias
-    )
+    return Prescription({**surfaces, IMAGE: plane()}, {**stands, IMAGE: image}, camera.stop, camera.field_bias)
 
 
 def beams_of(camera: CameraSpec) -> Beams:
@@ -82,9 +81,10 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
     """The camera of an optimised prescription: all that is not optics as in the start.
 
     Raises:
-        ValueError: surfaces are tilted or decentred, which a camera's file cannot say.
+        ValueError: mirrors are tilted or surfaces decentred, which a camera's file cannot say.
     """
-    if any(stand.y or stand.tilt for stand in prescription.stands.values()):
+    image = prescription.stands[IMAGE]
+    if image.y or any(stand.y or stand.tilt for n, stand in prescription.stands.items() if n != IMAGE):
         raise ValueError("a camera's file has no place for tilted or decentred surfaces")
     mirrors = {}
     for mirror in start.mirrors:
@@ -96,7 +96,7 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
         "name": name,
         "description": description or start.description,
         "mirrors": mirrors,
-        "image": ImageSpec.model_construct(z=prescription.stands[IMAGE].z),
+        "image": ImageSpec.model_construct(z=image.z, tilt=image.tilt or None),
         "field_bias": prescription.field_bias,
     }
     return start.model_copy(update=update)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.geometry.aperture import Aperture, Circle, Rectangle
-from optics.geometry.pose import Pose
+from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, RigidTree
 from optics.numerics.array_math import determinant, norm, turned
@@ -96,6 +96,12 @@ def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
     return np.asarray(vector / norm(vector))
 
 
+def image_pose(spec: CameraSpec) -> Pose:
+    """Pose of the image plane's body in the prescription frame: on the parent axis, turned by the plane's tilt."""
+    rotation = about_axis(0, spec.image.tilt) if spec.image.tilt else np.eye(3)
+    return Pose(rotation, np.array([0.0, 0.0, spec.image.z]))
+
+
 def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Launch points of collimated beams that meet the stop at given points.
 
@@ -148,7 +154,7 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     across = np.cross(LINE_AXIS, sight)
     origin = traced.hit(0)[0, 0] + np.array([0.0, 0.0, spec.mirrors[names[0]].z])
     camera_frame = Pose(np.stack([across, LINE_AXIS, sight], axis=-1), origin)
-    normal = np.array([0.0, 0.0, np.sign(sight[2])])
+    normal = np.sign(sight[2]) * image_pose(spec).rotation[:, 2]
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
 
     axes = transverse_axes(centre[None], LINE_AXIS[None])
@@ -177,7 +183,7 @@ def surface_of(mirror: MirrorSpec) -> Surface:
 
 def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:
     bodies = [Body(name, Pose(np.eye(3), np.array([0.0, 0.0, m.z]))) for name, m in spec.mirrors.items()]
-    bodies.append(Body(IMAGE, Pose(np.eye(3), np.array([0.0, 0.0, spec.image.z]))))
+    bodies.append(Body(IMAGE, image_pose(spec)))
     elements = {
         name: Element(name, name, surface, Interaction.REFLECT, apertures.get(name))
         for name, surface in surfaces.items()

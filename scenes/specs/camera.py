@@ -158,9 +158,15 @@ class FieldSpec(Spec):
 
 
 class ImageSpec(Spec):
-    """The focal plane: z is where it crosses the parent axis, metres."""
+    """The focal plane.
+
+    Attributes:
+        z: where it crosses the parent axis, metres.
+        tilt: about the prescription's x, along the line CCD, radians; left out for a plane square to the axis.
+    """
 
     z: Length
+    tilt: Annotated[float, Quantity(ANGLE, largest="45 deg")] | None = None
 
 
 class LineSpec(Spec):

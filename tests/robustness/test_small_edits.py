@@ -231,6 +231,9 @@ def test_a_camera_out_of_focus_says_so(tmp_path, backend) -> None:
     scaled(camera, ("mirrors", "M1", "radius"), 2e-3)
     job = job_of(tmp_path, camera, instrument)
     run = render_job(resolve(job), backend, frames=2)
+    # the camera's own images are, too; one warning for both cameras, which are of one file
+    (first,) = [text for text in run.warnings if "is blurred as designed" in text]
+    assert re.match(rf"camera \w+ \({tmp_path}/\w+.yaml\) is blurred as designed: \d+\.?\d* waves rms", first)
     blurred = [text for text in run.warnings if "out of focus as designed" in text]
     assert [text.partition(":")[0] for text in blurred] == ["forward", "backward"]
     shifts = [float(re.search(r"image\.z ([-+][\d.]+) mm", text)[1]) for text in blurred]

@@ -12,6 +12,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.obstruction import find_obstructions
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
@@ -157,6 +158,7 @@ def render_job(
         recovery=recovery,
         crosstalk=tables,
         warnings=(
+            *blur_warnings(resolved, backend),
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
             *(series.warnings if series is not None else ()),

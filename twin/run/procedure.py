@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from optics.numerics.backend import Backend
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.test_setup import ExperimentSetup
 from scenes.yaml.errors import KeyPath
 
@@ -49,6 +50,8 @@ class Procedure(Generic[Setup, Run]):
         resolve: file, or the name of one in the library -> set-up. Raises InputError.
         run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
+        warnings: set-up and backend -> what is wrong with what the test is given, beside what its report warns of.
+        seeded: whether anything is drawn at random; the command then has an option --seed.
     """
 
     kind: str
@@ -56,3 +59,5 @@ class Procedure(Generic[Setup, Run]):
     resolve: Callable[[Path | str], Setup]
     run: Callable[[Setup, Backend, int, Advance], Run]
     numbers: Callable[[Run], Mapping[str, Any]]
+    warnings: Callable[[Setup, Backend], tuple[str, ...]] = blur_warnings
+    seeded: bool = True

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.file_kinds import read_for
 from twin.run.artefact import significant
 from twin.run.cli import InputErrorText, Options, print_whole, result_table
-from twin.run.command import WRITE, Result, Session, run_command
+from twin.run.command import WRITE, Result, Session, print_warnings, run_command
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
 from twin.study.gradient.gradient_numbers import gradient_numbers, whole_table
 from twin.study.gradient.gradient_report import response_table, write_report
 from twin.study.gradient.study_gradient import Gradient, study_gradient
-from twin.study.runs.setup import StudySetup, resolve_study
+from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM
 from twin.study.study_command import StudyOptions
 
@@ -56,13 +58,14 @@ def _work(setup: StudySetup, session: Session) -> Result:
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", whole_table(found).content())
-    write_report(setup, found, folder)
+    warnings = blur_warnings(base_of(setup), session.backend)
+    write_report(setup, found, folder, warnings)
     entries = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
-    write_manifest(folder, PROGRAM, session.started, session.seconds, **entries)
-    return Result(numbers, lambda console: _print_result(found, console))
+    write_manifest(folder, PROGRAM, session.started, session.seconds, warnings=list(warnings), **entries)
+    return Result(numbers, lambda console: _print_result(found, warnings, console))
 
 
-def _print_result(found: Gradient, console: Console) -> None:
+def _print_result(found: Gradient, warnings: Sequence[str], console: Console) -> None:
     worst = f"; AD and differences agree to {significant(found.worst, 3, floor=0.0)}" if found.worst is not None else ""
     table = result_table(f"{len(found.responses)} responses by {len(found.factors)} factors{worst}")
     picked = [0, 1, 2, 3, 4, 5, 8]
@@ -72,3 +75,4 @@ def _print_result(found: Gradient, console: Console) -> None:
     for row in response_table(found).rows:
         table.add_row(*(str(row[k]) for k in picked))
     print_whole(console, table)
+    print_warnings(console, warnings)

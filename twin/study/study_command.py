@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
+from scenes.models.camera_sharpness import blur_warnings, cameras_of
 from scenes.specs.file_kinds import read_for
 from twin.run.cli import InputErrorText, check_backend, ending_signals
 from twin.run.run_folder import RunFolderError, chosen, write_manifest
@@ -20,7 +22,7 @@ from twin.study.runs.cluster import LEAST_MEMORY, Workers, local_workers, remote
 from twin.study.runs.engine import Engine, Progress, fit_workers
 from twin.study.runs.plan import Plan
 from twin.study.runs.sampling import run_count
-from twin.study.runs.setup import StudySetup, resolve_study
+from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM, StudyFolder
 
 
@@ -101,6 +103,7 @@ def run_study(
         raise InputErrorText("--resume needs the folder to go on with: --out DIR")
     setup = read_for(PROGRAM, file, resolve_study)
     _check_size(setup, options.confirmed)
+    base = base_of(setup)
     plan = Plan.of(setup)
     warnings: list[str] = []
     warn = progress.warn
@@ -122,6 +125,9 @@ def run_study(
             for text in store.corrupt:
                 remember(text)
             opened(folder.path)
+            blurred = blur_warnings(base, load_backend(options.backend)) if cameras_of(base) else ()
+            for text in blurred:
+                remember(text)
             engine = Engine(plan, store, options.backend, progress)
             count = 0
             if store.missing:
@@ -138,7 +144,7 @@ def run_study(
 
             result = store.result()
             numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
-            write_report(numbers.data, plan, folder.path, numbers.files)
+            write_report(numbers.data, plan, folder.path, numbers.files, blurred)
             entries = {
                 "backend": options.backend,
                 "seed": setup.study.design.seed,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
@@ -23,13 +25,14 @@ from twin.study.runs.study_folder import PROGRAM
 TEMPLATE = "gradient.html.j2"
 
 
-def write_report(setup: StudySetup, found: Gradient, folder: RunFolder) -> None:
+def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
     """Write report.html, its figures and tables into an open run folder.
 
     Args:
         setup: the study.
         found: its Jacobian.
         folder: where.
+        warnings: what is wrong with what the study is given.
     """
     with look("gradient"):
         figures = [
@@ -60,6 +63,7 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder) -> None:
             entries=found.method.size,
             worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
             doubtful=doubtful(found),
+            warnings=warnings,
             tables=[artefact_content(a, place(a)) for a in tables],
             figures=[artefact_content(a, place(a)) for a in figures],
             command=reproduce(PROGRAM, "config.yaml", "--gradient"),

@@ -28,7 +28,7 @@ STATISTICS = "statistics.json"
 ARTEFACTS = "artefacts"
 
 
-def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str]) -> None:
+def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str], given: Sequence[str] = ()) -> None:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
     Args:
@@ -36,12 +36,17 @@ def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str
         plan: the study; ``plan.setup.study.report`` says what is asked for.
         folder: of the study; it is complete but for the manifest, which is written afterwards.
         files: of the data set, in that folder.
+        given: what is wrong with what the study is given, to be told before all else.
     """
-    write_study_report(data, plan.setup.study, folder, files)
+    write_study_report(data, plan.setup.study, folder, files, given)
 
 
 def write_study_report(
-    data: xr.Dataset, study: StudySpec, folder: Path, files: Sequence[str] = ("study.nc", "study.csv")
+    data: xr.Dataset,
+    study: StudySpec,
+    folder: Path,
+    files: Sequence[str] = ("study.nc", "study.csv"),
+    given: Sequence[str] = (),
 ) -> None:
     """As ``write_report``, for a study whose base is not at hand."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
@@ -63,7 +68,7 @@ def write_study_report(
             runs=found.runs,
             failed=int(found.runs.failed.sum()),
             design=design_title(found.runs.kind),
-            warnings=warnings(found),
+            warnings=[*given, *warnings(found)],
             conclusions=conclusions(found),
             responses=_shown(responses),
             factors=_shown(factors),

@@ -18,7 +18,7 @@ from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
-from scenes.yaml.spec import Source
+from scenes.yaml.spec import Source, Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
 from twin.run.versions import source_digest, versions
@@ -113,6 +113,19 @@ def resolve_study(path: str | Path) -> StudySetup:
         InputError: any of the files cannot be read or is not valid, or a factor's key leads nowhere in the base.
     """
     return _resolved(read_yaml(path))
+
+
+def base_of(setup: StudySetup) -> Spec:
+    """The study's base as its own file has it, without what the factors do to it.
+
+    Raises:
+        InputError: the file has changed meanwhile.
+    """
+    source = setup.study.source
+    if source.prefix:  # a study's config.yaml holds it
+        below = {key[1:]: line for key, line in source.lines.items() if key[:1] == ("base",)}
+        return validate(setup.job.model, YamlFile(source.file, setup.tree, below))
+    return setup.job.resolve(_base_file(setup.study))
 
 
 def study_from_text(text: str) -> StudySetup:

@@ -1,0 +1,254 @@
+"""How sharp a camera is as designed, from a few hundred rays, and where its focal plane would be best.
+
+Errors are as ``optics.waves.wavefront`` has them: rms over the stop about the sphere that stands around the chief
+ray's image, piston and tilt taken out, in waves of the camera's own wavelength. The best focal plane has the least
+mean square of them over the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from optics.geometry import zernike
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.aim import AimError
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
+from optics.waves.wavefront import path_to_sphere
+from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
+from scenes.specs.camera import CameraSpec
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import Spec
+
+BLURRED = 0.25
+"""Wavefront error beyond which a camera is told to be blurred, waves rms: a Strehl ratio of 0.08, and for the library's
+cameras next to no contrast at the Nyquist frequency. Marechal's limit of a sharp one is 1/14."""
+
+FIELDS = tuple((x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, 0.0, 1.0))
+"""Shares of the half field along the line and along the track, at which a camera is judged and its focus sought."""
+
+_RINGS = 3
+"""Of the quadrature over the stop: exact for squares of wavefronts to fifth order."""
+
+_FEW_FIELDS = tuple((x, y) for x in (0.0, 1.0) for y in (-1.0, 0.0, 1.0))
+"""For a quick judgement: a camera of surfaces of revolution is the same on both sides of its plane of symmetry."""
+
+
+@dataclass(frozen=True)
+class FocalPlane:
+    """Where a camera's image plane stands.
+
+    Attributes:
+        z: where it crosses the parent axis, metres.
+        tilt: about the prescription's x, at the parent axis, radians; 0 stands square to the axis.
+    """
+
+    z: float
+    tilt: float = 0.0
+
+    @classmethod
+    def of(cls, camera: CameraSpec) -> FocalPlane:
+        """A camera's own."""
+        return cls(camera.image.z, camera.image.tilt or 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldBeams:
+    """Beams of F fields near the image, in the prescription frame; of each the chief ray, then N of a quadrature.
+
+    Attributes:
+        camera: whose.
+        fields: shares of the half field, (F, 2).
+        nodes: of the stop, N.
+        position, direction: (F, 1 + N, 3), metres and unit.
+        path: optical path from the incoming wavefront, (F, 1 + N), metres.
+        exit_pupil: from the camera's own image to its exit pupil, upstream, metres.
+        room: from the last mirror along the chief ray to the camera's own image, (F,), metres.
+    """
+
+    camera: CameraSpec
+    fields: np.ndarray
+    nodes: PupilNodes
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    exit_pupil: float
+    room: np.ndarray
+
+    @classmethod
+    def trace(
+        cls, model: CameraModel, backend: Backend, fields: tuple[tuple[float, float], ...], rings: int
+    ) -> FieldBeams:
+        """Trace them through the camera as designed; no aperture but the stop limits them.
+
+        Raises:
+            AimError, BeamMissedError: light of a field does not come through.
+        """
+        spec, nodes = model.spec, quadrature.disk(rings)
+        bare = model.bare_assembly(apertures=False)
+        to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]])
+        directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
+        radius = float(model.apertures[spec.stop].bounds[1])
+        points = radius * np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)])
+        launch = collimated(backend, to_stop, directions, points)
+        heading = np.broadcast_to(directions[:, None], launch.shape)
+        rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
+        last = len(model.mirrors) - 1
+        traced = trace(backend, assemble(bare, ["imaging"]), rays, keep=(last,), world=True)
+        assert traced.world is not None
+        position, direction, path, valid = traced.numpy(traced.world)
+        shape = launch.shape[:2]
+        require_some(valid.reshape(shape), f"camera {spec.name}")
+        position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
+        way = position[:, 0] - traced.hit(last).reshape(*shape, 3)[:, 0] - model.vertex(model.mirrors[last])
+        return cls(
+            spec,
+            np.array(fields),
+            nodes,
+            position,
+            direction,
+            path.reshape(shape),
+            float(model.first_order.exit_pupil_distance[0]),
+            np.sum(way * direction[:, 0], axis=-1),
+        )
+
+    def _away(self, plane: FocalPlane) -> np.ndarray:
+        """From the camera's own image along each ray to a plane, (F, 1 + N), metres."""
+        point = np.array([0.0, 0.0, plane.z])
+        normal = np.array([0.0, -np.sin(plane.tilt), np.cos(plane.tilt)])
+        return np.asarray(((point - self.position) @ normal) / (self.direction @ normal))
+
+    def reaches(self, plane: FocalPlane) -> bool:
+        """Whether the light meets the plane after its last mirror."""
+        return bool(np.all(self.room + self._away(plane)[:, 0] > 0.0))
+
+    def wavefronts(self, plane: FocalPlane) -> np.ndarray:
+        """Wavefront errors about the images on a plane, piston and tilt out, (F, N), waves."""
+        away = self._away(plane)
+        position, path = self.position + away[..., None] * self.direction, self.path + away
+        to_sphere = path_to_sphere(position, self.direction, path, position[:, :1], self.exit_pupil)
+        basis = zernike.basis(3, self.nodes.x, self.nodes.y)
+        error = (to_sphere[:, :1] - to_sphere)[:, 1:] / self.camera.wavelength
+        # the first three terms are orthonormal over the disk, and the rule is exact for their products
+        return np.asarray(error - (error * self.nodes.share) @ basis @ basis.T)
+
+    def errors(self, plane: FocalPlane) -> np.ndarray:
+        """Rms wavefront error at each field, (F,), waves."""
+        return np.asarray(np.sqrt(self.wavefronts(plane) ** 2 @ self.nodes.share))
+
+    def best_plane(self, tilt: bool = False) -> FocalPlane:
+        """The plane with the least mean square error over the fields; turned about x as well, if asked for."""
+        start, root = FocalPlane.of(self.camera), np.sqrt(self.nodes.share / len(self.fields))
+        middle = float(np.mean(self.position[:, 0, 1]))
+
+        def moved(step: np.ndarray) -> FocalPlane:
+            """The plane ``step[0]`` farther at the middle of the fields and turned by ``step[1]`` about there."""
+            turn = start.tilt + (float(step[1]) if tilt else 0.0)
+            there = start.z + middle * np.tan(start.tilt) + float(step[0])
+            return FocalPlane(float(there - middle * np.tan(turn)), turn)
+
+        # the errors are linear in a shift of the plane but for where chief rays meet it: a few steps find it
+        found = least_squares(
+            lambda step: (self.wavefronts(moved(step)) * root).ravel(),
+            np.zeros(2 if tilt else 1),
+            x_scale=[1e-3, 1e-3][: 2 if tilt else 1],
+            diff_step=1e-6,
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
+        )
+        return moved(found.x)
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """A quick judgement of a camera as designed.
+
+    Attributes:
+        worst: largest wavefront error over the field, waves rms.
+        field: where, shares of the half field along the line and along the track.
+        plane: the best focal plane; None for a sharp camera, and where light has no focus after its last mirror.
+        refocused: the largest error on that plane, waves rms.
+    """
+
+    worst: float
+    field: tuple[float, float]
+    plane: FocalPlane | None = None
+    refocused: float = np.nan
+
+
+@lru_cache(maxsize=64)
+def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
+    """Judge a camera from 222 rays, once.
+
+    Raises:
+        InputError: the prescription does not bring the light of its field through the stop to the image.
+        AimError, BeamMissedError: the same of some of it.
+    """
+    beams = FieldBeams.trace(derive_camera(camera, backend), backend, _FEW_FIELDS, _RINGS)
+    own = FocalPlane.of(camera)
+    errors = beams.errors(own)
+    worst = int(np.argmax(errors))
+    found = Sharpness(float(errors[worst]), (float(beams.fields[worst, 0]), float(beams.fields[worst, 1])))
+    if found.worst <= BLURRED:
+        return found
+    best = beams.best_plane()
+    if not beams.reaches(best):
+        return found
+    return replace(found, plane=best, refocused=float(np.max(beams.errors(best))))
+
+
+def cameras_of(setup: Spec) -> Mapping[str, CameraSpec]:
+    """Cameras among what a job or test refers to, by the file or name that it gives; empty where it has none."""
+    many, one = getattr(setup, "cameras", None), getattr(setup, "camera", None)
+    if isinstance(many, Mapping):
+        return {name: camera for name, camera in many.items() if isinstance(camera, CameraSpec)}
+    return {one.name: one} if isinstance(one, CameraSpec) else {}
+
+
+def blur_warnings(setup: Spec, backend: Backend) -> tuple[str, ...]:
+    """One warning for each camera of a job or test that is not sharp as designed.
+
+    A camera whose light does not come through at all has none: it is an error wherever it is traced.
+    """
+    out = []
+    for camera in cameras_of(setup).values():
+        try:
+            found = sharpness(camera, backend)
+        except (InputError, AimError, BeamMissedError):
+            continue
+        if found.worst > BLURRED:
+            out.append(_blurred(camera, found))
+    return tuple(dict.fromkeys(out))
+
+
+def _blurred(camera: CameraSpec, found: Sharpness) -> str:
+    file, inside = camera.source.file, camera.source.prefix
+    # in a run's config.yaml a camera stands among others
+    chosen = f" --camera {inside[-1]}" if len(inside) > 1 else ""
+    what = (
+        f"camera {camera.name}{f' ({file})' if file else ''} is blurred as designed: {found.worst:.3g} waves rms of "
+        f"wavefront error at field {field_text(camera, found.field)}, more than {BLURRED:g}"
+    )
+    if found.plane is None:
+        return f"{what}; refocusing cannot help: its light has no focus after the last mirror"
+    shift = 1e3 * (found.plane.z - camera.image.z)
+    left = f"{found.refocused:.2g} waves"
+    remedy = f"python -m twin.camera {file or camera.name}{chosen} --refocus moves image.z by {shift:+.4g} mm"
+    if found.refocused <= BLURRED:
+        return f"{what}; {remedy} and leaves {left}"
+    return f"{what}; {remedy}, but leaves {left}: it is not a matter of focus alone"
+
+
+def field_text(camera: CameraSpec, field: tuple[float, float]) -> str:
+    """A field in degrees: along the line and along the track."""
+    halves = (camera.field.x, camera.field.y)
+    along, across = (np.degrees(share * half) for share, half in zip(field, halves, strict=True))
+    return f"({along:.4g}, {across:.4g}) deg"
