@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, nnls
 
 from optics.design.design_rays import Beams
 from optics.design.design_variables import Prescription, Variable
@@ -26,6 +26,8 @@ STEEPER = 3.0
 ROUNDS = 10
 HELD = 2e-6
 """Violation, metres, below which a constraint counts as held."""
+LEAST_GAIN = 1e-3
+"""Share by which the rms error has to fall for a prescription to count as improved: where least squares ends."""
 LOST = 1e3
 """Residual of everything when light does not get through, so that the step is refused."""
 
@@ -34,6 +36,24 @@ Advance = Callable[[int, int], None]
 
 class DesignError(ValueError):
     """The constraints cannot be held together, or the start does not pass light."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A constraint at which an optimised prescription stands.
+
+    Attributes:
+        name: what it is about.
+        limit: what it asks for, metres.
+        start: by how much the start broke it, metres; negative for room that the start had.
+        worth: by how much the rms error over the fields would fall per metre that the limit is eased, waves/m, from the
+            constraint's Lagrange multiplier.
+    """
+
+    name: str
+    limit: float
+    start: float
+    worth: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +66,7 @@ class Design:
         variables: what was varied.
         merit: evaluated both; it names the passages.
         evaluations: traces with derivatives that it took.
+        held: the constraints that keep it from being better, the dearest first.
     """
 
     prescription: Prescription
@@ -54,6 +75,12 @@ class Design:
     variables: tuple[Variable, ...]
     merit: MeritFunction
     evaluations: int
+    held: tuple[Held, ...] = ()
+
+    @property
+    def improved(self) -> bool:
+        """Whether the rms error over the fields has fallen, by a thousandth at least."""
+        return rms_error(self.after) < (1.0 - LEAST_GAIN) * rms_error(self.before)
 
 
 def constraint_values(evaluation: Evaluation, operands: Operands) -> tuple[np.ndarray, list[str]]:
@@ -148,7 +175,83 @@ def optimise(
     _require_held(merit, after)
     if advance is not None:
         advance(total, total)
-    return Design(current, before, after, variables, merit, evaluations)
+    return Design(current, before, after, variables, merit, evaluations, held_by(merit, current, variables, before))
+
+
+def rms_error(evaluation: Evaluation) -> float:
+    """Rms error over the fields, waves."""
+    return float(np.sqrt(np.mean(evaluation.errors**2)))
+
+
+def held_by(
+    merit: MeritFunction, prescription: Prescription, variables: tuple[Variable, ...], before: Evaluation
+) -> tuple[Held, ...]:
+    """Constraints that hold an optimum, by their Lagrange multipliers.
+
+    At an optimum the slope of the mean square error is a sum of the slopes of the constraints at their limits, with
+    weights that are not negative; each weight is what the error falls by when its limit is eased.
+
+    Args:
+        merit: with the constraints.
+        prescription: optimised.
+        variables: what was varied.
+        before: the start.
+    """
+    there = merit.evaluate(prescription, variables)
+    g, names = constraint_values(there, merit.operands)
+    if not len(g):
+        return ()
+    assert there.d_residuals is not None
+    size = _sizes(prescription, variables)
+    fall = -2.0 * (there.d_residuals @ there.residuals) * size
+    slopes = _constraint_slopes(there, merit.operands) * size[:, None]
+    equal = merit.operands.principal_distance is not None
+    at_limit = np.flatnonzero((g > -_AT_LIMIT) | (equal & (np.arange(len(g)) == 0)))
+    columns = [slopes[:, k] for k in at_limit]
+    owners = list(at_limit)
+    if equal:  # held in both directions
+        columns.append(-slopes[:, 0])
+        owners.append(0)
+    weights, _ = nnls(np.stack(columns, axis=1), fall)
+    start = constraint_values(before, merit.operands)[0]
+    worth: dict[int, float] = {}
+    for owner, weight in zip(owners, weights, strict=True):
+        worth[int(owner)] = worth.get(int(owner), 0.0) + float(weight) / (2.0 * rms_error(there))
+    limits = _limits(merit.operands, len(there.extents), len(there.clearances))
+    told = _constraint_names(merit, prescription, names)
+    found = [Held(told[k], limits[k], float(start[k]), gain) for k, gain in worth.items() if gain > 0.0]
+    return tuple(sorted(found, key=lambda held: -held.worth))
+
+
+def _limits(operands: Operands, extents: int, clearances: int) -> list[float]:
+    """What every one of ``constraint_values`` asks for, metres."""
+    out = [] if operands.principal_distance is None else [operands.principal_distance]
+    out += [] if operands.envelope is None else [operands.envelope] * extents
+    return out + ([] if operands.clearance is None else [operands.clearance] * clearances)
+
+
+def _constraint_names(merit: MeritFunction, prescription: Prescription, names: Sequence[str]) -> list[str]:
+    """Names that tell the constraints of one kind apart."""
+    surfaces = ("scene", *prescription.names)
+    passages = iter(merit.passages)
+    count = len(prescription.names)
+    pairs = iter([(i, j) for i in range(count) for j in range(count) if i != j])
+    out = []
+    for name in names:
+        if name == "clearance":
+            p = next(passages)
+            way = f"{surfaces[p.stretch]} to {surfaces[p.stretch + 1]}"
+            out.append(f"clearance of the beams from {way} beside {surfaces[p.surface]}")
+        elif name == "envelope":
+            i, j = next(pairs)
+            out.append(f"envelope, from {prescription.names[j]} to {prescription.names[i]}")
+        else:
+            out.append(name)
+    return out
+
+
+_AT_LIMIT = 20e-6
+"""Room, metres, below which a constraint is at its limit."""
 
 
 def _round(
@@ -163,7 +266,7 @@ def _round(
     equal = merit.operands.principal_distance is not None
     last: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     x0 = start.values(variables)
-    size = np.maximum(np.abs(x0), [_SMALLEST[v.quantity] for v in variables])
+    size = _sizes(start, variables)
 
     def both(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if "at" in last and np.array_equal(last["at"][0], u):
@@ -207,6 +310,12 @@ def _round(
     if equal:
         worst[0] = abs(g[0])
     return ended, int(found.njev), moved, float(worst.max(initial=0.0))
+
+
+def _sizes(prescription: Prescription, variables: Sequence[Variable]) -> np.ndarray:
+    """By which variables are made dimensionless."""
+    least = [_SMALLEST[v.quantity] for v in variables]
+    return np.asarray(np.maximum(np.abs(prescription.values(variables)), least))
 
 
 _SMALLEST = {

@@ -14,7 +14,7 @@ from optics.design.design_variables import Prescription
 from optics.design.merit_function import Evaluation
 from optics.design.optimiser import Design
 from scenes.models.camera_design import prescription_of
-from twin.design.design_run import DesignRun
+from twin.design.design_run import DesignRun, verdict
 from twin.run.artefact import Data, SvgFigure, Table
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
@@ -40,6 +40,7 @@ def design_report(run: DesignRun) -> Report:
     before, after = found.before, found.after
     worst = float(after.errors.max())
     lead = (
+        verdict(run),
         f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
         f"({before.errors.max():.4f} in {setup.camera.name}); its extent along the axis is "
         f"{1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm).",
@@ -100,7 +101,7 @@ def design_report(run: DesignRun) -> Report:
         ),
     )
     facts = (("start", setup.camera.name), ("variables", str(len(found.variables))))
-    return Report(f"Design of {setup.test.name}", lead, facts, summary, sections)
+    return Report(f"Design of {setup.test.name}", lead, facts, summary, sections, warnings=run.warnings)
 
 
 def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optics.design.merit_function import MeritFunction, Operands
-from optics.design.optimiser import Design, DesignError, optimise
+from optics.design.optimiser import HELD, Design, DesignError, Held, optimise, rms_error
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -23,10 +23,15 @@ from scenes.models.camera_design import (
     variables_of,
 )
 from scenes.models.camera_model import derive_camera
+from scenes.models.camera_sharpness import BLURRED
 from twin.run.procedure import Advance, BenchError, Procedure, silent
 
 REMARK = """Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
 line CCD. Made by python -m twin.design from {start}: least squares of the wavefront error over the field."""
+
+
+WORTH = 0.01
+"""Share of the error that a constraint has to be worth, eased by a millimetre, to be spoken of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +42,13 @@ class DesignRun:
         setup: what its file says.
         found: prescription before and after.
         text: the new camera's file.
+        warnings: what its user should know.
     """
 
     setup: CameraDesignSetup
     found: Design
     text: str
+    warnings: tuple[str, ...] = ()
 
 
 def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent) -> DesignRun:
@@ -79,7 +86,11 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         )
     spec = camera_of(camera, found.prescription, test.name, test.description)
     derive_camera(spec, backend)  # it can be used as a camera
-    return DesignRun(setup, found, camera_file(spec, remark))
+    warnings = ()
+    worst = float(found.after.errors.max())
+    if worst > BLURRED:
+        warnings = (f"camera {spec.name} is blurred: {worst:.3g} waves rms in its worst field, more than {BLURRED:g}",)
+    return DesignRun(setup, found, camera_file(spec, remark), warnings)
 
 
 def design_numbers(run: DesignRun) -> dict[str, Any]:
@@ -94,8 +105,49 @@ def design_numbers(run: DesignRun) -> dict[str, Any]:
         "principal_distance_m": {"before": before.principal_distance, "after": after.principal_distance},
         "envelope_m": {"before": before.envelope, "after": after.envelope},
         "clearance_m": {"before": before.clearances.tolist(), "after": after.clearances.tolist()},
+        "improved": found.improved,
+        "held_by": [
+            {
+                "constraint": held.name,
+                "limit_m": held.limit,
+                "broken_at_start_m": max(held.start, 0.0),
+                "worth_waves_per_mm": 1e-3 * held.worth,
+            }
+            for held in found.held
+        ],
         "jacobians": found.evaluations,
     }
 
 
-DESIGN = Procedure("design", CameraDesignSetup, resolve_design, run_design, design_numbers)
+def verdict(run: DesignRun) -> str:
+    """Whether the camera has become better, and which constraints keep it from more; one sentence or two."""
+    found, start, name = run.found, run.setup.camera.name, run.setup.test.name
+    errors = f"{rms_error(found.after):.4f} waves rms over the field ({rms_error(found.before):.4f} in {start})"
+    held = tuple(one for one in found.held if 1e-3 * one.worth > WORTH * rms_error(found.after))
+    if found.improved:
+        text = f"Improved: {name} has a wavefront error of {errors}"
+        return f"{text}; more is held by {_held_text(held, start)}." if held else f"{text}."
+    if held:
+        return f"Not improved, held by {_held_text(held, start)}: a wavefront error of {errors}."
+    return f"Not improved: nothing that varies makes {start} better; {name} has a wavefront error of {errors}."
+
+
+def _held_text(held: tuple[Held, ...], start: str) -> str:
+    """The dearest constraints, at most three, each with by how much."""
+    parts = []
+    for one in held[:3]:
+        text = f"the {one.name} ({one.limit:.6g} m" if one.limit > 1.0 else f"the {one.name} ({1e3 * one.limit:.4g} mm"
+        if one.start > HELD:
+            text += f", which {start} breaks by {1e3 * one.start:.3g} mm"
+        parts.append(f"{text}; easing it by 1 mm is worth {1e-3 * one.worth:.2g} waves)")
+    return " and ".join(parts)
+
+
+def _blurred(setup: CameraDesignSetup, backend: Backend) -> tuple[str, ...]:
+    """Nothing of the start, which is there to be improved."""
+    return ()
+
+
+DESIGN = Procedure(
+    "design", CameraDesignSetup, resolve_design, run_design, design_numbers, warnings=_blurred, seeded=False
+)

@@ -77,23 +77,25 @@ class RunFacts:
         config: the test with all it refers to, as YAML; it can be given in place of the test's file.
         file: the test's file as the user gave it.
         backend: where it was traced.
-        seed: of everything that is drawn.
+        seed: of everything that is drawn; None where nothing is.
         started: seconds since the epoch.
         seconds: that it took.
         program: that ran it, as the user calls it.
         command: its subcommand.
         again: the command that runs it again, where it is not the test with the run's own config.yaml.
+        options: others that it was given, as the user would write them.
     """
 
     config: str
     file: str
     backend: str
-    seed: int
+    seed: int | None
     started: float
     seconds: float
     program: str
     command: str
     again: str = ""
+    options: str = ""
 
 
 def place(artefact: Artefact) -> str:
@@ -121,7 +123,8 @@ def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
 
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     """``report.html`` as text; its numbers are in KIND.json."""
-    options = f"--seed {facts.seed} --backend {facts.backend}"
+    seed = "" if facts.seed is None else f"--seed {facts.seed}"
+    options = " ".join(filter(None, (seed, f"--backend {facts.backend}", facts.options)))
     return (
         environment(__package__)
         .get_template(TEMPLATE)
@@ -155,5 +158,5 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
         for file, content in frame_files(name, frames, report.image_facts.get(name, FrameFacts()), stretch=None):
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
-    entries = {"test": kind, "backend": facts.backend, "seed": facts.seed, "warnings": list(report.warnings)}
+    entries = {"test": kind, "backend": facts.backend, "seed": facts.seed or 0, "warnings": list(report.warnings)}
     write_manifest(folder, facts.program, facts.started, facts.seconds, **entries)
