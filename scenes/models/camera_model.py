@@ -77,6 +77,11 @@ class CameraModel:
         """Vertex of a mirror's parent surface in the prescription frame, metres."""
         return np.array([0.0, 0.0, self.spec.mirrors[mirror].z])
 
+    @property
+    def image_body(self) -> Pose:
+        """Pose of the image plane in the prescription frame: its origin is on the parent axis."""
+        return image_pose(self.spec)
+
     def toward_optics(self, focal_plane: np.ndarray) -> np.ndarray:
         """Direction from the line's centre along its chief ray, upstream, for rotations (..., 3, 3) of the focal plane
         in the world.

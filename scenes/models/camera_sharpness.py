@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from optics.geometry import zernike
 from optics.numerics import quadrature
@@ -36,6 +35,11 @@ FIELDS = tuple((x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, 0.0, 
 
 _RINGS = 3
 """Of the quadrature over the stop: exact for squares of wavefronts to fifth order."""
+
+_STEPS = 6
+_DIFFERENCE = 1e-4
+"""By which the focal plane is moved and turned for derivatives, metres and radians: far more than rounding, and the
+errors are linear over it."""
 
 _FEW_FIELDS = tuple((x, y) for x in (0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 """For a quick judgement: a camera of surfaces of revolution is the same on both sides of its plane of symmetry."""
@@ -154,17 +158,16 @@ class FieldBeams:
             there = start.z + middle * np.tan(start.tilt) + float(step[0])
             return FocalPlane(float(there - middle * np.tan(turn)), turn)
 
-        # the errors are linear in a shift of the plane but for where chief rays meet it: a few steps find it
-        found = least_squares(
-            lambda step: (self.wavefronts(moved(step)) * root).ravel(),
-            np.zeros(2 if tilt else 1),
-            x_scale=[1e-3, 1e-3][: 2 if tilt else 1],
-            diff_step=1e-6,
-            xtol=1e-14,
-            ftol=1e-14,
-            gtol=1e-14,
-        )
-        return moved(found.x)
+        def residuals(step: np.ndarray) -> np.ndarray:
+            return np.asarray((self.wavefronts(moved(step)) * root).ravel())
+
+        # errors are linear in a move of the plane but for where chief rays meet it: Gauss' steps find it at once
+        step = np.zeros(2 if tilt else 1)
+        for _ in range(_STEPS):
+            sides = [(residuals(step + h), residuals(step - h)) for h in _DIFFERENCE * np.eye(len(step))]
+            slope = np.stack([(ahead - behind) / (2.0 * _DIFFERENCE) for ahead, behind in sides], axis=-1)
+            step = step - np.linalg.lstsq(slope, residuals(step), rcond=None)[0]
+        return moved(step)
 
 
 @dataclass(frozen=True)
@@ -208,9 +211,9 @@ def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
 def cameras_of(setup: Spec) -> Mapping[str, CameraSpec]:
     """Cameras among what a job or test refers to, by the file or name that it gives; empty where it has none."""
     many, one = getattr(setup, "cameras", None), getattr(setup, "camera", None)
-    if isinstance(many, Mapping):
-        return {name: camera for name, camera in many.items() if isinstance(camera, CameraSpec)}
-    return {one.name: one} if isinstance(one, CameraSpec) else {}
+    if isinstance(one, CameraSpec):
+        return {one.name: one}
+    return {name: camera for name, camera in (many or {}).items() if isinstance(camera, CameraSpec)}
 
 
 def blur_warnings(setup: Spec, backend: Backend) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
 from optics.waves.pupil_function import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
@@ -34,6 +35,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
 from scenes.specs.channel import BASE
+from twin.run.reference_frames import frames_text
 from twin.targets.target_path import LineRays, TargetPath
 
 Field = tuple[float, float]
@@ -108,7 +110,13 @@ class Wavefront:
                 "noll": ("noll", index, {"long_name": "Noll's index"}),
                 "term": ("noll", names),
             },
-            {"field": self.field, "wavelength_m": self.wavelength, "rms_waves": self.rms, "strehl": self.strehl},
+            {
+                "reference_frames": frames_text("optics"),
+                "field": self.field,
+                "wavelength_m": self.wavelength,
+                "rms_waves": self.rms,
+                "strehl": self.strehl,
+            },
         )
 
 
@@ -141,7 +149,8 @@ class Spot:
         """The rays, metres from the chief ray."""
         names = {"along_line": self.rays[:, 0], "along_track": self.rays[:, 1]}
         data = {name: ("ray", values, {"units": "m"}) for name, values in names.items()}
-        return xr.Dataset(data, attrs={"field": self.field, "rms_m": self.rms, "airy_m": self.airy})
+        told = {"reference_frames": frames_text("optics"), "field": self.field}
+        return xr.Dataset(data, attrs={**told, "rms_m": self.rms, "airy_m": self.airy})
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +185,7 @@ class Mtf:
                 "direction": ["along line", "along track"],
                 "frequency": ("frequency", self.frequency, {"units": "1/m", "long_name": "spatial frequency"}),
             },
-            {"field": self.field, "nyquist_per_m": self.nyquist},
+            {"reference_frames": frames_text("optics"), "field": self.field, "nyquist_per_m": self.nyquist},
         )
 
 
@@ -270,6 +279,7 @@ class CameraOptics:
         """
         return self.path.rays(self.state, self.directions(fields), points)
 
+    @one_blas_thread()  # of small matrices: threads would only wait for each other
     def wavefronts(
         self, fields: Sequence[Field] | np.ndarray, points: int = MAP_POINTS, terms: int = TERMS
     ) -> tuple[Wavefront, ...]:

@@ -57,9 +57,9 @@ def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
         mtf.values, mtf.limit, (LINE, TRACK), ("along the line", "along the track"), strict=True
     ):
         axes.plot(frequency, values, color=colour, lw=1.4, label=name if label else None)
-        axes.plot(frequency, limit, color=colour, lw=0.8, ls=(0, (4, 2)), alpha=0.8)
+        axes.plot(frequency, limit, color=INK, lw=0.7, ls=(0, (4, 3)), zorder=4)
     if label:
-        axes.plot([], [], color=GREY, lw=0.8, ls=(0, (4, 2)), label="diffraction limit")
+        axes.plot([], [], color=INK, lw=0.7, ls=(0, (4, 3)), label="diffraction limit")
     axes.axvline(1e-3 * mtf.nyquist, color=GREY, lw=0.8, ls=":")
     axes.annotate(
         "Nyquist", (1e-3 * mtf.nyquist, 0.98), (3, 0), textcoords="offset points", va="top", color=GREY, fontsize=7.5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,23 +14,9 @@ from optics.design.merit_function import Evaluation
 from optics.design.optimiser import Design
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DesignRun, verdict
-from twin.run.artefact import Data, SvgFigure, Table
+from twin.run.artefact import CameraFile, SvgFigure, Table
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
-
-
-@dataclass(frozen=True, eq=False)
-class CameraFile(Data):
-    """The optimised camera as a file of the library; ``data`` is its YAML text."""
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "yaml"
-
-    def content(self) -> bytes:
-        """The file."""
-        return str(self.data).encode()
 
 
 def design_report(run: DesignRun) -> Report:

@@ -206,3 +206,17 @@ class Data(Artefact):
     def content(self) -> bytes:
         """The data; NaN and infinities are refused."""
         return (json.dumps(self.data, indent=2, allow_nan=False) + "\n").encode()
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile(Data):
+    """A camera as a file of the library; ``data`` is its YAML text."""
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "yaml"
+
+    def content(self) -> bytes:
+        """The file."""
+        return str(self.data).encode()

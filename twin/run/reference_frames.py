@@ -68,6 +68,15 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         },
         "turntable": {"angles": "readings of the turntable's circle about its axis; errors: reading minus true angle"},
         "design": {"prescription": "vertex of M1; light enters toward +z, y in the symmetry plane, x along the line"},
+        "optics": {
+            "fields": "shares of the half field: along the line, positive at the end at +Y of the focal plane (left), "
+            "and along the track, positive at its +X",
+            "wavefront, zernike_waves": "over the stop in units of its radius, x along the line, y along the track; "
+            "positive where the wavefront is ahead",
+            "place_mm, principal_point": "on the focal plane from the line's middle, along Y and along X",
+            "image, z": "prescription: vertex of M1; light enters toward +z; tilt about x",
+            "focus, defocus": "of the detector, positive downstream, away from the optics",
+        },
         "angle": {
             "planes, look, along_track, truth": _LOOK,
             "frames": "axes in which the planes are fitted: each row names its own",

@@ -1,0 +1,129 @@
+"""What ``twin.camera`` tells of a camera against other people's software: first order, wavefronts, names, MTF."""
+
+import numpy as np
+import pytest
+
+from scenes.models.camera_model import derive_camera
+from scenes.specs.load import load_camera
+from tests.oracles.peers import batoid_camera, batoid_rays, optiland_camera
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.first_order_data import first_order_data
+from twin.camera.ray_paths import ray_paths
+
+pytestmark = pytest.mark.oracle
+NAMES = ["gf7", "monitor", "gf7_conic"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_paraxial_data_of_optiland(backend, name: str) -> None:
+    """Of the same mirrors looked at along their axis, where both mean the same: without the field's bias."""
+    pytest.importorskip("optiland")
+    spec = load_camera(name).model_copy(update={"field_bias": 0.0})
+    model = derive_camera(spec, backend)
+    data = first_order_data(CameraOptics.alone(model, backend))
+    optic = optiland_camera(model)
+    optic.set_aperture("EPD", spec.entrance_pupil)
+    optic.fields.set_type("angle")
+    optic.fields.add(y=0.0)
+    paraxial = optic.paraxial
+    # ours is the image's scale on the focal plane, which stands where the biased field is sharp: some 0.3 mm from the
+    # paraxial focus, of 181 m to gf7's exit pupil
+    assert data.focal_length == pytest.approx(abs(float(paraxial.f2())), rel=5e-6)
+    assert data.f_number == pytest.approx(abs(float(paraxial.FNO())), rel=5e-6)
+    # measured from the first surface, positive behind it
+    assert data.entrance_pupil_distance == pytest.approx(-float(paraxial.EPL()), rel=1e-4)
+    # from the image, along the light, which travels toward -z
+    away = float(np.ravel(paraxial.XPL())[0])
+    assert abs(data.exit_pupil_distance) == pytest.approx(abs(away), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_wavefronts_of_batoids_rays(backend, camera, name: str) -> None:
+    """batoid traces; its paths to the reference sphere are found by the quadratic, and poppy's Zernike terms fitted."""
+    pytest.importorskip("batoid")
+    zernike1 = pytest.importorskip("poppy").zernike.zernike1
+    model = camera(name)
+    optics = CameraOptics.alone(model, backend)
+    fields = [(0.0, 0.0), (1.0, 0.0), (0.4, -1.0)]
+    rng = np.random.default_rng(1)
+    r, angle = np.sqrt(rng.uniform(size=2000)), rng.uniform(0.0, 2.0 * np.pi, 2000)
+    stop = np.concatenate([np.zeros((1, 2)), 0.999999 * np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)])
+    starts = ray_paths(model, backend, fields, stop).points[:2]
+    basis = np.stack([zernike1(j, rho=r, theta=angle, outside=None, noll_normalize=True) for j in range(1, 38)], -1)
+    peer = batoid_camera(model)
+    radius = float(model.first_order.exit_pupil_distance[0])
+    for k, wave in enumerate(optics.wavefronts(fields)):
+        launch = starts[0, k]
+        way = starts[1, k] - launch
+        direction = way / np.linalg.norm(way, axis=-1, keepdims=True)
+        rays = batoid_rays(launch, direction[0])
+        peer.trace(rays)
+        rays.toCoordSys(peer.items[-1].coordSys)
+        # from the sphere about the chief ray's image back along each ray: |p + t v - c| = |radius|
+        offset = rays.r - rays.r[0]
+        along = np.sum(offset * rays.v, axis=-1)
+        root = np.sqrt(along**2 - np.sum(offset**2, axis=-1) + radius**2)
+        to_sphere = rays.t + (-along - np.sign(radius) * root)
+        error = (to_sphere[0] - to_sphere)[1:] / model.spec.wavelength
+        terms = np.linalg.lstsq(basis, error, rcond=None)[0]
+        # 37 terms follow these wavefronts to 1e-6 waves
+        np.testing.assert_allclose(wave.coefficients[3:], terms[3:], atol=3e-6)
+        assert wave.rms == pytest.approx(np.sqrt(np.sum(terms[3:] ** 2)), abs=3e-6)
+        left = error - basis[:, :3] @ terms[:3]
+        assert np.ptp(left) <= wave.peak_to_valley * (1.0 + 1e-6) + 1e-5
+        assert np.ptp(left) > 0.9 * wave.peak_to_valley
+        # and where the chief ray falls
+        place = peer.items[-1].coordSys.origin + rays.r[0] - model.focal_plane.translation
+        np.testing.assert_allclose(wave.place, place[:2], atol=1e-12)
+
+
+def test_poppys_names_of_zernike_terms() -> None:
+    """To fourth order, beyond which it calls trefoil astigmatism: kinds by their word, x and y of coma by theirs."""
+    zern_name = pytest.importorskip("poppy").zernike.zern_name
+    from optics.geometry import zernike
+
+    words = {"Focus": "defocus", "Astig": "astigmatism", "Coma": "coma", "Spherical": "spherical", "Tilt": "tilt"}
+    words |= {"Trefoil": "trefoil", "Tetrafoil": "tetrafoil", "Pentafoil": "pentafoil", "Piston": "piston"}
+    compared = 0
+    for j in range(1, 16):
+        theirs = zern_name(j)
+        kind = [own for word, own in words.items() if word in theirs]
+        if len(kind) == 1:
+            assert kind[0] in zernike.name(j), (j, theirs)
+            compared += 1
+    assert compared >= 13
+    for j in (2, 3, 7, 8):
+        assert zernike.name(j)[-1] == zern_name(j)[-1].lower()
+
+
+def test_mtf_of_poppys_image(backend, camera) -> None:
+    """The camera's own wavefront in a round pupil through poppy's matrix transform: its MTF along both axes."""
+    poppy = pytest.importorskip("poppy")
+    import astropy.units as u
+
+    model = camera("gf7")
+    optics = CameraOptics.alone(model, backend)
+    field = (1.0, 1.0)
+    wave, mtf = optics.wavefront(field), optics.mtf(field)
+    f_number = optics.spot(field).airy / (1.22 * model.spec.wavelength)
+    system = poppy.OpticalSystem(oversample=1, npix=1024, pupil_diameter=1.0 * u.m)
+    system.add_pupil(poppy.CircularAperture(radius=0.5))
+    coefficients = (wave.coefficients * model.spec.wavelength).tolist()
+    system.add_pupil(poppy.ZernikeWFE(radius=0.5, coefficients=coefficients))
+    # pixels of a quarter of lambda / D, a field of 256 lambda / D: what is beyond it holds 0.2 % of the light
+    count, step = 1024, 0.25
+    scale = np.rad2deg(model.spec.wavelength / 1.0) * 3600 * step
+    system.add_detector(pixelscale=scale, fov_pixels=count)
+    image = system.calc_psf(wavelength=model.spec.wavelength * u.m)[0].data
+    own = np.arange(count) * step * model.spec.wavelength * f_number
+    for k, frequency in enumerate((20e3, 50e3, 71.4e3)):
+        turn = np.exp(-2j * np.pi * frequency * own)
+        along = abs(np.sum(image * turn)) / np.sum(image)
+        track = abs(np.sum(image * turn[:, None])) / np.sum(image)
+        # the true pupil is elliptic by 1.2 % and its edge a little uneven; poppy's is round and of the same area
+        for direction, value in enumerate((along, track)):
+            ratio = np.interp(frequency, mtf.frequency, mtf.values[direction] / np.maximum(mtf.limit[direction], 1e-9))
+            s = frequency * model.spec.wavelength * f_number
+            limit = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s**2))
+            assert value / limit == pytest.approx(ratio, abs=0.006), (k, direction)
+            assert ratio < 0.995

@@ -1,0 +1,289 @@
+"""The command that judges a camera: its verdict, its numbers by hand, refocusing, the files it takes and refuses."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from optics.numerics import quadrature
+from scenes.models.camera_file import file_with_plane
+from scenes.models.camera_model import derive_camera
+from scenes.models.camera_sharpness import FocalPlane, sharpness
+from scenes.specs.camera import CameraSpec
+from scenes.specs.camera_setup import resolve_camera
+from scenes.specs.load import LIBRARY, load_camera
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import read_yaml
+from tests.twin.commands import files, invoke
+from tests.twin.test_blurred_cameras import GF7, gf7_with
+from twin.camera.__main__ import app
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_run import GRID, camera_numbers, find_focus, kind_of, run_camera, verdict
+from twin.camera.field_maps import distortion, field_curves, through_focus
+from twin.camera.first_order_data import first_order_data
+from twin.camera.ray_paths import obscuration, ray_paths
+
+WAVE = 650e-9
+
+
+@pytest.fixture(scope="module")
+def gf7_alone(backend, gf7) -> CameraOptics:
+    return CameraOptics.alone(gf7, backend)
+
+
+@pytest.fixture(scope="module")
+def blurred(tmp_path_factory, backend):
+    """M2 4 mm too far, and what the command makes of it."""
+    folder = tmp_path_factory.mktemp("camera")
+    file = gf7_with(folder, "-2.02 m")
+    out = folder / "out"
+    result = invoke(app, file, "--refocus", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    return file, out, result
+
+
+def test_first_order_data_by_hand(gf7, gf7_alone) -> None:
+    data = first_order_data(gf7_alone)
+    spec = gf7.spec
+    assert data.focal_length == pytest.approx(np.sqrt(data.focal_length_line * data.focal_length_track), rel=1e-9)
+    assert data.f_number == pytest.approx(data.focal_length / 0.6, rel=1e-12)
+    # at the image as from the object: of an aplanatic camera f / D is 1 / (2 NA), to its offence against the sine law
+    assert data.working_f_number == pytest.approx(data.f_number, rel=1e-3)
+    assert data.working_f_number_line == pytest.approx(data.focal_length_line / 0.6, rel=5e-3)
+    assert data.working_f_number_track == pytest.approx(data.focal_length_track / 0.6, rel=5e-3)
+    assert data.cutoff == pytest.approx(1.0 / (WAVE * data.working_f_number_line), rel=1e-12)
+    assert data.sampling == pytest.approx(2.0 * data.nyquist / data.cutoff, rel=1e-12)  # 2 samples the cut-off
+    assert data.airy == pytest.approx(1.22 * WAVE * data.working_f_number, rel=1e-12)
+    assert data.pixel_angle == pytest.approx(spec.line.pitch / data.focal_length_line, rel=1e-12)
+    # M2, the stop, as M1 images it: a mirror's equation about M1's vertex, which the beam meets 0.54 m beside
+    distance, half = 2.01593, 6.745359 / 2.0
+    assert data.entrance_pupil_distance == pytest.approx(-1.0 / (1.0 / distance - 1.0 / half), rel=0.06)
+    assert data.exit_pupil == pytest.approx(abs(data.exit_pupil_distance) / data.working_f_number, rel=1e-9)
+    assert data.chief_ray_angle[0] < data.chief_ray_angle[1] < 1e-3  # nearly telecentric
+    assert dict(data.obscuration) == {}
+
+
+def test_the_entrance_pupil_is_where_chief_rays_cross(backend, gf7, gf7_alone) -> None:
+    """Pairs of lines by their feet of the common normal; off axis the pupil is 4 % astigmatic, the mean is told."""
+    found = []
+    for pair in ([(-0.2, 0.0), (0.2, 0.0)], [(0.0, -0.2), (0.0, 0.2)]):
+        paths = ray_paths(gf7, backend, pair, np.zeros((1, 2)))
+        start, then = paths.points[0, :, 0], paths.points[1, :, 0]
+        way = (then - start) / np.linalg.norm(then - start, axis=-1, keepdims=True)
+        steps, *_ = np.linalg.lstsq(np.stack([way[0], -way[1]], axis=-1), start[1] - start[0], rcond=None)
+        found.append(gf7.camera_frame.inverse().apply(start[0] + steps[0] * way[0])[2])
+    assert first_order_data(gf7_alone).entrance_pupil_distance == pytest.approx(np.mean(found), rel=2e-3)
+    assert found[0] / found[1] == pytest.approx(0.96, abs=0.01)
+
+
+def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
+    """With a quarter of its bias the light meets M2 on its way to M1, and again on its way to the image."""
+    file = tmp_path / "low.yaml"
+    file.write_text(GF7.replace("field_bias: 6 deg", "field_bias: 1.5 deg"), "utf-8")
+    model = derive_camera(load_camera(file), backend)
+    shares = obscuration(model, backend)
+    # M2 as a flat disk at its vertex, its sag is some millimetres; worst at the field whose image is nearest to it
+    nodes = quadrature.disk(20)
+    points = ray_paths(model, backend, [(0.0, -1.0)], np.stack([nodes.x, nodes.y], axis=-1), 6.0).points[:, 0]
+    z, radius = model.vertex("M2")[2], model.apertures["M2"].radius + model.spec.edge_margin
+    met = np.zeros(nodes.count, bool)
+    for k in (0, 3):
+        start, end = points[k], points[k + 1]
+        t = (z - start[:, 2]) / (end - start)[:, 2]
+        there = start + t[:, None] * (end - start)
+        met |= (t > 0.0) & (t < 1.0) & (np.hypot(there[:, 0], there[:, 1]) < radius)
+    taken = float(met @ nodes.share)
+    assert 0.1 < taken < 0.9
+    assert shares["M2"] == pytest.approx(taken, abs=0.05)  # 144 rays tell shares to some percent
+
+
+def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
+    found = distortion(gf7_alone)
+    t = np.tan(found.angle)
+    assert found.line_distance == pytest.approx(5.51199976, abs=1e-7)  # tests of the truth: 5.511999
+    assert np.sum(found.residual * t) == pytest.approx(0.0, abs=1e-15)  # least squares leaves nothing along its column
+    np.testing.assert_allclose(found.residual, -found.residual[::-1], atol=1e-12)  # symmetric
+    assert np.max(np.abs(found.residual)) == pytest.approx(19.28e-6, abs=0.01e-6)
+    # the principal point of the field is on the parent axis, where a perfect camera's is: 5.51 m * tan(6 deg) off
+    assert found.point[0] == pytest.approx(0.0, abs=1e-9)
+    assert found.point[1] == pytest.approx(-found.distance * np.tan(np.deg2rad(6.0)), rel=2e-3)
+    assert found.rms < found.largest < 1e-3
+    away = (found.places - found.ideal).reshape(-1, 2)
+    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=1e-12)
+
+
+def test_focus_along_the_line_and_through_focus(backend, gf7_alone) -> None:
+    """The best focus of curves is where the error through focus is least, and both fans stand about it."""
+    curves = field_curves(gf7_alone, sharp=True, count=3)
+    near = through_focus(gf7_alone, backend, ((0.0, 0.0), (1.0, 0.0)), sharp=True)
+    for k, share in enumerate((1, 2)):
+        least = np.polyfit(near.defocus, near.error[k] ** 2, 2)
+        assert -least[1] / (2.0 * least[0]) == pytest.approx(curves.focus[share], abs=0.3e-6)
+        # the beam is 2 % elliptic: its best focus is nearer to one of the fans
+        line, track = curves.focus_line[share], curves.focus_track[share]
+        assert 0.5 * (line + track) == pytest.approx(curves.focus[share], abs=0.05 * abs(line - track))
+    middle = len(near.defocus) // 2
+    np.testing.assert_allclose(near.mtf[0, :, middle], gf7_alone.mtf().at(gf7_alone.nyquist), atol=1e-3)
+    np.testing.assert_allclose(curves.mtf[1], near.mtf[0, :, middle], atol=1e-6)
+    # astigmatism parts the fans: where one is sharpest its MTF is
+    best = near.defocus[np.argmax(near.mtf[1], axis=1)]
+    assert (best[0] - best[1]) * (curves.focus_line[2] - curves.focus_track[2]) > 0.0
+    assert near.error[0, middle] == pytest.approx(gf7_alone.wavefront().rms, rel=1e-4)
+    assert np.all(curves.vignetted == 0.0)
+    assert np.all(np.abs(curves.illumination - 1.0) < 5e-3)
+
+
+def test_kinds_of_aberration() -> None:
+    assert [kind_of(j) for j in (4, 5, 6, 7, 9, 11, 13, 22)] == [
+        "defocus", "astigmatism", "astigmatism", "coma", "trefoil", "spherical aberration", "secondary astigmatism",
+        "secondary spherical aberration",
+    ]  # fmt: skip
+
+
+def test_refocusing_finds_a_focal_plane_that_was_moved(backend) -> None:
+    """Of a sharp camera 1 mm out of focus, and 5 mrad out of level: back to where its own best focus is."""
+    camera = load_camera("gf7")
+    own = find_focus(camera, backend, tilt=True)
+    moved = camera.model_copy(
+        update={"image": camera.image.model_copy(update={"z": camera.image.z + 1e-3, "tilt": 5e-3})}
+    )
+    found = find_focus(moved, backend, tilt=True)
+    assert found.after.z == pytest.approx(own.after.z, abs=1e-6)
+    assert found.after.tilt == pytest.approx(own.after.tilt, abs=1e-6)
+    assert found.errors_before.max() > 0.3 > found.errors_after.max()
+    assert abs(find_focus(camera, backend, tilt=False).after.z - camera.image.z) < 3e-6  # it was designed so
+
+
+def test_the_refocused_file_keeps_all_else(backend, blurred) -> None:
+    file, out, _ = blurred
+    made = out / "artefacts" / "gf7_refocused.yaml"
+    before, after = file.read_text("utf-8"), made.read_text("utf-8")
+    comments = [line for line in before.splitlines() if line.lstrip().startswith("#")]
+    assert comments
+    assert [line for line in after.splitlines() if line.lstrip().startswith("#")] == comments
+    start, camera = load_camera(file), load_camera(made)
+    assert camera.name == "gf7_refocused"
+    assert camera.model_copy(update={"name": start.name, "image": start.image}) == start
+    assert sharpness(camera, backend).worst == pytest.approx(0.101, abs=2e-3)
+
+
+def test_a_refocused_file_finds_its_data_sheets(tmp_path) -> None:
+    folder = tmp_path / "own"
+    folder.mkdir()
+    (folder / "sheet.yaml").write_text((LIBRARY / "detectors" / "gf7_pan.yaml").read_text("utf-8"), "utf-8")
+    file = folder / "mine.yaml"
+    file.write_text(GF7.replace("detector: gf7_pan", "detector: ./sheet.yaml"), "utf-8")
+    text = file_with_plane(load_camera(file), FocalPlane(-2.1, 1e-4), "other")
+    (tmp_path / "other.yaml").write_text(text, "utf-8")
+    made = load_camera(tmp_path / "other.yaml")
+    assert made.bands["P"].detector == str(folder / "sheet.yaml")
+    assert (made.image.z, made.image.tilt) == (-2.1, 1e-4)
+    # and back to a plane square to the axis
+    (tmp_path / "other.yaml").write_text(file_with_plane(made, FocalPlane(-2.2), "back"), "utf-8")
+    assert load_camera(tmp_path / "other.yaml").image.tilt is None
+
+
+def test_the_command_refocuses(blurred, monkeypatch) -> None:
+    _, out, result = blurred
+    told = json.loads((out / "optics.json").read_text("utf-8"))
+    assert told["schema"] == "optics 2"
+    moved = told["refocus"]
+    assert moved["worst_before_waves"] == pytest.approx(6.75, abs=0.01)
+    assert moved["worst_after_waves"] == pytest.approx(told["worst_wfe_waves"], rel=1e-3)
+    assert 1e3 * (moved["z_after_m"] - moved["z_before_m"]) == pytest.approx(10.61, abs=0.01)
+    assert told["verdict"].startswith("Not diffraction limited in ")
+    assert "most of it coma" in told["verdict"]
+    assert told["verdict"] in " ".join(result.stdout.split("\n"))
+    page = (out / "report.html").read_text("utf-8")
+    first = re.search(r'<p class="lead">(.*?)</p>', page)
+    assert first is not None
+    assert first[1].startswith("Not diffraction limited in ")
+    assert page.count("<svg") == 10
+    assert "http" not in re.sub(r"http://www.w3.org[^\"]*", "", page)  # nothing from elsewhere
+    assert "warning" not in result.stdout  # what was wrong has been done
+    wanted = {"config.yaml", "manifest.json", "optics.json", "optics.nc", "report.html", "artefacts/layout.svg"}
+    assert wanted <= files(out)
+    with xr.open_dataset(out / "optics.nc", engine="h5netcdf") as data:
+        assert data["wavefront"].shape == (9, 129, 129)
+        assert str(data["term"].values[3]) == "defocus"
+    # what the report says makes it again does
+    command = re.search(r"<pre>python -m twin.camera (.*)</pre>", page)
+    assert command is not None
+    assert "--refocus" in command[1]
+    monkeypatch.chdir(out)
+    again = resolve_camera(out / "config.yaml")
+    assert again.camera == resolve_camera(blurred[0]).camera
+
+
+def test_a_diffraction_limited_camera_says_so(backend) -> None:
+    run = run_camera(resolve_camera("gf7_pair", "forward"), backend)
+    text = verdict(run)
+    assert text.startswith("Diffraction limited over the whole field: the worst wavefront error is 0.0363 waves rms")
+    assert "at field (1.25, 0.15) deg, most of it astigmatism (0.0345)" in text
+    numbers = camera_numbers(run)
+    assert numbers["mounted"] == "forward"
+    # the monitor's prisms stand in the beam, the camera's own parts do not
+    assert numbers["first_order"]["obscuration"] == {}
+    bodies = numbers["bodies_in_the_beam"]
+    assert run.quality is not None
+    assert sum(share[1] for share in bodies.values()) == pytest.approx(run.quality.light_lost[0, 1], abs=2e-3)
+    assert run.quality.light_lost[0, 1] > 0.05
+    own = numbers["fields"][GRID.index((0.0, 0.0))]
+    assert own["wfe_rms_waves"] == pytest.approx(0.015918, rel=1e-3)
+    assert own["strehl"] == pytest.approx(0.99, abs=1e-3)
+
+
+def test_files_that_it_takes(tmp_path) -> None:
+    alone = resolve_camera("gf7")
+    assert alone.camera == load_camera("gf7")
+    assert resolve_camera(LIBRARY / "cameras" / "gf7.yaml").camera == alone.camera
+    mounted = resolve_camera("gf7_pair", "backward")
+    assert mounted.mounted == "backward"
+    for setup in (alone, mounted):
+        config = tmp_path / "config.yaml"
+        config.write_text(setup.to_yaml(), "utf-8")
+        assert resolve_camera(config) == setup
+    design = tmp_path / "design.yaml"
+    design.write_text("test: {name: a}\ncamera:\n" + "".join(f"  {line}\n" for line in GF7.splitlines()), "utf-8")
+    assert resolve_camera(design).camera == alone.camera
+    study = tmp_path / "study.yaml"
+    both = "".join(f"      {line}\n" for line in GF7.splitlines())
+    study.write_text(f"study: {{}}\nbase:\n  cameras:\n    one:\n{both}    two:\n{both}", "utf-8")
+    found = resolve_camera(study, "two").camera
+    assert found == alone.camera
+    assert found.source.prefix == ("base", "cameras", "two")
+    assert isinstance(validate(CameraSpec, read_yaml(LIBRARY / "cameras" / "gf7.yaml")), CameraSpec)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("gf8",), "no such camera or instrument; found 'gf8'.*did you mean 'gf7'"),
+        (("gf7_pair",), "gf7_pair: which of its cameras is meant is not said; allowed: --camera forward"),
+        (("gf7_pair", "--camera", "foreward"), "no such camera; found 'foreward'.*did you mean 'forward'"),
+        (("gf7", "--camera", "backward"), "gf7: --camera backward: the file holds one camera, gf7"),
+        (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus tilt"),
+        (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus tilt"),
+        (("scenes/examples/perturb.yaml",), "perturb.yaml:1: there is no camera's prescription in this file"),
+        (("nowhere.yaml",), "nowhere.yaml: no such file"),
+    ],
+)
+def test_what_it_refuses(tmp_path, words: tuple[str, ...], message: str) -> None:
+    result = invoke(app, *words, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert re.search(message, " ".join(result.stderr.split()))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None:
+    file = gf7_with(tmp_path, "-2.70 m")
+    result = invoke(app, file, "--refocus", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert re.search(r"gf7_moved.yaml:\d+: mirrors: refocusing cannot help", "".join(result.stderr.split("\n")))
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="no focus after M3"):
+        run_camera(resolve_camera(Path(file)), backend, refocus=True)

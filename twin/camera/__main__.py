@@ -1,0 +1,89 @@
+"""``python -m twin.camera``: a camera as an optical designer looks at it, and its best focus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenes.models.camera_sharpness import blur_warnings
+from scenes.specs.camera_setup import CameraSetup, resolve_camera
+from scenes.yaml.errors import names_text
+from twin.camera.camera_report import camera_report
+from twin.camera.camera_run import camera_data, camera_numbers, run_camera
+from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
+from twin.run.command import Result, Session, print_report, run_command
+from twin.run.data_files import netcdf
+from twin.run.page import RunFacts, write_test
+from twin.run.reference_frames import described
+
+PROGRAM, KIND, TILT = "twin.camera", "optics", "tilt"
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            readable=False,
+            help="Camera or instrument: a name of the library (gf7), a YAML file, or the config.yaml of a run.",
+        ),
+    ],
+    what: Annotated[str | None, typer.Argument(metavar="[tilt]", help="With --refocus: turn the image, too.")] = None,
+    camera: Annotated[str | None, typer.Option("--camera", help="Which camera, where there are several.")] = None,
+    refocus: Annotated[
+        bool, typer.Option("--refocus", help="Find the best image plane first; writes the camera's file with it.")
+    ] = False,
+    out: Out = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Look at a camera as an optical designer does: layout with rays, first-order data, wavefronts, spots, MTF,
+    through focus, distortion, field curvature and illumination over the field; first of all how good it is, where it
+    is worst and what limits it.
+
+        python -m twin.camera gf7
+
+        python -m twin.camera gf7_pair --camera forward
+
+        python -m twin.camera my_camera.yaml --refocus
+
+    With --refocus the image plane is moved to the least mean square wavefront error over the field, with
+    `--refocus tilt` turned about the line as well. The camera's file with that plane, comments kept, is in artefacts/
+    and can be used as it is.
+
+    The run folder gets report.html, optics.json (numbers), optics.nc (maps, spots, curves), config.yaml, and figures
+    and tables in artefacts/.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+
+    def resolve() -> CameraSetup:
+        if what is not None and (what != TILT or not refocus):
+            allowed = names_text((f"--refocus {TILT}",))
+            raise InputErrorText(f"{what!r} has no meaning here; there is {allowed}")
+        return resolve_camera(file, camera)
+
+    def work(setup: CameraSetup, session: Session) -> Result:
+        run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)
+        # a refocused camera is judged by its verdict: what its file lacked has been done
+        warnings = () if refocus else blur_warnings(setup, session.backend)
+        numbers, shown = camera_numbers(run), camera_report(run, warnings)
+        session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
+        options = " ".join(filter(None, ("--refocus" if refocus else "", what or "")))
+        config, name = setup.to_yaml(), session.backend.name
+        facts = RunFacts(config, str(file), name, None, session.started, session.seconds, PROGRAM, "", options)
+        write_test(KIND, numbers, shown, facts, session.folder)
+        return Result(described(KIND, numbers), lambda console: print_report(shown, console))
+
+    stem = file.stem if camera is None else f"{file.stem}-{camera}"
+    run_command(stem, Options(out, None, backend, force, as_json, quiet), resolve, work)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,247 @@
+"""Figures of a judged camera: maps and spots over the field, MTF, through focus, curves along the line, distortion."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from optics.geometry import zernike
+from scenes.models.camera_sharpness import BLURRED, FIELDS
+from twin.camera.camera_optics import Field
+from twin.camera.camera_run import GRID, SHARP, CameraRun
+from twin.camera.view_plots import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
+from twin.run.artefact import plain
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
+
+MICRO = "\N{MICRO SIGN}m"
+_FIELD_COLOURS = (INK, SKY, BLUE, VERMILION, ORANGE)
+_FIRST_TERMS = range(4, 23)
+"""Zernike terms that are drawn as bars, Noll's order."""
+
+
+def degrees_text(run: CameraRun, field: Field) -> str:
+    """A field in degrees, along the line and along the track, for titles."""
+    halves = (run.camera.field.x, run.camera.field.y)
+    return ", ".join(plain(float(np.degrees(s * h)), 4) for s, h in zip(field, halves, strict=True)) + "\N{DEGREE SIGN}"
+
+
+def _grid(height: float) -> tuple[Figure, np.ndarray]:
+    figure = new_figure(height, {"w_pad": 0.05, "h_pad": 0.06})
+    return figure, np.ravel(figure.subplots(3, 3))
+
+
+def wavefront_figure(run: CameraRun) -> Figure:
+    """Maps at nine fields, of one scale of colours."""
+    figure, axes = _grid(9.6)
+    most = max(float(np.nanmax(np.abs(wave.map))) for wave in run.waves)
+    for one, wave in zip(axes, run.waves, strict=True):
+        mesh = draw_wavefront(one, wave, most)
+        one.set_title(
+            f"{degrees_text(run, wave.field)}\n{wave.rms:.3g} rms, {wave.peak_to_valley:.3g} PV", fontsize=8.5
+        )
+        one.set_axis_off()
+    bar = figure.colorbar(mesh, ax=list(axes), shrink=0.55, aspect=30, pad=0.02)
+    bar.set_label(f"wavefront error, waves of {1e9 * run.camera.wavelength:.0f} nm")
+    return figure
+
+
+def spot_figure(run: CameraRun) -> Figure:
+    """Spots at nine fields in boxes of one size, with the Airy disk."""
+    figure, axes = _grid(10.2)
+    half = max(1.2 * run.first_order.airy, 1.08 * max(spot.farthest for spot in run.spots))
+    for one, spot in zip(axes, run.spots, strict=True):
+        draw_spot(one, spot, half)
+        rms, far = (plain(1e6 * value, 3) for value in (spot.rms, spot.farthest))
+        one.set_title(f"{degrees_text(run, spot.field)}\nrms {rms}, largest {far} {MICRO}", fontsize=8.5)
+        one.tick_params(labelsize=7)
+    for one in axes[6:]:
+        one.set_xlabel(f"along the line, {MICRO}")
+    for one in axes[::3]:
+        one.set_ylabel(f"along the track, {MICRO}")
+    return figure
+
+
+def zernike_figure(run: CameraRun) -> Figure:
+    """Terms in the middle of the field and where it is worst."""
+    figure = new_figure(3.6)
+    axes = figure.subplots()
+    middle = run.waves[GRID.index((0.0, 0.0))]
+    worst = run.optics.wavefront(run.worst[1], points=3)
+    at = np.arange(len(_FIRST_TERMS))
+    for shift, wave, colour in ((-0.2, middle, GREY), (0.2, worst, BLUE)):
+        values = [wave.coefficients[j - 1] for j in _FIRST_TERMS]
+        axes.bar(at + shift, values, 0.38, color=colour, label=degrees_text(run, wave.field))
+    axes.axhline(0.0, color=GREY, lw=0.7)
+    names = [f"Z{j} {zernike.name(j)}" for j in _FIRST_TERMS]
+    axes.set_xticks(at, names, rotation=52, ha="right", rotation_mode="anchor", fontsize=7)
+    axes.set_ylabel("waves rms")
+    axes.legend(loc="upper right")
+    plain_axes(axes)
+    return figure
+
+
+def error_figure(run: CameraRun) -> Figure:
+    """Rms wavefront error over the field as a map, and along the line in three places along the track."""
+    figure = new_figure(3.3)
+    left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
+    x, y = (np.degrees(run.field[..., k] * h) for k, h in enumerate((run.camera.field.x, run.camera.field.y)))
+    filled = left.contourf(x, y, run.errors, levels=12, cmap="YlGnBu")
+    figure.colorbar(filled, ax=left, label="waves rms", shrink=0.95)
+    worst = run.worst[1]
+    left.plot(
+        np.degrees(worst[0] * run.camera.field.x), np.degrees(worst[1] * run.camera.field.y), "o", color=VERMILION,
+        ms=7, mfc="none", mew=1.6, clip_on=False,
+    )  # fmt: skip
+    left.set_xlabel("field along the line, degrees")
+    left.set_ylabel("along the track, degrees")
+    count = run.field.shape[1]
+    for k, colour in zip((0, count // 2, count - 1), (SKY, INK, VERMILION), strict=True):
+        text = plain(float(y[0, k]), 3)
+        right.plot(x[:, k], run.errors[:, k], color=colour, lw=1.3, label=f"{text}\N{DEGREE SIGN} along the track")
+    most = float(run.errors.max())
+    for limit, name in ((SHARP, "diffraction limited"), (BLURRED, "blurred")):
+        if limit < 4.0 * most and most < 4.0 * limit:
+            right.axhline(limit, color=GREY, lw=0.8, ls=":")
+            right.annotate(name, (float(x[0, 0]), limit), (2, -2), textcoords="offset points", va="top", fontsize=7.5)
+    right.set_ylim(0.0, None)
+    right.set_xlabel("field along the line, degrees")
+    right.set_ylabel("waves rms")
+    right.legend(fontsize=7.5)
+    plain_axes(right)
+    return figure
+
+
+def mtf_figure(run: CameraRun) -> Figure:
+    """MTF curves of five fields, each with its own limit of diffraction, and MTF at Nyquist along the line."""
+    figure = new_figure(6.4)
+    axes = np.ravel(figure.subplots(2, 3, sharey=True))
+    for k, (one, mtf) in enumerate(zip(axes, run.mtfs, strict=False)):
+        draw_mtf(one, mtf, label=k == 0)
+        one.set_title(degrees_text(run, mtf.field))
+        if k == 0:
+            one.legend(fontsize=7.5, loc="upper right", bbox_to_anchor=(1.0, 0.93))
+    last = axes[-1]
+    x = np.degrees(run.curves.share * run.camera.field.x)
+    for k, (colour, name) in enumerate(((LINE, "along the line"), (TRACK, "along the track"))):
+        last.plot(x, run.curves.mtf[:, k], color=colour, lw=1.4, label=name)
+    last.set_title("at Nyquist, along the line")
+    last.set_xlabel("field, degrees")
+    last.legend(fontsize=7.5, loc="lower left")
+    plain_axes(last)
+    axes[0].set_ylabel("MTF of the optics")
+    axes[3].set_ylabel("MTF of the optics")
+    return figure
+
+
+def focus_figure(run: CameraRun) -> Figure:
+    """Wavefront error and MTF at Nyquist through focus, field by field."""
+    focus = run.focus
+    count = 3 if np.any(np.isfinite(focus.mtf)) else 1
+    figure = new_figure(3.3)
+    axes = np.atleast_1d(figure.subplots(1, count))
+    dz = 1e6 * focus.defocus
+    for k, (field, colour) in enumerate(zip(focus.fields, _FIELD_COLOURS, strict=True)):
+        axes[0].plot(dz, focus.error[k], color=colour, lw=1.3, label=degrees_text(run, field))
+        for direction in range(count - 1):
+            axes[1 + direction].plot(dz, focus.mtf[k, direction], color=colour, lw=1.3)
+    axes[0].set_ylabel("waves rms")
+    axes[0].set_title("wavefront error")
+    axes[0].set_ylim(0.0, None)
+    axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
+    for one, name in zip(axes[1:], ("along the line", "along the track"), strict=False):
+        one.set_title(f"MTF at Nyquist {name}")
+        one.set_ylim(0.0, None)
+    for one in axes:
+        one.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
+        one.set_xlabel(f"detector downstream, {MICRO}")
+        plain_axes(one)
+    return figure
+
+
+def curves_figure(run: CameraRun) -> Figure:
+    """Field curvature and astigmatism, illumination along the line."""
+    curves = run.curves
+    figure = new_figure(3.2)
+    left, right = figure.subplots(1, 2)
+    x = np.degrees(curves.share * run.camera.field.x)
+    left.plot(x, 1e6 * curves.focus_line, color=LINE, lw=1.4, label="fans along the line")
+    left.plot(x, 1e6 * curves.focus_track, color=TRACK, lw=1.4, label="fans along the track")
+    left.plot(x, 1e6 * curves.focus, color=INK, lw=1.0, ls=(0, (4, 2)), label="whole beam")
+    left.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    left.set_title("Field curvature and astigmatism")
+    left.set_ylabel(f"best focus downstream, {MICRO}")
+    left.legend(fontsize=7.5)
+    right.plot(x, 100.0 * curves.illumination, color=GREEN, lw=1.4, label="relative illumination")
+    right.plot(x, 100.0 * (1.0 - curves.vignetted), color=PURPLE, lw=1.2, ls=(0, (4, 2)), label="not vignetted")
+    low = 100.0 * min(float(curves.illumination.min()), 1.0 - float(curves.vignetted.max()))
+    right.set_ylim(min(98.0, low - 1.0), 100.0 + max(0.5, 100.0 * float(curves.illumination.max()) - 100.0 + 0.3))
+    right.set_title("Illumination")
+    right.set_ylabel("percent of the middle")
+    right.legend(fontsize=7.5, loc="lower left")
+    for one in (left, right):
+        one.set_xlabel("field along the line, degrees")
+        plain_axes(one)
+    return figure
+
+
+def distortion_figure(run: CameraRun) -> Figure:
+    """Departure from the perfect camera over the field, drawn larger, and along the line."""
+    d = run.distortion
+    figure = new_figure(3.6)
+    left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
+    away = d.places - d.ideal
+    spacing = 0.5 * float(np.min(np.ptp(d.ideal, axis=(0, 1)) / (np.array(d.fields.shape[:2]) - 1)))
+    factor = _round_factor(spacing / max(d.largest, 1e-12))
+    for places, colour, width in ((d.ideal, GREY, 0.6), (d.ideal + factor * away, BLUE, 1.0)):
+        for line in (*places, *np.swapaxes(places, 0, 1)):
+            left.plot(1e3 * line[:, 0], 1e3 * line[:, 1], color=colour, lw=width)
+    left.set_title(f"Grid of fields, departures {factor:g} times")
+    left.set_xlabel("along the line, mm")
+    left.set_ylabel("along the track, mm")
+    _lines(right, run)
+    plain_axes(left)
+    return figure
+
+
+def _lines(axes: Axes, run: CameraRun) -> None:
+    d = run.distortion
+    axes.plot(1e3 * d.position, 1e6 * d.residual, color=INK, lw=1.4, label="L \N{MINUS SIGN} f tan W")
+    if np.max(np.abs(d.residual_with_point - d.residual)) > 1e-9:
+        axes.plot(
+            1e3 * d.position, 1e6 * d.residual_with_point, color=ORANGE, lw=1.2, label="principal point fitted, too"
+        )
+    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    axes.set_title("Along the line")
+    axes.set_xlabel("L, mm from its middle")
+    axes.set_ylabel(f"distortion, {MICRO}")
+    axes.legend(fontsize=7.5)
+    plain_axes(axes)
+
+
+def _round_factor(value: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten up to a value."""
+    size = 10.0 ** np.floor(np.log10(value))
+    return float(size * max(step for step in (1.0, 2.0, 5.0) if step * size <= value * (1.0 + 1e-9)))
+
+
+def refocus_figure(run: CameraRun) -> Figure:
+    """Wavefront error of every field before and after refocusing."""
+    assert run.refocus is not None
+    figure = new_figure(3.0)
+    axes = figure.subplots()
+    at = np.arange(len(FIELDS))
+    before, after = run.refocus.errors_before, run.refocus.errors_after
+    axes.vlines(at, np.minimum(before, after), np.maximum(before, after), color=LIGHT, lw=2.0, zorder=1)
+    axes.plot(at, before, "o", color=GREY, ms=6, label="before")
+    axes.plot(at, after, "o", color=BLUE, ms=6, label="after")
+    axes.set_yscale("log")
+    axes.set_xlim(-0.5, len(at) + 1.2)
+    for limit, name in ((SHARP, "diffraction limited"), (BLURRED, "blurred")):
+        axes.axhline(limit, color=GREY, lw=0.8, ls=":")
+        axes.annotate(name, (len(at) + 1.2, limit), (0, 1), textcoords="offset points", ha="right", fontsize=7.5)
+    axes.set_xticks(at, [degrees_text(run, field) for field in FIELDS], rotation=30, ha="right", fontsize=7.5)
+    axes.set_ylabel("waves rms")
+    axes.legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    plain_axes(axes)
+    return figure

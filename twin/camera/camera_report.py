@@ -1,0 +1,327 @@
+"""Report of a judged camera: the verdict, first-order data, then every figure and table that a designer looks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from optics.geometry import zernike
+from scenes.models.camera_file import file_with_plane
+from scenes.models.camera_sharpness import FIELDS, field_text
+from twin.camera.camera_plots import (
+    curves_figure,
+    degrees_text,
+    distortion_figure,
+    error_figure,
+    focus_figure,
+    mtf_figure,
+    refocus_figure,
+    spot_figure,
+    wavefront_figure,
+    zernike_figure,
+)
+from twin.camera.camera_run import MOST_WAVES, CameraRun, refocus_text, verdict
+from twin.camera.layout_plot import layout_figure
+from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
+from twin.run.report import Report, Section
+from twin.run.svg import look, to_svg
+
+_TOLD_TERMS = 15
+"""Zernike terms in the table of fields; the others are in optics.json and optics.nc."""
+
+
+def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
+    """Report of a judged camera.
+
+    Args:
+        run: the camera.
+        warnings: what is wrong with it, to be told before all else.
+    """
+    moved = refocus_text(run)
+    sections = [_layout(run), *([_refocus(run)] if moved else []), _wavefronts(run), _spots(run), _mtf(run)]
+    sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
+    return Report(
+        f"Camera {run.setup.title}",
+        (verdict(run), *((moved,) if moved else ()), _first_order_text(run)),
+        _facts(run),
+        first_order_table(run),
+        tuple(sections),
+        warnings=warnings,
+    )
+
+
+def new_name(run: CameraRun) -> str:
+    """Of the refocused camera and its file."""
+    return f"{run.setup.camera.name}_refocused"
+
+
+def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure:
+    with look(name):
+        return SvgFigure(name, title, caption, to_svg(draw()))
+
+
+def _first_order_text(run: CameraRun) -> str:
+    data, d = run.first_order, run.distortion
+    blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in data.obscuration.items())
+    return (
+        f"f {data.focal_length:.4g} m, F/{data.f_number:.3g}, field {np.degrees(data.field_line):.3g} by "
+        f"{np.degrees(data.field_track):.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
+        f"distortion at most {1e6 * np.max(np.abs(d.residual)):.3g} µm there; "
+        + (f"its own parts stand in the beam: {blocked}." if blocked else "nothing of its own stands in the beam.")
+    )
+
+
+def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
+    spec = run.camera
+    facts = [("Camera", spec.name)]
+    if spec.description:
+        facts.append(("Description", spec.description))
+    if run.setup.instrument is not None:
+        facts.append(("Mounted", f"as {run.setup.mounted} of {run.setup.where}"))
+    facts.append(("Mirrors", ", ".join(f"{m} (stop)" if m == spec.stop else m for m in spec.mirrors)))
+    facts.append(("Waves", f"of {1e9 * spec.wavelength:.0f} nm"))
+    facts.append(
+        ("Fields", "angles along the line and along the track from the middle of the field; the first is positive at "
+         "the line's left end (+Y)")
+    )  # fmt: skip
+    return tuple(facts)
+
+
+def first_order_table(run: CameraRun) -> Table:
+    """First-order data, the report's first table."""
+    data, d = run.first_order, run.distortion
+    degrees = np.degrees
+
+    def far(value: float) -> str:
+        return f"{value:.4g} m" if abs(value) < 1e4 else "infinite"
+
+    rows: list[tuple[str, str]] = [
+        ("worst wavefront error", f"{run.worst[0]:.4g} waves rms at {field_text(run.camera, run.worst[1])}"),
+        ("focal length", f"{data.focal_length:.5f} m (line {data.focal_length_line:.5f}, "
+         f"track {data.focal_length_track:.5f})"),
+        ("principal distance of the line", f"{d.line_distance:.6f} m"),
+        ("F-number", f"{data.f_number:.3f}"),
+        ("working F-number", f"{data.working_f_number:.3f} (line {data.working_f_number_line:.3f}, "
+         f"track {data.working_f_number_track:.3f})"),
+        ("entrance pupil", f"{1e3 * data.entrance_pupil:.1f} mm, {_before(data.entrance_pupil_distance)} the first "
+         "mirror"),
+        ("exit pupil", f"{far(data.exit_pupil)}, {_before(data.exit_pupil_distance)} the image"),
+        ("chief rays at the image", f"{degrees(data.chief_ray_angle[0]):.3f} deg from its normal in the middle, "
+         f"{degrees(data.chief_ray_angle[1]):.3f} at most"),
+        ("field of view", f"{degrees(data.field_line):.4g} × {degrees(data.field_track):.4g} deg"),
+        ("image", f"{1e3 * data.image_line:.2f} × {1e3 * data.image_track:.2f} mm"),
+        ("plate scale", f"{degrees(data.plate_scale) * 3.6:.4f} arcsec/mm"),
+        ("pixel", f"{1e6 * data.pitch:.4g} µm, {degrees(data.pixel_angle) * 3600:.4f} arcsec"),
+        ("Airy disk", f"{1e6 * data.airy:.3f} µm radius, {data.airy / data.pitch:.2f} pixels"),
+        ("sampling", f"λF / pixel {data.sampling:.3f} (2 samples the cut-off); Nyquist {1e-3 * data.nyquist:.2f}, "
+         f"cut-off {1e-3 * data.cutoff:.1f} cycles/mm"),
+        ("length along the axis", f"{data.length:.4f} m"),
+        ("obscuration by its own parts",
+         ", ".join(f"{b} {100 * s:.2f}%" for b, s in data.obscuration.items()) or "none"),
+    ]  # fmt: skip
+    caption = f"In the middle of the field, at {1e9 * data.wavelength:.0f} nm, unless it says otherwise."
+    return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
+
+
+def _before(distance: float) -> str:
+    if abs(distance) > 1e4:
+        return "infinitely far from"
+    return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
+
+
+def _layout(run: CameraRun) -> Section:
+    model, backend = run.optics.model, run.optics.path.backend
+    caption = (
+        "To one scale, in the prescription's frame; mirrors with their clear apertures, dash-dotted the parent axis."
+    )
+    figure = _figure("layout", "Layout with rays", caption, lambda: layout_figure(model, backend))
+    return Section("Layout", (), (figure,))
+
+
+def _refocus(run: CameraRun) -> Section:
+    assert run.refocus is not None
+    moved = run.refocus
+    rows: list[list[Cell]] = [
+        [degrees_text(run, field), float(b), float(a)]
+        for field, b, a in zip(FIELDS, moved.errors_before, moved.errors_after, strict=True)
+    ]
+    text = (
+        f"The image plane with the least mean square wavefront error over {len(FIELDS)} fields"
+        + (", place and tilt" if moved.tilt else "")
+        + ". All else here is of the refocused camera."
+    )
+    name = new_name(run)
+    file = file_with_plane(run.setup.camera, moved.after, name)
+    artefacts: tuple[Artefact, ...] = (
+        _figure("refocus", "Before and after", "Waves rms, logarithmic.", lambda: refocus_figure(run)),
+        CameraFile(name.lower(), "The refocused camera", "Its file: other name and image, else as it was.", file),
+        Table("refocus-fields", "Wavefront error by field", "Waves rms.", ("field", "before", "after"), rows,
+              (None, 4, 4)),
+    )  # fmt: skip
+    return Section("Refocused", (text,), artefacts)
+
+
+def _wavefronts(run: CameraRun) -> Section:
+    heads = ["", *(degrees_text(run, w.field) for w in run.waves)]
+    rows: list[list[Cell]] = [
+        ["rms", *(w.rms for w in run.waves)],
+        ["peak to valley", *(w.peak_to_valley for w in run.waves)],
+        ["Strehl ratio", *(w.strehl for w in run.waves)],
+    ]
+    for j in range(4, _TOLD_TERMS + 1):
+        rows.append([f"Z{j} {zernike.name(j)}", *(float(w.coefficients[j - 1]) for w in run.waves)])
+    caption = "Waves; Zernike terms in Noll's order, waves rms, piston and tilt taken out."
+    table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
+    kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
+    text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."
+    return Section(
+        "Wavefront",
+        (text,),
+        (
+            _figure(
+                "wavefront-field",
+                "Over the field",
+                "Rms wavefront error; the ring marks the worst field.",
+                lambda: error_figure(run),
+            ),
+            _figure(
+                "wavefront-maps",
+                "Maps",
+                "Over the stop, x along the line to the right, y along the track upward; one scale of colours. "
+                "Positive where the wavefront is ahead.",
+                lambda: wavefront_figure(run),
+            ),
+            _figure(
+                "zernike-bars", "Zernike terms", "In the middle and at the worst field.", lambda: zernike_figure(run)
+            ),
+            table,
+        ),
+    )  # fmt: skip
+
+
+def _spots(run: CameraRun) -> Section:
+    rows: list[list[Cell]] = [
+        [degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
+        for s in run.spots
+    ]
+    heads = ("field", "rms, µm", "along line, µm", "along track, µm", "largest, µm", "rms / Airy radius")
+    return Section(
+        "Spots",
+        (),
+        (
+            _figure(
+                "spots",
+                "Spot diagrams",
+                "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk.",
+                lambda: spot_figure(run),
+            ),
+            Table(
+                "spot-sizes",
+                "Spot sizes by field",
+                "Radii about the centroid.",
+                heads,
+                rows,
+                (None, 3, 3, 3, 3, 3),
+            ),
+        ),
+    )
+
+
+def _mtf(run: CameraRun) -> Section:
+    if not run.mtfs:
+        return Section(
+            "MTF", (f"No MTF is told of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing.",)
+        )
+    rows: list[list[Cell]] = []
+    for mtf in run.mtfs:
+        values = mtf.at(mtf.nyquist)
+        limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
+        rows.append([degrees_text(run, mtf.field), *map(float, values), *limits])
+    heads = ("field", "along line", "along track", "limit along line", "limit along track")
+    text = (
+        f"Of the optics alone, at {1e9 * run.camera.wavelength:.0f} nm: pixels, charge and motion come on top of it. "
+        f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
+    )
+    return Section(
+        "MTF",
+        (text,),
+        (
+            _figure(
+                "mtf",
+                "MTF by field",
+                "Along the line and along the track; dashed what diffraction allows.",
+                lambda: mtf_figure(run),
+            ),
+            Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)),
+        ),
+    )
+
+
+def _through_focus(run: CameraRun) -> Section:
+    best = 1e6 * run.focus.best
+    where = f"{fixed(abs(best), 1)} µm {'downstream' if best > 0.0 else 'upstream'} of the focal plane"
+    text = f"The least error over these fields is {where}." if np.isfinite(best) else "The light has no focus."
+    caption = "The detector moves along its normal; positive is downstream, away from the optics."
+    return Section("Through focus", (text,), (_figure("focus", "Through focus", caption, lambda: focus_figure(run)),))
+
+
+def _field(run: CameraRun) -> Section:
+    d, curves = run.distortion, run.curves
+    half = float(np.max(np.abs(d.position)))
+    largest = float(np.max(np.abs(d.residual)))
+    point, both = d.line_point
+    text = (
+        f"Along the line: principal distance {d.line_distance:.6f} m with the principal point in the line's middle, "
+        f"distortion {1e6 * np.sqrt(np.mean(d.residual**2)):.3g} µm rms and {1e6 * largest:.3g} µm at most, "
+        f"{100 * largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
+        f"{fixed(1e3 * point, 3)} mm off.",
+        f"Over the whole field: the nearest perfect camera has f {d.distance:.6f} m and its principal point at "
+        f"({plain(1e3 * d.point[0], 4)}, {plain(1e3 * d.point[1], 6)}) mm from the line's middle, near the parent "
+        f"axis; the field departs from it by {1e6 * d.rms:.3g} µm rms, {1e6 * d.largest:.3g} µm at most.",
+    )
+    x = np.degrees(curves.share * run.camera.field.x)
+    rows: list[list[Cell]] = [
+        [float(a), *(float(1e6 * v[k]) for v in (curves.focus_line, curves.focus_track, curves.focus)),
+         float(curves.illumination[k]), float(curves.vignetted[k])]
+        for k, a in enumerate(x)
+    ]  # fmt: skip
+    heads = ("field, deg", "focus line, µm", "focus track, µm", "focus, µm", "illumination", "vignetted")
+    line: list[list[Cell]] = [
+        [1e3 * float(p), float(np.degrees(w)), 1e6 * float(r)]
+        for p, w, r in zip(d.position, d.angle, d.residual, strict=True)
+    ]
+    return Section(
+        "Over the field",
+        text,
+        (
+            _figure(
+                "distortion",
+                "Distortion",
+                "Left against the perfect camera with the best principal distance and point; right along the line.",
+                lambda: distortion_figure(run),
+            ),
+            _figure(
+                "field-curves",
+                "Focus and illumination",
+                "Along the line. Illumination is the solid angle of the beam as the focal plane sees it.",
+                lambda: curves_figure(run),
+            ),
+            Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
+            Table("distortion-line", "Distortion along the line", "", ("L, mm", "W, deg", "distortion, µm"), line,
+                  (3, 5, 3)),
+        ),
+    )  # fmt: skip
+
+
+def _bodies(run: CameraRun) -> Section:
+    assert run.quality is not None
+    rows: list[list[Cell]] = [
+        [body, *(100.0 * float(v) for v in share[0])] for body, share in run.quality.bodies.items()
+    ]
+    rows.append(["all together, of the light", *(100.0 * float(v) for v in run.quality.light_lost[0])])
+    text = "Bodies of the instrument that stand in the beam; MTF and through focus are without what they take."
+    heads = ("body", "right end, %", "middle, %", "left end, %")
+    table = Table("bodies", "Share of the beam", "", heads, rows, (None, 2, 2, 2))
+    return Section("In the instrument", (text,), (table,))

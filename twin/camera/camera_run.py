@@ -1,0 +1,363 @@
+"""A camera judged: everything that its report shows, its numbers, and the sentence that comes first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from optics.geometry import zernike
+from optics.numerics.backend import Backend
+from scenes.models.camera_file import with_plane
+from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.camera import CameraSpec
+from scenes.specs.camera_setup import CameraSetup
+from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
+from twin.camera.field_maps import (
+    Distortion,
+    FieldCurves,
+    ThroughFocus,
+    distortion,
+    field_curves,
+    field_grid,
+    through_focus,
+)
+from twin.camera.first_order_data import FirstOrderData, first_order_data
+from twin.monitor.image_quality import CameraQuality, image_quality
+from twin.run.plain_data import plain_data
+from twin.run.procedure import Advance, silent
+from twin.run.reference_frames import frames_text
+
+SHARP = 1.0 / 14.0
+"""Marechal's limit: Strehl ratio 0.8, waves rms."""
+
+MOST_WAVES = 10.0
+"""Wavefront error beyond which no MTF is worked out: it would take minutes and be nothing."""
+
+GRID: tuple[Field, ...] = tuple((x, y) for y in (1.0, 0.0, -1.0) for x in (-1.0, 0.0, 1.0))
+"""Fields of wavefront maps and spot diagrams, row by row."""
+
+MTF_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.0, 1.0), (1.0, -1.0))
+"""Fields of MTF curves and through focus."""
+
+ERROR_GRID = (25, 9)
+"""Fields along the line and along the track of the map of wavefront errors."""
+
+MAP_POINTS = 129
+"""Of wavefront maps on each axis."""
+
+QUALITY_FIELDS = (-1.0, 0.0, 1.0)
+"""Of half the line: where bodies of an instrument are looked for in the beam."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refocus:
+    """A focal plane found anew.
+
+    Attributes:
+        before, after: the plane of the file and the best one.
+        errors_before, errors_after: rms wavefront error at ``FIELDS``, waves.
+        tilt: whether it was turned, too.
+    """
+
+    before: FocalPlane
+    after: FocalPlane
+    errors_before: np.ndarray
+    errors_after: np.ndarray
+    tilt: bool
+
+
+@dataclass(frozen=True, eq=False)
+class CameraRun:
+    """A judged camera.
+
+    Attributes:
+        setup: as it was given.
+        camera: the prescription that is judged: the refocused one, if that was asked for.
+        optics: it, ready to be looked at.
+        first_order: its data.
+        waves: wavefront errors at GRID.
+        spots: spots at GRID.
+        mtfs: MTF of the optics at MTF_FIELDS and the design wavelength; empty for a camera too blurred for it.
+        field: fields of the map of wavefront errors, (A, B, 2).
+        errors: rms wavefront error there, waves, (A, B).
+        distortion: over the field and along the line.
+        curves: along the line.
+        focus: through focus at MTF_FIELDS.
+        refocus: what refocusing did, None where nobody asked.
+        quality: of a camera in an instrument: what its bodies take of the beam.
+    """
+
+    setup: CameraSetup
+    camera: CameraSpec
+    optics: CameraOptics
+    first_order: FirstOrderData
+    waves: tuple[Wavefront, ...]
+    spots: tuple[Spot, ...]
+    mtfs: tuple[Mtf, ...]
+    field: np.ndarray
+    errors: np.ndarray
+    distortion: Distortion
+    curves: FieldCurves
+    focus: ThroughFocus
+    refocus: Refocus | None = None
+    quality: CameraQuality | None = None
+
+    @cached_property
+    def worst(self) -> tuple[float, Field]:
+        """Largest wavefront error over the field, waves rms, and where."""
+        # of places that are the same but for rounding, as in a symmetric camera, the one at the line's left end
+        same = np.round(self.errors / np.max(self.errors), 6)[::-1]
+        k = np.unravel_index(int(np.argmax(same)), same.shape)
+        k = (len(same) - 1 - k[0], k[1])
+        return float(self.errors[k]), (float(self.field[k][0]), float(self.field[k][1]))
+
+    @cached_property
+    def limits(self) -> tuple[tuple[str, float], ...]:
+        """Kinds of aberration at the worst field and their rms, waves, the largest first."""
+        wave = self.optics.wavefront(self.worst[1], points=3)
+        kinds: dict[str, float] = {}
+        for j, coefficient in enumerate(wave.coefficients[3:], start=4):
+            kinds[kind_of(j)] = kinds.get(kind_of(j), 0.0) + float(coefficient) ** 2
+        found = sorted(((kind, float(np.sqrt(square))) for kind, square in kinds.items()), key=lambda k: -k[1])
+        return tuple(found)
+
+
+def kind_of(index: int) -> str:
+    """Name of a Zernike term without its direction."""
+    words = zernike.name(index).split()
+    return " ".join(words if zernike.noll_to_nm(index)[1] == 0 else words[: -1 if words[-1] in ("x", "y") else -2])
+
+
+def run_camera(
+    setup: CameraSetup, backend: Backend, refocus: bool = False, tilt: bool = False, advance: Advance = silent
+) -> CameraRun:
+    """Judge a camera.
+
+    Args:
+        setup: the camera.
+        backend: where to trace.
+        refocus: find the best focal plane first and judge the camera with it.
+        tilt: let it turn about the line, too.
+        advance: told what is being done.
+
+    Raises:
+        InputError: light of the field does not come through, or has no focus after the last mirror.
+    """
+    advance("focus", 0, 1)
+    camera, moved = setup.camera, None
+    if refocus:
+        moved = find_focus(camera, backend, tilt)
+        camera = with_plane(camera, moved.after)
+    advance("focus", 1, 1)
+    optics = CameraOptics.alone(camera, backend)
+    quality = None
+    if setup.instrument is not None and setup.mounted is not None:
+        cameras = {name: camera if one == setup.camera else one for name, one in setup.cameras.items()}
+        instrument = build_instrument(setup.instrument, cameras, backend)
+        optics = CameraOptics.within(instrument, setup.mounted, backend)
+        quality = image_quality(instrument, backend, [{}], QUALITY_FIELDS).cameras[setup.mounted]
+    field = field_grid(ERROR_GRID)
+    beams = FieldBeams.trace(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5)
+    errors = beams.errors(FocalPlane.of(camera)).reshape(field.shape[:2])
+    sharp = float(errors.max()) < MOST_WAVES
+    advance("wavefronts", 0, 1)
+    waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
+    advance("wavefronts", 1, 1)
+    advance("MTF", 0, 1)
+    mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
+    focus = through_focus(optics, backend, MTF_FIELDS, sharp)
+    curves = field_curves(optics, sharp)
+    advance("MTF", 1, 1)
+    return CameraRun(
+        setup=setup,
+        camera=camera,
+        optics=optics,
+        first_order=first_order_data(optics),
+        waves=waves,
+        spots=spots,
+        mtfs=mtfs,
+        field=field,
+        errors=errors,
+        distortion=distortion(optics),
+        curves=curves,
+        focus=focus,
+        refocus=moved,
+        quality=quality,
+    )
+
+
+def find_focus(camera: CameraSpec, backend: Backend, tilt: bool) -> Refocus:
+    """The focal plane with the least mean square wavefront error over ``FIELDS``.
+
+    Raises:
+        InputError: light does not come through, or has no focus after the last mirror.
+    """
+    beams = FieldBeams.trace(CameraOptics.alone(camera, backend).model, backend, FIELDS, 6)
+    best, own = beams.best_plane(tilt), FocalPlane.of(camera)
+    if not beams.reaches(best):
+        problem = f"refocusing cannot help: the light has no focus after {list(camera.mirrors)[-1]}"
+        raise camera.error(problem, ("mirrors",), allowed="mirrors that make a real image")
+    return Refocus(own, best, beams.errors(own), beams.errors(best), tilt)
+
+
+def verdict(run: CameraRun) -> str:
+    """How good the camera is, where it is worst and what limits it."""
+    worst, where = run.worst
+    place = field_text(run.camera, where)
+    (kind, size), *_ = run.limits
+    lead = f"{worst:.3g} waves rms at field {place}, most of it {kind} ({size:.3g})"
+    if worst <= SHARP:
+        text = f"Diffraction limited over the whole field: the worst wavefront error is {lead}"
+        text += f"; Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f}."
+    elif worst <= BLURRED:
+        share = float(np.mean(run.errors <= SHARP))
+        text = f"Not diffraction limited in {100.0 * (1.0 - share):.0f}% of the field: the worst wavefront error is "
+        text += f"{lead}; Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f}."
+    else:
+        text = f"Blurred: the worst wavefront error is {lead}; beyond {BLURRED:g} an image has next to no contrast."
+    if run.mtfs:
+        low = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
+        limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
+        text += f" The MTF of the optics at Nyquist goes down to {low:.2g}; diffraction would allow {limit:.2f}."
+    return text
+
+
+def refocus_text(run: CameraRun) -> str:
+    """What refocusing did, empty where nobody asked for it."""
+    moved = run.refocus
+    if moved is None:
+        return ""
+    shift = 1e3 * (moved.after.z - moved.before.z)
+    turn = f" and turns it by {np.degrees(moved.after.tilt - moved.before.tilt) * 60:+.3g} arcmin" if moved.tilt else ""
+    return (
+        f"Refocusing moves image.z by {shift:+.4g} mm{turn}: the worst wavefront error falls from "
+        f"{moved.errors_before.max():.3g} to {moved.errors_after.max():.3g} waves rms, its rms over the field from "
+        f"{np.sqrt(np.mean(moved.errors_before**2)):.3g} to {np.sqrt(np.mean(moved.errors_after**2)):.3g}."
+    )
+
+
+def camera_numbers(run: CameraRun) -> dict[str, Any]:
+    """Contents of optics.json without its frames; a key ends in its unit."""
+    data, d, worst = run.first_order, run.distortion, run.worst
+    degrees = np.degrees
+    spec = run.camera
+    out: dict[str, Any] = {
+        "camera": spec.name,
+        "instrument": run.setup.where or None,
+        "mounted": run.setup.mounted,
+        "verdict": verdict(run),
+        "worst_wfe_waves": worst[0],
+        "worst_field": worst[1],
+        "limited_by": [{"aberration": kind, "rms_waves": size} for kind, size in run.limits[:4]],
+        "wavelength_nm": 1e9 * data.wavelength,
+        "image": {"z_m": spec.image.z, "tilt_deg": degrees(spec.image.tilt or 0.0)},
+        "first_order": {
+            "focal_length_m": data.focal_length,
+            "focal_length_along_line_m": data.focal_length_line,
+            "focal_length_along_track_m": data.focal_length_track,
+            "entrance_pupil_m": data.entrance_pupil,
+            "entrance_pupil_before_first_mirror_m": data.entrance_pupil_distance,
+            "exit_pupil_m": data.exit_pupil,
+            "exit_pupil_before_image_m": data.exit_pupil_distance,
+            "f_number": data.f_number,
+            "working_f_number": data.working_f_number,
+            "working_f_number_along_line": data.working_f_number_line,
+            "working_f_number_along_track": data.working_f_number_track,
+            "field_deg": [degrees(data.field_line), degrees(data.field_track)],
+            "image_mm": [1e3 * data.image_line, 1e3 * data.image_track],
+            "plate_scale_arcsec_per_mm": degrees(data.plate_scale) * 3.6,
+            "pixel_um": 1e6 * data.pitch,
+            "pixel_arcsec": degrees(data.pixel_angle) * 3600.0,
+            "nyquist_per_mm": 1e-3 * data.nyquist,
+            "cutoff_per_mm": 1e-3 * data.cutoff,
+            "sampling_lambda_f_per_pixel": data.sampling,
+            "airy_radius_um": 1e6 * data.airy,
+            "chief_ray_angle_deg": degrees(data.chief_ray_angle),
+            "length_m": data.length,
+            "obscuration": dict(data.obscuration),
+        },
+        "fields": [
+            {
+                "field": wave.field,
+                "place_mm": [1e3 * p for p in wave.place],
+                "wfe_rms_waves": wave.rms,
+                "wfe_pv_waves": wave.peak_to_valley,
+                "strehl": wave.strehl,
+                "vignetted": wave.vignetted,
+                "spot_rms_um": 1e6 * spot.rms,
+                "spot_largest_um": 1e6 * spot.farthest,
+                # piston and tilts are taken out
+                "zernike_waves": dict(list(wave.terms.items())[3:]),
+            }
+            for wave, spot in zip(run.waves, run.spots, strict=True)
+        ],
+        "mtf_at_nyquist": [
+            {"field": mtf.field, "along_line": mtf.at(mtf.nyquist)[0], "along_track": mtf.at(mtf.nyquist)[1]}
+            for mtf in run.mtfs
+        ],
+        "distortion": {
+            "principal_distance_m": d.distance,
+            "principal_point_mm": 1e3 * d.point,
+            "rms_um": 1e6 * d.rms,
+            "largest_um": 1e6 * d.largest,
+            "line_principal_distance_m": d.line_distance,
+            "line_rms_um": 1e6 * float(np.sqrt(np.mean(d.residual**2))),
+            "line_largest_um": 1e6 * float(np.max(np.abs(d.residual))),
+            "line_fitted_with_point_m": {"principal_distance": d.line_point[1], "principal_point": d.line_point[0]},
+        },
+        "refocus": None,
+        "bodies_in_the_beam": None,
+    }
+    if run.refocus is not None:
+        moved = run.refocus
+        out["refocus"] = {
+            "z_before_m": moved.before.z,
+            "z_after_m": moved.after.z,
+            "tilt_before_deg": degrees(moved.before.tilt),
+            "tilt_after_deg": degrees(moved.after.tilt),
+            "worst_before_waves": moved.errors_before.max(),
+            "worst_after_waves": moved.errors_after.max(),
+            "rms_before_waves": np.sqrt(np.mean(moved.errors_before**2)),
+            "rms_after_waves": np.sqrt(np.mean(moved.errors_after**2)),
+        }
+    if run.quality is not None:
+        out["bodies_in_the_beam"] = {body: share[0] for body, share in run.quality.bodies.items()}
+    found: dict[str, Any] = plain_data(out)
+    return found
+
+
+def camera_data(run: CameraRun) -> xr.Dataset:
+    """Contents of optics.nc: wavefront maps, Zernike terms, spots, MTF, fields and curves along the line."""
+    first = run.waves[0].to_xarray()
+    fields = [list(wave.field) for wave in run.waves]
+    data: dict[str, Any] = {
+        "wavefront": (("field", "y", "x"), np.stack([w.map for w in run.waves]), {"units": "waves"}),
+        "zernike": (("field", "noll"), np.stack([w.coefficients for w in run.waves]), {"units": "waves rms"}),
+        "field_share": (("field", "direction"), np.array(fields), {"long_name": "share of the half field"}),
+        "wfe": (("field_along", "field_across"), run.errors, {"units": "waves rms"}),
+        "through_focus_wfe": (("mtf_field", "defocus"), run.focus.error, {"units": "waves rms"}),
+        "through_focus_mtf": (("mtf_field", "direction", "defocus"), run.focus.mtf),
+        "distortion_line": (("line",), run.distortion.residual, {"units": "m"}),
+    }
+    coords: dict[str, Any] = {
+        "x": first["x"],
+        "y": first["y"],
+        "noll": first["noll"],
+        "term": first["term"],
+        "direction": ["along line", "along track"],
+        "field_along": run.field[:, 0, 0],
+        "field_across": run.field[0, :, 1],
+        "defocus": ("defocus", run.focus.defocus, {"units": "m"}),
+        "line": ("line", run.distortion.position, {"units": "m"}),
+        "mtf_field_share": (("mtf_field", "direction"), np.array(MTF_FIELDS)),
+    }
+    if run.mtfs:
+        data["mtf"] = (("mtf_field", "direction", "frequency"), np.stack([m.values for m in run.mtfs]))
+        data["mtf_limit"] = (("mtf_field", "direction", "frequency"), np.stack([m.limit for m in run.mtfs]))
+        coords["frequency"] = ("frequency", run.mtfs[0].frequency, {"units": "1/m"})
+    return xr.Dataset(data, coords, {"reference_frames": frames_text("optics")})
