@@ -208,7 +208,7 @@ def held_by(
     equal = merit.operands.principal_distance is not None
     at_limit = np.flatnonzero((g > -_AT_LIMIT) | (equal & (np.arange(len(g)) == 0)))
     columns = [slopes[:, k] for k in at_limit]
-    owners = list(at_limit)
+    owners = [int(k) for k in at_limit]
     if equal:  # held in both directions
         columns.append(-slopes[:, 0])
         owners.append(0)

@@ -11,14 +11,7 @@ from pydantic import Field
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.load import (
-    CAMERAS,
-    INSTRUMENTS,
-    library_names,
-    load_camera,
-    load_instrument,
-    paths_of_cameras,
-)
+from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names, load_camera, load_instrument, paths_of_cameras
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.yaml.spec import Name, Paths, Source, Spec
 from scenes.yaml.translate import validate

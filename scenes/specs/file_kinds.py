@@ -9,8 +9,7 @@ from scenes.specs.autocollimator_test import AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec

@@ -316,7 +316,9 @@ def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Is
             issues.append(_not_allowed(course, nodes[path], "temperature", key))
     for path, moves in course.motion.items():
         # what is given at any time counts, also where it is zero
-        does = {name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.given.items() if v is not None}
+        does: dict[str, Any] = {
+            name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.given.items() if v is not None
+        }
         whole = PerturbationSpec.model_construct(**does, pivot=moves.pivot)
         issues += perturbation_issues(course, nodes, path, whole, ("motion", path))
     return issues

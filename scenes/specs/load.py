@@ -13,8 +13,7 @@ from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
 from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec

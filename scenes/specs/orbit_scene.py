@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from optics.geometry.polygon import area, hull, intersect, sides
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.band import Diffusion, Spectrum, TdiSpec
+from scenes.specs.camera import Diffusion, Spectrum, TdiSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Number, Reference, Spec, Whole

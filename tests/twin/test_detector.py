@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy import stats
 
-from scenes.specs.band import BandSpec
+from scenes.specs.camera import BandSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.load import LIBRARY
 from scenes.yaml.errors import InputError

@@ -21,7 +21,7 @@ from optics.waves.imaging import imaging_field
 from optics.waves.pupil_function import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import LAUNCH_DISTANCE
-from scenes.specs.band import BandSpec
+from scenes.specs.camera import BandSpec
 from scenes.specs.load import load_detector
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.edge_images import ALONG, DIRECTIONS, TRACK

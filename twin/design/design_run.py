@@ -86,7 +86,7 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         )
     spec = camera_of(camera, found.prescription, test.name, test.description)
     derive_camera(spec, backend)  # it can be used as a camera
-    warnings = ()
+    warnings: tuple[str, ...] = ()
     worst = float(found.after.errors.max())
     if worst > BLURRED:
         warnings = (f"camera {spec.name} is blurred: {worst:.3g} waves rms in its worst field, more than {BLURRED:g}",)

@@ -20,7 +20,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.specs.channel import BASE, CENTRAL_PRISM
-from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import ErrorBudgetSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth

@@ -217,7 +217,7 @@ def run_series(
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:
     """What to say when the state at time number ``k`` cannot be rendered."""
     course = _course(job)
-    given = {"temperature": course.temperature, "motion": course.motion}
+    given = {"temperature": list(course.temperature), "motion": list(course.motion)}
     parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in given.items() if nodes}
     return course.error(
         f"the instrument at {moment(course.times[k])} of the course cannot be rendered: {reason}",

@@ -12,7 +12,7 @@ from optics.numerics.quadrature import gauss
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.specs.band import BandSpec
+    from scenes.specs.camera import BandSpec
     from scenes.specs.detector import DetectorSpec
 
 

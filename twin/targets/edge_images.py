@@ -21,7 +21,7 @@ from optics.targets.target_shapes import slanted_edge
 from optics.waves.diffraction import Grid
 from optics.waves.pupil_function import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
-from scenes.specs.band import BandSpec
+from scenes.specs.camera import BandSpec
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 
 ALONG, TRACK = "along", "track"

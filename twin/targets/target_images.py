@@ -20,7 +20,7 @@ from optics.targets.target_shapes import Target, bar_group
 from optics.waves.diffraction import Grid
 from optics.waves.pupil_function import PupilFunction
 from optics.waves.transfer import TransferTable, polychromatic_transfer
-from scenes.specs.band import BandSpec
+from scenes.specs.camera import BandSpec
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.edge_images import ALONG, EdgeImager, EdgeOptics, knife_edge
 from twin.targets.target_path import LocalMap, TargetPath

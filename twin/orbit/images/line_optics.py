@@ -24,7 +24,7 @@ from optics.geometry.zernike import cartesian_terms
 from optics.waves.pupil_function import PupilFunction, circular_pupil
 from optics.waves.pupil_shadow import PupilShadow, separate
 from optics.waves.transfer import TransferTable
-from scenes.specs.band import BandSpec
+from scenes.specs.camera import BandSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.sensor import Sensor
 from twin.sensors.line_ccd import LineCcd, band_wavelengths

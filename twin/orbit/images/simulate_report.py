@@ -224,7 +224,7 @@ def simulation_report(run: Simulation) -> Report:
         _summary(run),
         sections(run),
         files,
-        _warnings(run),
+        warnings=_warnings(run),
     )
 
 
