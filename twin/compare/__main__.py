@@ -66,7 +66,7 @@ def main(
         limits = ["--rtol", f"{rtol:g}"] + ([] if sigmas is None else ["--sigmas", f"{sigmas:g}"])
         config = {"runs": [str(run) for run in runs], "rtol": rtol, "sigmas": sigmas}
         again = " ".join(["python -m", PROGRAM, *map(str, runs), *limits, "--out again"])
-        facts = RunFacts(dump_yaml(config), "", "", None, session.started, session.seconds, PROGRAM, "", again)
+        facts = RunFacts(dump_yaml(config), "", "", None, session.started, session.seconds, PROGRAM, "", again=again)
         write_test(KIND, found, report, facts, session.folder)
         code = 0 if comparison.same else DIFFERENT
         return Result(described(KIND, found), lambda console: print_report(report, console), code=code)

@@ -82,8 +82,8 @@ class RunFacts:
         seconds: that it took.
         program: that ran it, as the user calls it.
         command: its subcommand.
-        again: the command that runs it again, where it is not the test with the run's own config.yaml.
         options: others that it was given, as the user would write them.
+        again: the command that runs it again, where it is not the test with the run's own config.yaml.
     """
 
     config: str
@@ -94,8 +94,8 @@ class RunFacts:
     seconds: float
     program: str
     command: str
-    again: str = ""
     options: str = ""
+    again: str = ""
 
 
 def place(artefact: Artefact) -> str:
