@@ -216,7 +216,7 @@ def held_by(
     start = constraint_values(before, merit.operands)[0]
     worth: dict[int, float] = {}
     for owner, weight in zip(owners, weights, strict=True):
-        worth[int(owner)] = worth.get(int(owner), 0.0) + float(weight) / (2.0 * rms_error(there))
+        worth[owner] = worth.get(owner, 0.0) + float(weight) / (2.0 * rms_error(there))
     limits = _limits(merit.operands, len(there.extents), len(there.clearances))
     told = _constraint_names(merit, prescription, names)
     found = [Held(told[k], limits[k], float(start[k]), gain) for k, gain in worth.items() if gain > 0.0]

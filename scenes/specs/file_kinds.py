@@ -36,8 +36,8 @@ class FileKind:
         name: of its JSON Schema.
         model: what it may say.
         what: it is, with article, for messages.
-        command: that reads it, as the user calls it; empty for what other files name.
-        place: where other files name it; empty for what a command reads.
+        command: that reads it, as the user calls it; empty for what only other files name.
+        place: where other files name it; empty for what only a command reads.
     """
 
     name: str
@@ -59,7 +59,11 @@ FILE_KINDS = (
     FileKind("job", JobSpec, "a job of the monitor", "twin.render"),
     FileKind("instrument", InstrumentSpec, "an instrument", place="a job's `instrument: FILE`"),
     FileKind(
-        "camera", CameraSpec, "a camera's prescription", place="an instrument's `cameras: {NAME: {camera: FILE}}`"
+        "camera",
+        CameraSpec,
+        "a camera's prescription",
+        "twin.camera",
+        "an instrument's `cameras: {NAME: {camera: FILE}}`",
     ),
     FileKind("camera_design", CameraDesignSpec, "an optimisation of a camera", "twin.design"),
     FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
@@ -119,5 +123,7 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
             raise error from None
         if kind is None or kind.command == command:
             raise
-        there = f"python -m {kind.command} {file} does" if kind.command else f"its name belongs into {kind.place}"
+        reads = f"python -m {kind.command} {file} does" if kind.command else ""
+        named = f"its name belongs into {kind.place}" if kind.place else ""
+        there = ", or ".join(filter(None, (reads, named)))
         raise InputError(Issue(f"this is {kind.what}, which {command} does not read; {there}", str(file))) from None

@@ -109,7 +109,7 @@ def test_the_commands_are_there(kind) -> None:
             orbit,
             ("angle",),
             "library/cameras/gf7.yaml",
-            "a camera's prescription, which twin.orbit angle does not read; its na",
+            "a camera's prescription, which twin.orbit angle does not read; python -m twin.camera {} does, or its na",
         ),
         (
             design,

@@ -1,5 +1,6 @@
 """A blurred camera is told about: how many waves, where, in which file, and what would help."""
 
+import json
 import re
 from pathlib import Path
 
@@ -9,7 +10,15 @@ import pytest
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models import camera_sharpness
 from scenes.models.camera_model import derive_camera
-from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, blur_warnings, cameras_of, sharpness
+from scenes.models.camera_sharpness import (
+    BLURRED,
+    FIELDS,
+    FieldBeams,
+    FocalPlane,
+    blur_warnings,
+    cameras_of,
+    sharpness,
+)
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
@@ -17,12 +26,15 @@ from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
+from tests.twin.commands import invoke
+from twin.camera.camera_optics import CameraOptics
 from twin.design.design_run import DESIGN
 from twin.laboratory.distortion_numbers import DISTORTION
 from twin.laboratory.focus_numbers import FOCUS
 from twin.orbit.angle.angle_numbers import ANGLE
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.monitoring.monitoring_numbers import MONITOR
+from twin.study.__main__ import app as study_app
 
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
@@ -139,14 +151,14 @@ def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     for procedure in (FOCUS, DISTORTION, MONITOR):
         setup = procedure.resolve(EXAMPLES[procedure])
         assert cameras_of(setup), procedure.kind
-        assert procedure.warnings(setup, backend) == ()
+        assert procedure.judged
+        assert blur_warnings(setup, backend) == ()
         update = {"camera": blurred} if hasattr(setup, "camera") else {"cameras": FrozenMap({"gf7": blurred})}
-        (text,) = procedure.warnings(setup.model_copy(update=update), backend)
+        (text,) = blur_warnings(setup.model_copy(update=update), backend)
         assert "is blurred as designed" in text
     assert not cameras_of(CALIBRATION.resolve("calibrate"))
     assert not cameras_of(ANGLE.resolve("angle"))  # a payload's lines have no mirrors
-    design = Path(LIBRARY).parent / "examples" / "design_gf7_short.yaml"
-    assert DESIGN.warnings(DESIGN.resolve(design).model_copy(update={"camera": blurred}), backend) == ()
+    assert not DESIGN.judged
 
 
 def test_a_camera_in_a_runs_config_is_named_there(backend, tmp_path) -> None:
@@ -170,5 +182,48 @@ def test_a_tilted_image_plane(backend) -> None:
     beams = [FieldBeams.trace(m, backend, FIELDS, 3) for m in (derive_camera(camera, backend), model)]
     # the chief ray's image moves, and with it the sphere: by some 1e-8 waves of the rms
     np.testing.assert_allclose(beams[0].errors(plane), beams[1].errors(FocalPlane.of(tilted)), rtol=1e-4)
+    # and as the camera itself sees it, whose rays end on its own plane
+    own = [wave.rms for wave in CameraOptics.alone(model, backend).wavefronts(FIELDS)]
+    np.testing.assert_allclose(beams[1].errors(FocalPlane.of(tilted)), own, rtol=1e-3)
+    assert max(own) > 1.03 * min(own)
     assert validate(CameraSpec, YamlFile("", tilted.plain(), {})) == tilted
     assert "tilt" not in camera.plain()["image"]
+
+
+@pytest.mark.slow
+def test_studies_and_gradients_warn(tmp_path) -> None:
+    """On stderr, in the manifest and the report; a study that is run again from its config.yaml as well."""
+    gf7_with(tmp_path, "-2.02 m", "blurred")
+    pair = (
+        (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8").replace("camera: gf7", "camera: ./blurred.yaml")
+    )
+    (tmp_path / "pair.yaml").write_text(pair, "utf-8")
+    (tmp_path / "job.yaml").write_text("instrument: ./pair.yaml\nrender: {images: [spots], frames: 2}\n", "utf-8")
+    study = tmp_path / "study.yaml"
+    study.write_text(STUDY, "utf-8")
+    for options in (("--workers", 1), ("--gradient",)):
+        out = tmp_path / "-".join(map(str, options)).strip("-")
+        done = invoke(study_app, study, *options, "--out", out)
+        assert done.exit_code == 0, done.stderr
+        told = [
+            text for text in json.loads((out / "manifest.json").read_text("utf-8"))["warnings"] if "blurred" in text
+        ]
+        assert len(told) == 1
+        assert f"{tmp_path}/blurred.yaml --refocus moves image.z by +10.61 mm" in told[0]
+        assert "is blurred as designed: 6.75 waves rms" in (out / "report.html").read_text("utf-8")
+        assert "is blurred as designed: 6.75 waves rms" in " ".join((done.stderr + done.stdout).split())
+    config = tmp_path / "workers-1" / "config.yaml"
+    again = invoke(study_app, config, "--workers", 1, "--out", tmp_path / "again")
+    assert again.exit_code == 0, again.stderr
+    assert f"{config} --camera ./blurred.yaml --refocus" in "".join(again.stderr.split("\n"))
+
+
+STUDY = """\
+name: study
+base: {command: render, file: ./job.yaml}
+factors:
+  turn: {key: [job, perturb, base/backward/focal_plane, rotate, 2], normal: {mean: 0 arcsec, sigma: 2 arcsec}}
+design: {kind: monte_carlo, runs: 3, seed: 1}
+responses:
+  gamma: {key: [truth, cameras, backward, d_gamma_arcsec]}
+"""

@@ -16,11 +16,14 @@ from rich.console import Console
 
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.camera import CameraSpec
+from scenes.specs.load import load_camera
 from scenes.specs.test_setup import ExperimentSetup, read_setup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
+from tests.twin.test_blurred_cameras import gf7_with
 from twin.run import cli, reference_frames
 from twin.run.artefact import SvgFigure, Table
 from twin.run.cli import Heartbeat
@@ -177,6 +180,45 @@ def test_what_fails_on_the_bench_is_told_at_the_line_of_the_file(run: Callable, 
     assert f"{path}:2: readings" in done.stderr
     assert "100 or fewer" in done.stderr
     assert files(tmp_path) == {"level.yaml"}
+
+
+class FocusedSetup(ExperimentSetup[LevelSpec]):
+    camera: CameraSpec
+
+
+def test_a_blurred_camera_is_told_wherever_a_test_has_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In the terminal, the manifest and the report; beside the error where the test fails; in a study not at all."""
+    frames = {**reference_frames.FRAMES, "level": {"readings_arcsec": "about the level's own axis"}}
+    monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap(frames))
+    camera = load_camera(gf7_with(tmp_path, "-2.02 m"))
+
+    def with_camera(path: Path | str) -> FocusedSetup:
+        return FocusedSetup.model_construct(test=validate(LevelSpec, read_yaml(path)), camera=camera)
+
+    app = typer.Typer()
+
+    @app.callback()
+    def main() -> None:
+        """Instruments of one's own."""
+
+    test = Procedure("level", FocusedSetup, with_camera, measure, numbers)
+    add_test(app, "own.bench", "level", with_camera, lambda: (test, report), "Read a level.")
+    path, out = tmp_path / "level.yaml", tmp_path / "run"
+    path.write_text(FILE, "utf-8")
+    done = invoke(app, "level", path, "--out", out)
+    assert done.exit_code == 0, done.stderr
+    told = json.loads((out / "manifest.json").read_text("utf-8"))["warnings"]
+    assert len(told) == 2
+    assert "is blurred as designed: 6.75 waves rms" in told[0]
+    assert told[1] == "a toy"
+    assert f"warning: {told[0]}" in done.stdout
+    assert "is blurred as designed: 6.75 waves rms" in (out / "report.html").read_text("utf-8")
+    path.write_text(FILE.replace("readings: 5", "readings: 500"), "utf-8")
+    failed = invoke(app, "level", path, "--out", tmp_path / "none")
+    assert failed.exit_code == 2
+    text = " ".join(failed.stderr.split())
+    assert "the memory of the level is full" in text
+    assert "is blurred as designed: 6.75 waves rms" in text
 
 
 def test_base_of_studies(backend: Backend, tmp_path: Path) -> None:

@@ -17,10 +17,26 @@ from twin.study.runs.cluster import _children_deaf_to_ctrl_c, _ending_later
 
 HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
-READ = (("twin.render",), ("twin.study",), ("twin.design",), ("twin.lab", "focus"), ("twin.orbit", "angle"))
+READ = (
+    ("twin.render",),
+    ("twin.camera",),
+    ("twin.study",),
+    ("twin.design",),
+    ("twin.lab", "focus"),
+    ("twin.orbit", "angle"),
+)
 """Commands that read a YAML file; all tests of a program do it in the same way."""
 PROGRAMS = (
-    *("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.doctor"),
+    *(
+        "twin.render",
+        "twin.camera",
+        "twin.lab",
+        "twin.orbit",
+        "twin.study",
+        "twin.design",
+        "twin.validate",
+        "twin.doctor",
+    ),
     *("scenes.schema", "analysis.mtf"),
 )
 BAD = "seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n"

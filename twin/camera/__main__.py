@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.camera_setup import CameraSetup, resolve_camera
-from scenes.yaml.errors import names_text
-from twin.camera.camera_report import camera_report
-from twin.camera.camera_run import camera_data, camera_numbers, run_camera
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
 from twin.run.command import Result, Session, print_report, run_command
-from twin.run.data_files import netcdf
-from twin.run.page import RunFacts, write_test
 from twin.run.reference_frames import described
 
 PROGRAM, KIND, TILT = "twin.camera", "optics", "tilt"
@@ -65,19 +64,24 @@ def main(
 
     def resolve() -> CameraSetup:
         if what is not None and (what != TILT or not refocus):
-            allowed = names_text((f"--refocus {TILT}",))
-            raise InputErrorText(f"{what!r} has no meaning here; there is {allowed}")
+            raise InputErrorText(f"{what!r} has no meaning here; there is --refocus {TILT}")
         return resolve_camera(file, camera)
 
     def work(setup: CameraSetup, session: Session) -> Result:
+        from scenes.models.camera_sharpness import blur_warnings
+        from twin.camera.camera_report import camera_report
+        from twin.camera.camera_run import camera_data, camera_numbers, run_camera
+        from twin.run.data_files import netcdf
+        from twin.run.page import RunFacts, reproduce, write_test
+
         run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)
-        # a refocused camera is judged by its verdict: what its file lacked has been done
+        # what a refocused camera's file lacked has been done; how good it is now its verdict says
         warnings = () if refocus else blur_warnings(setup, session.backend)
         numbers, shown = camera_numbers(run), camera_report(run, warnings)
         session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
-        options = " ".join(filter(None, ("--refocus" if refocus else "", what or "")))
-        config, name = setup.to_yaml(), session.backend.name
-        facts = RunFacts(config, str(file), name, None, session.started, session.seconds, PROGRAM, "", options)
+        name = session.backend.name
+        again = reproduce(PROGRAM, "config.yaml", what or "", "--refocus" if refocus else "", f"--backend {name}")
+        facts = RunFacts(setup.to_yaml(), str(file), name, None, session.started, session.seconds, PROGRAM, "", again)
         write_test(KIND, numbers, shown, facts, session.folder)
         return Result(described(KIND, numbers), lambda console: print_report(shown, console))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.system import assemble
-from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, collimated, field_direction
+from scenes.models.camera_model import CameraModel, collimated, field_direction
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.ray_paths import obscuration
 
@@ -149,5 +149,4 @@ def _entrance_pupil(model: CameraModel, optics: CameraOptics) -> float:
     apart, turned = start[1:] - start[0], light[1:] - light[0]
     way = -float(np.sum(apart * turned) / np.sum(turned * turned))
     crossing = model.camera_frame.inverse().apply(start[0] + way * light[0])
-    assert way > -LAUNCH_DISTANCE * 1e6
     return float(crossing[2])

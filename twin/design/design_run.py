@@ -143,11 +143,5 @@ def _held_text(held: tuple[Held, ...], start: str) -> str:
     return " and ".join(parts)
 
 
-def _blurred(setup: CameraDesignSetup, backend: Backend) -> tuple[str, ...]:
-    """Nothing of the start, which is there to be improved."""
-    return ()
-
-
-DESIGN = Procedure(
-    "design", CameraDesignSetup, resolve_design, run_design, design_numbers, warnings=_blurred, seeded=False
-)
+# the start is there to be improved, however blurred it is
+DESIGN = Procedure("design", CameraDesignSetup, resolve_design, run_design, design_numbers, judged=False, seeded=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -14,7 +14,6 @@ from rich.progress import Progress, TaskID
 
 from optics.numerics.backend import Backend, load_backend
 from scenes.specs.file_kinds import read_for
-from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
     AsJson,
@@ -35,7 +34,7 @@ from twin.run.cli import (
     progress_columns,
     result_table,
 )
-from twin.run.procedure import Advance, BenchError, Procedure, Run
+from twin.run.procedure import Advance, Procedure, Run
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder, chosen
 
@@ -208,18 +207,12 @@ def run_test(
 
     def work(setup: Any, session: Session) -> Result:
         from twin.run.page import RunFacts, write_test
+        from twin.run.report import with_warnings
 
         procedure, report = load()
         number = setup.test.seed if options.seed is None else options.seed
-        given = procedure.warnings(setup, session.backend)
-        try:
-            run = procedure.run(setup, session.backend, number, session.advance)
-        except BenchError as error:
-            raise _told_with(given, _explained_at(setup.test, error)) from error
-        except InputError as error:
-            raise _told_with(given, error) from error
-        numbers, shown = procedure.numbers(run), report(run)
-        shown = replace(shown, warnings=(*given, *shown.warnings))
+        run, given = procedure.performed(setup, session.backend, number, session.advance)
+        numbers, shown = procedure.numbers(run), with_warnings(report(run), given)
         config, name = setup.with_seed(number).to_yaml(), session.backend.name
         drawn = number if procedure.seeded else None
         facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
@@ -227,18 +220,6 @@ def run_test(
         return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console))
 
     run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
-
-
-def _told_with(given: Sequence[str], error: InputError) -> InputError:
-    """An error, and what was wrong with what the test was given: it may be the reason."""
-    return InputError(*error.issues, *(Issue(text) for text in given))
-
-
-def _explained_at(test: Any, error: BenchError) -> InputError:
-    """What went wrong in the test, at the line of its file that can change it."""
-    result = test.error(str(error), error.key, allowed=error.remedy)
-    assert isinstance(result, InputError)
-    return result
 
 
 def print_report(report: Report, console: Console) -> None:

@@ -82,7 +82,6 @@ class RunFacts:
         seconds: that it took.
         program: that ran it, as the user calls it.
         command: its subcommand.
-        options: others that it was given, as the user would write them.
         again: the command that runs it again, where it is not the test with the run's own config.yaml.
     """
 
@@ -94,7 +93,6 @@ class RunFacts:
     seconds: float
     program: str
     command: str
-    options: str = ""
     again: str = ""
 
 
@@ -124,7 +122,7 @@ def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     """``report.html`` as text; its numbers are in KIND.json."""
     seed = "" if facts.seed is None else f"--seed {facts.seed}"
-    options = " ".join(filter(None, (seed, f"--backend {facts.backend}", facts.options)))
+    options = f"{seed} --backend {facts.backend}".strip()
     return (
         environment(__package__)
         .get_template(TEMPLATE)

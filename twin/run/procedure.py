@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from optics.numerics.backend import Backend
-from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.test_setup import ExperimentSetup
-from scenes.yaml.errors import KeyPath
+from scenes.yaml.errors import InputError, Issue, KeyPath
 
 Advance = Callable[[str, int, int], None]
 """Told what is being done, and how many of how many parts of it are."""
@@ -50,7 +49,7 @@ class Procedure(Generic[Setup, Run]):
         resolve: file, or the name of one in the library -> set-up. Raises InputError.
         run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
-        warnings: set-up and backend -> what is wrong with what the test is given, beside what its report warns of.
+        judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
         seeded: whether anything is drawn at random; the command then has an option --seed.
     """
 
@@ -59,5 +58,28 @@ class Procedure(Generic[Setup, Run]):
     resolve: Callable[[Path | str], Setup]
     run: Callable[[Setup, Backend, int, Advance], Run]
     numbers: Callable[[Run], Mapping[str, Any]]
-    warnings: Callable[[Setup, Backend], tuple[str, ...]] = blur_warnings
+    judged: bool = True
     seeded: bool = True
+
+    def performed(
+        self, setup: Setup, backend: Backend, seed: int, advance: Advance = silent
+    ) -> tuple[Run, tuple[str, ...]]:
+        """Run it, and what the user should know of what it was given.
+
+        Raises:
+            InputError: also for what fails on the bench, at the key that can change it; with what is wrong with what
+                the test was given, which may be the reason.
+        """
+        given: tuple[str, ...] = ()
+        if self.judged:
+            # a command is told of a bad file before this is imported
+            from scenes.models.camera_sharpness import blur_warnings
+
+            given = blur_warnings(setup, backend)
+        try:
+            return self.run(setup, backend, seed, advance), given
+        except BenchError as error:
+            told = setup.test.error(str(error), error.key, allowed=error.remedy)
+            raise InputError(*told.issues, *(Issue(text) for text in given)) from error
+        except InputError as error:
+            raise InputError(*error.issues, *(Issue(text) for text in given)) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -58,3 +58,8 @@ class Report:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"more than one artefact is called {', '.join(twice)}")
+
+
+def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
+    """The report with further warnings before its own."""
+    return replace(report, warnings=(*given, *report.warnings))

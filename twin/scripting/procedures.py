@@ -19,8 +19,7 @@ from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.command import Test
 from twin.run.page import RunFacts, cell_text, write_test
-from twin.run.procedure import BenchError, silent
-from twin.run.report import Report
+from twin.run.report import Report, with_warnings
 from twin.run.run_folder import RunFolder
 
 
@@ -102,14 +101,12 @@ def perform(
         setup = setup.model_copy(update={"test": setup.test.with_source(Source(source.file))})
     number = setup.test.seed if seed is None else seed
     started, clock = time.time(), time.monotonic()
-    try:
-        run = procedure.run(setup, load_backend(backend), number, silent)
-    except BenchError as error:
-        raise setup.test.error(str(error), error.key, allowed=error.remedy) from error
+    run, given = procedure.performed(setup, load_backend(backend), number)
     program, command = name.split()
     config = setup.with_seed(number).to_yaml()
     facts = RunFacts(config, str(file), backend, number, started, time.monotonic() - clock, f"twin.{program}", command)
-    return TestResult(name, procedure.numbers(run), report(run), setup, run, facts, procedure.kind)
+    shown = with_warnings(report(run), given)
+    return TestResult(name, procedure.numbers(run), shown, setup, run, facts, procedure.kind)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

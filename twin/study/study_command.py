@@ -13,7 +13,6 @@ from typing import Any
 
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
-from scenes.models.camera_sharpness import blur_warnings, cameras_of
 from scenes.specs.file_kinds import read_for
 from twin.run.cli import InputErrorText, check_backend, ending_signals
 from twin.run.run_folder import RunFolderError, chosen, write_manifest
@@ -125,6 +124,9 @@ def run_study(
             for text in store.corrupt:
                 remember(text)
             opened(folder.path)
+            # nor is what judges cameras, before the study's file is known to be good
+            from scenes.models.camera_sharpness import blur_warnings, cameras_of
+
             blurred = blur_warnings(base, load_backend(options.backend)) if cameras_of(base) else ()
             for text in blurred:
                 remember(text)
