@@ -155,6 +155,10 @@ def main(
 
     That of a job lists the nodes of the library's instruments, their pivots and what may be done to each; quantities
     are checked for the usual units of their kind.
+
+    Example: python -m scenes.schema --out schemas
+
+    Then the first line of a job's file may be: # yaml-language-server: $schema=schemas/job.schema.json
     """
     instruments: dict[str, Mapping[str, NodeInfo]] = {}
     try:

@@ -227,6 +227,8 @@ def main(
 ) -> None:
     """Check Python, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies. Exit code 0 if the twin can run, 1
     if not.
+
+    Example: python -m twin.doctor --quick
     """
     checks = examine(quick)
     good = all(check.status != "failed" for check in checks)

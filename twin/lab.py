@@ -29,6 +29,8 @@ def main() -> None:
     Examples of all three files are in scenes/lab. The run folder gets config.yaml, the numbers as JSON, a
     self-contained report.html, figures and tables in artefacts/ and recorded frames in images/.
 
+    Example: `python -m twin.lab turntable scenes/lab/turntable.yaml`
+
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
 
@@ -65,6 +67,8 @@ add_test(
 
     focus.json holds, for every round, the confocal error, the line's level, MTF at Nyquist by band and the shims,
     and under `truth` what the exact trace says.
+
+    Example: `python -m twin.lab focus scenes/lab/focus.yaml`
     """,
 )
 
@@ -80,6 +84,8 @@ add_test(
     distortion.json: `rms_raw_um` and `rms_compensated_um` are what a laboratory can state, the scatter of the points
     about a smooth curve; how wrong the distortion is stands under `truth`, `error_rms_raw_um` and
     `error_rms_compensated_um`.
+
+    Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
     """,
 )
 
@@ -89,7 +95,10 @@ add_test(
     "turntable",
     resolve_turntable,
     _turntable,
-    """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.""",
+    """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
+
+    Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
+    """,
 )
 
 

@@ -96,9 +96,13 @@ def main(
     quality.json has them. What prisms and other bodies take of the cameras' beams is missing in their pupils, here and
     in the targets' images; `render: {obstruction: ignore}` leaves it out.
 
+    What can be perturbed in a job's instrument: --list-nodes.
+
     With --picture the run folder also gets picture.png (the instrument), picture_prisms.png and
     picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba cannot, the rest of the
     run is kept and the exit code is 1.
+
+    Example: `python -m twin.render scenes/examples/perturb.yaml --out runs/first`
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """

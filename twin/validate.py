@@ -117,6 +117,8 @@ def main(
     The run folder gets validation.json, a self-contained validation.html, a summary in summary/, and figures and
     tables in artefacts/.
 
+    Examples: `python -m twin.validate --list` and `python -m twin.validate --only 004.eq2 --fast`
+
     Exit codes: 0 every verdict is the expected one; 1 a verdict is another one, a check failed, or the backend cannot
     be used; 2 bad input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is left behind.
     """

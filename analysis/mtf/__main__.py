@@ -110,7 +110,9 @@ def main(
     taken as it is, with a warning. Colour becomes the luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B). Pages
     of a TIFF are averaged. --saturation and --offset are grey values linear in light.
 
-    Example: python -m analysis.mtf edge.tiff --roi 100,200,64,64 --pixel-size "7 um" --plot mtf.png
+    Example, with images of `python -m twin.render scenes/examples/targets.yaml --out runs/targets`:
+    `python -m analysis.mtf runs/targets/images/forward_centre_knife_edge_along_before.tiff --roi 24,24,64,64
+    --pixel-size "7 um" --plot mtf.png`
 
     Exit codes: 0 measured; 2 bad input, with a sentence that says what to change; 1 the result cannot be printed.
     After 2 no file is written.

@@ -32,7 +32,9 @@ def main(
     """Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
     the field is made least, with the focal length, the envelope and free beams as constraints.
 
-    An example is scenes/examples/design_gf7_short.yaml. The run folder gets the new camera's file in artefacts/,
+    Example: `python -m twin.design scenes/examples/design_gf7_short.yaml`
+
+    The run folder gets the new camera's file in artefacts/,
     design.json, config.yaml and a report.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.

@@ -28,6 +28,8 @@ def main() -> None:
     Examples are in scenes/orbit. The run folder gets config.yaml, the numbers as JSON, a self-contained report.html,
     figures and tables in artefacts/.
 
+    Example: `python -m twin.orbit angle scenes/orbit/angle.yaml`
+
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
 
@@ -71,6 +73,8 @@ add_test(
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points.
+
+    Example: `python -m twin.orbit angle scenes/orbit/angle.yaml`
     """,
 )
 
@@ -85,6 +89,8 @@ add_test(
 
     calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
     plan and height of every field before calibration and by each scheme.
+
+    Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
     """,
 )
 
@@ -99,6 +105,8 @@ add_test(
 
     monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
     time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from.
+
+    Example: `python -m twin.orbit monitor scenes/orbit/monitor.yaml`
     """,
 )
 
@@ -113,6 +121,8 @@ add_test(
 
     simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
     truth knows is in artefacts/truth.json.
+
+    Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
     """,
 )
 

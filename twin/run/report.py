@@ -38,8 +38,8 @@ class Report:
         summary: the main table, also printed in the terminal.
         sections: the rest of the report.
         images: name -> recorded frames, uint16 (frames, rows, columns).
-        image_facts: name -> what is known of these frames; of some or all.
         warnings: what the user should know before using the numbers.
+        image_facts: name of images -> what is known of these frames; of some or all.
     """
 
     title: str
@@ -48,8 +48,8 @@ class Report:
     summary: Table
     sections: tuple[Section, ...]
     images: Mapping[str, np.ndarray] = field(default_factory=FrozenMap)
-    image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
     warnings: tuple[str, ...] = ()
+    image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         """Refuse two artefacts of one name: they would be one file."""

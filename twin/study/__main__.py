@@ -79,6 +79,9 @@ def main(
     With --gradient it runs no design: the folder gets the Jacobian at the base's own values, gradient.json and
     gradient.csv, by automatic differentiation and beside it by differences.
 
+    Examples: `python -m twin.study scenes/examples/study_smoke.yaml --workers 2` and
+    `python -m twin.study scenes/examples/study_smoke.yaml --gradient`
+
     Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else.
     """
     errors = Console(stderr=True)
