@@ -31,7 +31,7 @@ CUTS = (
     "twin.laboratory.distortion_bench.DistortionBench.record",
     "twin.laboratory.turntable_run.choose",
     "twin.orbit.angle.angle_run.estimated",
-    "twin.orbit.calibration.campaign._drawn",
+    "twin.orbit.calibration.campaign._simulated_points",
     "twin.orbit.calibration.field_images.Imager.measured",
     "twin.orbit.monitoring.monitoring_flight._changes",
     "twin.orbit.images.simulate_run.fly_patch",
