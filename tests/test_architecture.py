@@ -317,6 +317,27 @@ def test_general_commands_know_no_paper(room: str) -> None:
     assert not told, "\n".join(told)
 
 
+OTHER_SIGNS = {"\N{GREEK SMALL LETTER MU}m": "µm", "\N{DOUBLE PRIME}": "arcsec", "\N{ANGSTROM SIGN}": "nm"}
+"""How lengths and angles are not written, and how they are: µ is the micro sign."""
+UNIT_AFTER_COMMA = re.compile(r"[^,;:.]{2,}, (µm|um|mm|m|km|arcsec|arcmin|px|deg|DN|min)")
+"""Of a table's head or a figure's axis; units stand in brackets there."""
+
+
+@pytest.mark.parametrize("room", ["twin", "analysis"])
+def test_one_notation_for_units(room: str) -> None:
+    """In everything that a command can show; the checks quote papers, and their pages put that into the same units."""
+    found = []
+    for path in sorted((ROOT / room).rglob("*.py")):
+        place = path.relative_to(ROOT).as_posix()
+        if place.startswith("twin/validation/") or place == "analysis/mtf/__main__.py":
+            # the latter reads what users write, in whichever letter
+            continue
+        for line, text in texts(ast.parse(path.read_text("utf-8"))):
+            if any(sign in text for sign in OTHER_SIGNS) or (room == "twin" and UNIT_AFTER_COMMA.fullmatch(text)):
+                found.append(f"{place}:{line}: {text[:60]!r}")
+    assert not found, "\n".join(found)
+
+
 def test_folders_are_small_enough_to_look_through() -> None:
     count = Counter(path.parent.as_posix() for path in modules().values())
     assert {folder: number for folder, number in count.items() if number > MOST_FILES} == {}

@@ -354,7 +354,7 @@ def write_toy(folder: Path) -> Report:
     """What a test of the laboratory could give, as a run folder."""
     summary = Table("summary", "Found", "Nothing.", ("x",), ((21,),))
     frames = np.arange(2 * 5 * 7, dtype=np.uint16).reshape(2, 5, 7)
-    result = Report("A test", (), (), summary, (Section("Own section"),), {"edge": frames})
+    result = Report("A test", "It is one.", (), (), summary, (Section("Own section"),), {"edge": frames})
     with RunFolder(folder, False) as made:
         write_test(
             "focus", {"x": 21}, result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made
@@ -383,7 +383,7 @@ def test_a_report_section(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     add(monkeypatch, SECTIONS, ("focus", "silent"), lambda numbers: None)
     write_toy(tmp_path / "run")
     page = page_text(tmp_path / "run")
-    assert re.findall(r"<h2>(.*)</h2>", page) == ["Set-up", "Own section", "Twice is 42", "How to reproduce"]
+    assert re.findall(r"<h2>(.*)</h2>", page) == ["Own section", "Twice is 42", "How to reproduce"]
     assert "<p>Nothing < all.</p>" in page
     assert (tmp_path / "run" / "artefacts" / "twice.csv").read_text("utf-8") == "2x\n42\n"
     assert "artefacts/twice.csv" in read(tmp_path / "run", "manifest")["sha256"]

@@ -80,7 +80,8 @@ def main(
 
     Every quantity carries its unit. The run folder gets the images (TIFF), the expected irradiance (netCDF),
     truth.json, recovered.json, crosstalk.json, a self-contained report.html and scene.glb. A run's own config.yaml
-    can be given as the job to repeat it.
+    can be given as the job to repeat it. The terminal, the report and recovered.json begin or end with a verdict: one
+    sentence about what was recovered, how well, and what limits it.
 
     A job with a course, a table of temperatures over time (scenes/examples/orbit.yaml), also gets every time's
     numbers and images: course.json, course.nc and images/CAMERA_SIDE_course.tiff.

@@ -29,6 +29,7 @@ from twin.run.cli import (
     check_backend,
     exit_on_terminate,
     explained,
+    print_verdict,
     print_whole,
     result_table,
     time_text,
@@ -43,7 +44,6 @@ from twin.validation.checks.check import (
     REFUTED,
     REPRODUCED,
     UNDECIDED,
-    VERDICTS,
     Verdict,
 )
 
@@ -141,7 +141,9 @@ def main(
             validation = _run(selections, backend, seed, only, fast, folder, errors)
     with to_stdout(errors, "" if folder is None else f"the report is complete in {folder.target}"):
         if as_json:
-            print_json(validation.to_dict())
+            from twin.validation.validation_report import verdict
+
+            print_json({**validation.to_dict(), "verdict": verdict(validation)})
         else:
             _print_result(validation, None if folder is None else folder.target)
     for result, expected in validation.unexpected:
@@ -252,7 +254,7 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
-    from twin.validation.validation_report import claim_text, measured_text, sigma_text
+    from twin.validation.validation_report import claim_text, measured_text, sigma_text, verdict
 
     table = result_table()
     table.add_column("check", no_wrap=True)
@@ -266,10 +268,8 @@ def _print_result(validation: Validation, target: Path | None) -> None:
         cells = (r.id, claim_text(r), measured_text(r), sigma_text(r), unit)
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
     console = Terminal()
+    print_verdict(console, verdict(validation))
     print_whole(console, table)
-    counts = ", ".join(f"{validation.counts[verdict]} {verdict}" for verdict in VERDICTS if validation.counts[verdict])
-    number = len(validation.results)
-    console.print(f"{number} check{'' if number == 1 else 's'}: {counts}", markup=False, highlight=False)
     if target is None:
         console.print("How each was done: --out DIR writes a report, --json prints it.", style="dim", soft_wrap=True)
     else:

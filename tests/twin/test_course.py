@@ -199,7 +199,7 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
     printed = json.loads((folder.parent / "printed.json").read_text())
     assert printed["course"] == found
     report = (folder / "report.html").read_text("utf-8")
-    for words in ("Time course", "3 states from 0 min to 30 min", "at 12 min", "course.nc", "temperature 0.6 K"):
+    for words in ("Time course", "3 times from 0 min to 30 min", "at 12 min", "course.nc", "temperature 0.6 K"):
         assert words in report
 
 

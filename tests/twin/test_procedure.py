@@ -30,7 +30,7 @@ from twin.run.cli import Heartbeat
 from twin.run.command import add_test
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Advance, BenchError, Procedure
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 
 FILE = "name: levels\nreadings: 5\nsigma_arcsec: 0.5\nseed: 3\n"
@@ -88,13 +88,26 @@ def report(run: LevelRun) -> Report:
     figure = SvgFigure("scatter", "Scatter", "All readings.", "<svg></svg>")
     return Report(
         title="Level",
-        lead=(f"{len(rows)} readings.",),
+        verdict=f"{len(rows)} readings.",
+        lead=(),
         facts=(("sigma", f"{run.setup.test.sigma_arcsec} arcsec"),),
         summary=Table("readings", "Readings", "", ("number", "arcsec"), rows),
         sections=(Section("Readings", (), (figure,)),),
         images={"level": np.zeros((1, 4, 4), np.uint16)},
         warnings=("a toy",),
     )
+
+
+@pytest.mark.parametrize("verdict", ["", "No full stop", "One sentence. And another.", "Is it? No."])
+def test_a_verdict_is_one_sentence(verdict: str) -> None:
+    table = Table("readings", "Readings", "", ("number",), [])
+    with pytest.raises(ValueError, match="not one sentence"):
+        Report("Level", verdict, (), (), table, ())
+
+
+def test_statements_become_one_sentence() -> None:
+    assert one_sentence("Heights err by 3 m.", "", "The rest is 0.5 m") == "Heights err by 3 m; the rest is 0.5 m."
+    assert one_sentence("It is.", "MTF falls", "Δα is read") == "It is; MTF falls; Δα is read."
 
 
 LEVEL = Procedure("level", LevelSetup, resolve, measure, numbers)
@@ -150,7 +163,7 @@ def test_command(run: Callable, tmp_path: Path) -> None:
     assert json.loads(done.stdout) == data
     assert list(data) == [
         *("schema", "reference_frames"),
-        *("seed", "mean_arcsec", "mean_arcsec_sigma", "readings_arcsec"),
+        *("seed", "mean_arcsec", "mean_arcsec_sigma", "readings_arcsec", "verdict"),
     ]
     assert data["seed"] == 7
     assert data["readings_arcsec"] == np.random.default_rng(7).normal(0.0, 0.5, 5).tolist()

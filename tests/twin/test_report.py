@@ -1,5 +1,9 @@
 """The report says what the results say, by itself: no other file, no network, nothing missing."""
 
+import base64
+import csv
+import html
+import io
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -15,9 +19,13 @@ from twin.main_job.crosstalk_content import is_wrong
 from twin.main_job.render_job import STAGES, render_job
 from twin.main_job.render_report import render_report
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_content import goodness, systematics
+from twin.main_job.report_content import goodness
 from twin.main_job.report_labels import PARAMETERS
+from twin.main_job.report_tables import report_tables
 from twin.main_job.summary_plot import write_summary
+from twin.main_job.systematics import systematics
+from twin.main_job.verdict import judge
+from twin.pictures.scene_file import write_scene
 from twin.run.artefact import FAR, decimals_for, fixed, plain, residual_text, significant
 
 VOID = {"meta", "br", "hr", "img", "input", "link", "col", "wbr"}
@@ -40,8 +48,10 @@ def run(backend, told) -> RenderRun:
 
 
 @pytest.fixture(scope="module")
-def page(run) -> str:
-    return render_report(run)
+def page(run, tmp_path_factory) -> str:
+    scene = tmp_path_factory.mktemp("scene") / "scene.glb"
+    write_scene(run.experiment, run.state, scene)
+    return render_report(run, scene=scene.read_bytes())
 
 
 class Cells(HTMLParser):
@@ -103,11 +113,12 @@ def test_every_stage_is_told_when_it_begins_and_when_it_ends(run, told):
 
 def test_well_formed_and_complete(page, parsed):
     assert page.startswith("<!DOCTYPE html>")
-    titles = re.findall(r"<h2>(\d)", page)
-    assert titles == [str(k) for k in range(1, len(titles) + 1)]
-    assert len(titles) == 9
+    ids = {attrs["id"] for _, attrs in parsed.tags if attrs.get("id")}
+    links = {attrs["href"] for tag, attrs in parsed.tags if tag == "a" and str(attrs["href"]).startswith("#")}
+    assert links
+    assert {link[1:] for link in links if link} <= ids
     drawings = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
-    assert len(drawings) == 5  # two cameras' spots, residuals, side view, footprints
+    assert len(drawings) == 6  # two cameras' spots, residuals, motions, side view, footprints
     for drawing in drawings:
         named = drawing.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
         assert "xmlns:xlink" in drawing
@@ -115,12 +126,12 @@ def test_well_formed_and_complete(page, parsed):
 
 
 def test_needs_nothing_else(page, parsed):
-    """No script, link, font or picture from outside; pictures are data in the page."""
+    """No script, link, font or picture from outside; pictures and tables are data in the page."""
     text = page
     for namespace in NAMESPACES:
         text = text.replace(f'"{namespace}"', "")
     assert not re.search(r"https?:|//www|@import|file:", text)
-    assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in parsed.tags}
+    assert not {"link", "iframe", "object"} & {tag for tag, _ in parsed.tags}
     images = [attrs for tag, attrs in parsed.tags if tag in ("img", "image")]
     assert len(images) >= 16
     for attrs in images:
@@ -204,8 +215,66 @@ def test_every_motion_and_perturbation_is_named(run, parsed):
     for table in run.crosstalk.values():
         for motion in table.motions:
             assert motion.body.removeprefix("base/") in words
-        for statement in table.observability.statements[1:]:
-            assert statement.partition(": ")[0].replace("[um]", "[µm]") in words
+
+
+def tables_of(page: str) -> dict[str, list[list[str]]]:
+    """The tables that a page hands out, by their names."""
+    found = re.findall(r'download="([a-z_-]+)\.csv" href="data:text/csv;charset=utf-8;base64,([^"]+)"', page)
+    return {name: list(csv.reader(io.StringIO(base64.b64decode(data).decode()))) for name, data in found}
+
+
+def test_every_table_can_be_taken_away_with_all_digits(run, page, parsed):
+    """Each data table is followed by its CSV; those of facts hold no numbers of the run. A number to a cell."""
+    text = re.sub(r"<style>.*?</style>|<svg.*?</svg>", "", page, flags=re.DOTALL)
+    tables = re.split(r"<table", text)[1:]
+    data = [after for after in tables if not after.startswith(' class="facts"')]
+    assert len(data) >= 8
+    for after in data:
+        # the two tables of crosstalk share the one of motions
+        assert 'class="csv"' in after or 'class="cross"' in after[:20] or "#motions" in after
+    handed = tables_of(page)
+    assert set(report_tables(run)) <= set(handed)
+    heads, *rows = handed["results"]
+    recovered = run.recovered_dict()["cameras"]
+    for row in rows[:8]:
+        at = dict(zip(heads, row, strict=True))
+        key = next(p.key for p in PARAMETERS if p.symbol == at["parameter"])
+        assert float(at["model"]) == recovered[at["camera"]]["model"][key]
+        assert float(at["model sigma"]) == recovered[at["camera"]]["model"][f"{key}_sigma"]
+    heads, *rows = handed["motions"]
+    assert len(rows) == sum(len(table.motions) for table in run.crosstalk.values())
+    pitch = 1e6 * run.experiment.path.pitch
+    table = run.crosstalk["forward"]
+    for k, row in enumerate(rows[: len(table.motions)]):
+        at = dict(zip(heads, row, strict=True))
+        assert (at["camera"], at["motion"]) == ("forward", table.motions[k].label)
+        shown = [float(at[f"{name} [µm]"]) for name in ("left y", "left x", "right y", "right x")]
+        np.testing.assert_allclose(shown, pitch * table.spot_shift[:, k], rtol=1e-14)
+
+
+def test_the_answer_comes_first_and_the_rest_is_folded(run, page, parsed):
+    """One sentence, the same as elsewhere, before anything else; unfolded at most 2 500 words."""
+    told = judge(run)
+    body = page[page.index("<body>") :]
+    first = re.search(r"<p[^>]*>(.*?)</p>", body, re.DOTALL)
+    assert first is not None
+    assert html.unescape(first[1]) == told.verdict
+    unfolded = re.sub(r"(<summary>.*?</summary>)", r"\1", body, flags=re.DOTALL)
+    while "<details" in unfolded:  # innermost first
+        unfolded = re.sub(r"<details[^>]*>((?!<details).)*?</details>", "", unfolded, flags=re.DOTALL)
+    words = re.sub(r"<(script|svg|style).*?</\1>|<[^>]+>", " ", unfolded, flags=re.DOTALL).split()
+    assert 200 < len(words) <= 2500
+
+
+def test_one_notation(page, run):
+    """Micro sign, not the Greek letter, and no inch or second marks for arcsec."""
+    text = re.sub(r"<(script|svg|style|pre).*?</\1>", "", page, flags=re.DOTALL)
+    text = re.sub(r"<[^>]+>", " ", text)
+    assert "\N{GREEK SMALL LETTER MU}" not in text
+    assert "\N{DOUBLE PRIME}" not in text
+    assert not re.search(r"\bum\b|d_alpha|d_beta|d_gamma|d_f\b", text)
+    assert "Δα [arcsec]" in text
+    assert "Δf [µm]" in text
 
 
 def test_crosstalk_explains_the_systematic_residuals(run):
@@ -223,7 +292,7 @@ def test_crosstalk_explains_the_systematic_residuals(run):
     assert checked == 8
     assert largest > 50  # there was something to explain
     texts = {g["name"]: g for g in goodness(run)}
-    assert "M2 along Z, 3 um" in texts["forward"]["outside"]
+    assert "M2 along Z, 3 µm" in texts["forward"]["outside"]
     assert "tilt" in texts["backward"]["outside"]
     assert not texts["forward"]["uncovered"]
 

@@ -5,13 +5,14 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from optics.geometry.solid import face_plane
 from optics.geometry.tree import Motion
 from scenes.models.meshes import BOARD, CHIP, mirror_mesh
 from scenes.specs.channel import BASE
 from twin.pictures.light_paths import FIELDS, trace_light_paths
-from twin.pictures.scene_file import TUBE, build_scene
+from twin.pictures.scene_file import TUBE, build_scene, motions
 
 TOLERANCE = 1e-3
 """Metres: meshes and float32 files are for looking at."""
@@ -33,6 +34,7 @@ def loaded(gf7_pair, paths, tmp_path_factory):
     """The scene of a state with large motions, written and read back."""
     placed = gf7_pair.assembly.place([STATE])
     scene = build_scene(gf7_pair, type(paths)(paths.beams, placed))
+    scene.metadata["motions"] = motions(gf7_pair, STATE, placed)
     place = tmp_path_factory.mktemp("scene") / "scene.glb"
     place.write_bytes(scene.export(file_type="glb"))
     return trimesh.load_scene(place), placed
@@ -96,6 +98,53 @@ def test_boxes_of_mirrors_and_detectors(gf7_pair, loaded):
         assert face[1, 1] - face[0, 1] == pytest.approx(2 * radius, abs=TOLERANCE)
         checked += 2
     assert checked == 2 * 4 + 4 * 2
+
+
+def drawn(told: dict, factor: float) -> np.ndarray:
+    """A body's matrix in its parent when its motion is drawn ``factor`` times as large, as a viewer works it out."""
+    nominal = np.array(told["nominal"]).reshape(4, 4).T
+    turn = Rotation.from_rotvec(factor * np.array(told["rotate"])).as_matrix()
+    pivot = np.array(told["pivot"])
+    change = np.eye(4)
+    change[:3, :3], change[:3, 3] = turn, pivot + factor * np.array(told["shift"]) - turn @ pivot
+    return nominal @ change
+
+
+def test_motions_can_be_drawn_larger(gf7_pair, loaded):
+    """As they are they give the bodies' places, not at all the nominal ones; k times they are k times the job's."""
+    scene, placed = loaded
+    told = scene.metadata["motions"]
+    assert set(told) == set(STATE)
+    nominal = gf7_pair.assembly.place()
+    for path, motion in STATE.items():
+        parent = path.rpartition("/")[0]
+        for factor, where in ((0.0, nominal), (1.0, placed)):
+            pose = where.pose(parent).inverse() @ where.pose(path)
+            matrix = drawn(told[path], factor)
+            np.testing.assert_allclose(matrix[:3, :3], pose.rotation, atol=1e-12)
+            np.testing.assert_allclose(matrix[:3, 3], pose.translation, atol=1e-12)
+        np.testing.assert_allclose(told[path]["rotate"], motion.rotate, atol=1e-12)
+        np.testing.assert_allclose(told[path]["shift"], motion.shift, atol=1e-12)
+    larger = {
+        path: Motion(tuple(7.0 * np.array(m.rotate)), tuple(7.0 * np.array(m.shift))) for path, m in STATE.items()
+    }
+    seven = gf7_pair.assembly.place([larger])
+    for path in STATE:
+        parent = path.rpartition("/")[0]
+        pose = seven.pose(parent).inverse() @ seven.pose(path)
+        np.testing.assert_allclose(drawn(told[path], 7.0)[:3, 3], pose.translation, atol=1e-12)
+
+
+def test_a_turn_about_a_pivot_leaves_it_in_place(gf7_pair):
+    """However large it is drawn; a body that only its carrier moves has no motion of its own."""
+    path = "base/backward/focal_plane"
+    state = {path: Motion(rotate=(0.0, 0.01, 0.02), pivot="rear_node"), "base/forward": Motion(shift=(0.0, 0.0, 1e-3))}
+    told = motions(gf7_pair, state, gf7_pair.assembly.place([state]))
+    assert set(told) == set(state)
+    pivot = np.array([*told[path]["pivot"], 1.0])
+    assert np.linalg.norm(pivot[:3]) > 0.1
+    for factor in (1.0, 30.0):
+        np.testing.assert_allclose(drawn(told[path], factor) @ pivot, drawn(told[path], 0.0) @ pivot, atol=1e-12)
 
 
 def corners_of(solid, placed) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Reports of studies of all kinds: they stand alone, say what was found, and hold out when there is nothing."""
 
+import html
 import json
 import re
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.twin.study_data import columns, dataset, study_of
+from twin.run.report import one_sentence
 from twin.study.report.study_report import write_study_report
 from twin.study.report.study_runs import StudyRuns
 
@@ -22,7 +24,11 @@ def page(folder, study, values, failed=None) -> str:
     assert "<script" not in text
     for name in re.findall(r'href="(artefacts/[^"]+|statistics.json)"', text):
         assert (folder / name).stat().st_size > 0, name
-    json.loads((folder / "statistics.json").read_text("utf-8"))
+    verdict = json.loads((folder / "statistics.json").read_text("utf-8"))["verdict"]
+    first = re.search(r"<p[^>]*>(.*?)</p>", text, re.DOTALL)
+    assert first is not None
+    assert html.unescape(first[1]) == verdict
+    assert one_sentence(*verdict.split(". ")) == verdict
     words = re.sub(r"<svg.*?</svg>|<style>.*?</style>", "", text, flags=re.DOTALL)
     words = re.sub(r"<[^>]+>", " ", words)
     for wrong in ("nan", "None", "inf", "np.float"):

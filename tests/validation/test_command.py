@@ -481,6 +481,12 @@ def test_the_report_shows_everything_and_needs_nothing_from_outside(fake, tmp_pa
     places = ("<h2>Paper 001", "001.table3.a<", "<h2>Paper 004", "004.eq3.f<")
     starts = [page.index(place) for place in places]
     assert starts == sorted(starts)
+    first = re.search(r'<p class="answer">(.*?)</p>', page)
+    assert first is not None
+    told = json.loads((tmp_path / "run/validation.json").read_text("utf-8"))["verdict"]
+    assert first[1] == told
+    assert told.startswith(f"{len(GOOD.ids) + len(OTHER.ids)} checks: ")
+    assert "\N{DOUBLE PRIME}" not in page
     for reference in ('src="http', 'href="http', "@import", "<script", "<link"):
         assert reference not in page
 

@@ -77,7 +77,8 @@ def main(
         run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)
         # what a refocused camera's file lacked has been done; how good it is now its verdict says
         warnings = () if refocus else blur_warnings(setup, session.backend)
-        numbers, shown = camera_numbers(run), camera_report(run, warnings)
+        shown = camera_report(run, warnings)
+        numbers = {**camera_numbers(run), "verdict": shown.verdict}
         session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
         name = session.backend.name
         again = reproduce(PROGRAM, "config.yaml", what or "", "--refocus" if refocus else "", f"--backend {name}")

@@ -25,7 +25,7 @@ from twin.camera.camera_plots import (
 from twin.camera.camera_run import MOST_WAVES, CameraRun, refocus_text, verdict
 from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import look, to_svg
 
 _TOLD_TERMS = 15
@@ -44,7 +44,8 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
     sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
     return Report(
         f"Camera {run.setup.title}",
-        (verdict(run), *((moved,) if moved else ()), _first_order_text(run)),
+        one_sentence(*verdict(run).split(". "), "see the wavefronts and the layout"),
+        (*((moved,) if moved else ()), _first_order_text(run)),
         _facts(run),
         first_order_table(run),
         tuple(sections),

@@ -62,7 +62,8 @@ def main(
         from twin.run.page import RunFacts, write_test
 
         comparison = compare(runs, rtol, sigmas)
-        found, report = numbers(comparison), compare_report(comparison)
+        report = compare_report(comparison)
+        found = {**numbers(comparison), "verdict": report.verdict}
         limits = ["--rtol", f"{rtol:g}"] + ([] if sigmas is None else ["--sigmas", f"{sigmas:g}"])
         config = {"runs": [str(run) for run in runs], "rtol": rtol, "sigmas": sigmas}
         again = " ".join(["python -m", PROGRAM, *map(str, runs), *limits, "--out again"])

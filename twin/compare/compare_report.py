@@ -7,7 +7,7 @@ import numpy as np
 from twin.compare.comparison import Comparison, verdict
 from twin.compare.run_differences import ArrayDifference, Differences, Leaf, RunResults, images_of, is_sigma
 from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, to_png, to_svg
 
 MOST_BARS = 30
@@ -28,7 +28,7 @@ def compare_report(comparison: Comparison) -> Report:
             if comparison.sigmas is None
             else f" and, where it has a sigma, by more than {comparison.sigmas:g} sigma."
         ),
-        ("run", "inputs", "numbers", "images", "compared", "largest, sigma"),
+        ("run", "inputs", "numbers", "images", "compared", "largest [sigma]"),
         [_row(name, found) for name, found in zip(names[1:], comparison.found, strict=True)],
     )
     sections = []
@@ -38,7 +38,8 @@ def compare_report(comparison: Comparison) -> Report:
             sections.append(Section(name, (), artefacts))
     return Report(
         title=f"{', '.join(names[1:])} against {names[0]}",
-        lead=(verdict(comparison),),
+        verdict=one_sentence(*verdict(comparison).split(". ")),
+        lead=(),
         facts=tuple((name, str(run.folder)) for name, run in zip(names, comparison.runs, strict=True)),
         summary=summary,
         sections=tuple(sections),

@@ -27,6 +27,8 @@ LEFT_OUT = frozenset(
     ("seconds", "worker_seconds", "runs_computed", "states_per_second", "wall_time_s", "fingerprint", "sha256")
 )
 """Keys of results that say how the run was done, not what it gave."""
+TOLD = frozenset(("verdict", "warnings"))
+"""Sentences at the top of a result that follow from its numbers, which are compared themselves."""
 NAMES = ("name", "motion", "label", "field", "path", "time_s")
 """Keys by which an entry of a list is told from the others, in this order."""
 SERIES = 12
@@ -173,7 +175,8 @@ def read_run(folder: Path) -> RunResults:
             data = json.loads((folder / name).read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise InputError(Issue(f"cannot be read: {error}", str(folder / name))) from None
-        for key, value in _leaves(data):
+        results = {key: value for key, value in data.items() if key not in TOLD} if isinstance(data, Mapping) else data
+        for key, value in _leaves(results):
             if isinstance(value, np.ndarray):
                 series[name, key] = value
             else:

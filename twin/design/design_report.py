@@ -15,7 +15,7 @@ from optics.design.optimiser import Design
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DesignRun, verdict
 from twin.run.artefact import CameraFile, SvgFigure, Table
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
 
 
@@ -24,11 +24,12 @@ def design_report(run: DesignRun) -> Report:
     setup, found = run.setup, run.found
     before, after = found.before, found.after
     worst = float(after.errors.max())
-    lead = (
-        verdict(run),
+    told = one_sentence(
+        *verdict(run).split(". "),
         f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
-        f"({before.errors.max():.4f} in {setup.camera.name}); its extent along the axis is "
-        f"{1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm).",
+        f"({before.errors.max():.4f} in {setup.camera.name})",
+        f"its extent along the axis is {1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm): see "
+        "the fields and the room between beams and edges",
     )
     numbers = _numbers(before, after)
     summary = Table("merit", "The camera before and after", "", ("", "before", "after"), numbers, (None, 4, 4))
@@ -37,7 +38,7 @@ def design_report(run: DesignRun) -> Report:
         "fields",
         "Wavefront error by field",
         "Waves rms, piston and tilt removed; the other half of the field is the mirror image.",
-        ("x, deg", "y, deg", "before", "after"),
+        ("x [deg]", "y [deg]", "before", "after"),
         [
             [float(x), float(y), float(b), float(a)]
             for (x, y), b, a in zip(fields, before.errors, after.errors, strict=True)
@@ -86,7 +87,7 @@ def design_report(run: DesignRun) -> Report:
         ),
     )
     facts = (("start", setup.camera.name), ("variables", str(len(found.variables))))
-    return Report(f"Design of {setup.test.name}", lead, facts, summary, sections, warnings=run.warnings)
+    return Report(f"Design of {setup.test.name}", told, (), facts, summary, sections, warnings=run.warnings)
 
 
 def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
@@ -94,11 +95,11 @@ def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
         return [name, float(of(before)), float(of(after))]
 
     return [
-        row("wavefront error, worst field, waves rms", lambda j: j.errors.max()),
-        row("wavefront error, rms over the field, waves", lambda j: np.sqrt(np.mean(j.errors**2))),
-        row("principal distance, m", lambda j: j.principal_distance),
-        row("extent along the axis, m", lambda j: j.envelope),
-        row("least clearance, m", lambda j: j.clearances.min()),
+        row("wavefront error, worst field [waves rms]", lambda j: j.errors.max()),
+        row("wavefront error, rms over the field [waves]", lambda j: np.sqrt(np.mean(j.errors**2))),
+        row("principal distance [m]", lambda j: j.principal_distance),
+        row("extent along the axis [m]", lambda j: j.envelope),
+        row("least clearance [m]", lambda j: j.clearances.min()),
     ]
 
 
@@ -112,7 +113,7 @@ def layout_figure(design: Design, start: Prescription) -> Figure:
     for one, prescription, title in zip(axes, (start, design.prescription), ("before", "after"), strict=True):
         _layout(one, design, prescription)
         one.set_title(title)
-    axes[0].set_ylabel("y, m")
+    axes[0].set_ylabel("y [m]")
     return figure
 
 
@@ -133,7 +134,7 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
         axes.plot(stand.z + sag, y, color=INK, lw=2.2)
         axes.annotate(name, (float(stand.z + sag[-1]), float(y[-1])), (4, 4), textcoords="offset points")
     axes.set_aspect("equal")
-    axes.set_xlabel("z, m")
+    axes.set_xlabel("z [m]")
     plain_axes(axes)
 
 

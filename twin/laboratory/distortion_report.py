@@ -15,9 +15,9 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_run import DistortionRun, rms
 from twin.laboratory.turntable_report import FIT_NAMES
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.artefact import FAR, Cell, SvgFigure, Table
 from twin.run.data_files import FrameFacts
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def curve_svg(run: DistortionRun) -> str:
         below.axhline(0.0, color=GREY, lw=0.8)
         above.set_title("Distortion D = L − c − f tan W + p tan² W", loc="left")
         below.set_title("Measured − true", loc="left")
-        below.set_xlabel("field angle W, deg")
+        below.set_xlabel("field angle W [deg]")
         for axes in (above, below):
             axes.set_ylabel("µm")
             _dress(axes)
@@ -128,13 +128,8 @@ def distortion_report(run: DistortionRun) -> Report:
     facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
     return Report(
         title="Interior orientation and distortion",
-        lead=(
-            f"Principal distance {data['principal_distance_mm']:.3f} ± {data['principal_distance_mm_sigma']:.3f} mm "
-            f"(truth {truth['principal_distance_mm']:.3f} mm).",
-            typeset(fit.point.statement),
-            f"Distortion is measured to {truth['error_rms_compensated_um']:.2f} µm rms with compensated angles and "
-            f"{truth['error_rms_raw_um']:.2f} µm with angles as read.",
-        ),
+        verdict=_verdict(data, truth),
+        lead=(typeset(fit.point.statement),),
         facts=(
             ("camera", f"{test.camera}, band {test.band}"),
             (
@@ -157,6 +152,20 @@ def distortion_report(run: DistortionRun) -> Report:
         images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
         image_facts=FrozenMap({f"spot-{i + 1:02d}": facts for i in numbers}),
         warnings=_warnings(run),
+    )
+
+
+def _verdict(data: Mapping[str, Any], truth: Mapping[str, Any]) -> str:
+    found, sigma = data["principal_distance_mm"], data["principal_distance_mm_sigma"]
+    ratio = abs(found - truth["principal_distance_mm"]) / sigma
+    well = "within" if ratio <= FAR else "outside"
+    with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
+    gain = "compensating them helps" if with_it < without else "compensating them does not help"
+    return one_sentence(
+        f"The principal distance is {found:.3f} ± {sigma:.3f} mm, {well} {FAR:g} σ of the truth "
+        f"({truth['principal_distance_mm']:.3f} mm, {ratio:.1f} σ)",
+        f"distortion is measured to {with_it:.2f} µm rms with compensated angles and {without:.2f} µm with angles as "
+        f"read: {gain}, see the curve and the compensation",
     )
 
 
@@ -188,23 +197,23 @@ def _summary(data: Mapping[str, Any]) -> Table:
     truth = data["truth"]
     rows: list[tuple[Cell, ...]] = [
         (
-            "principal distance, mm",
+            "principal distance [mm]",
             # six digits, which tables show of a number, are too few here
             f"{data['principal_distance_mm']:.4f}",
             data["principal_distance_mm_sigma"],
             f"{truth['principal_distance_mm']:.4f}",
         ),
         (
-            "principal point, mm",
+            "principal point [mm]",
             data["principal_point_mm"],
             data["principal_point_mm_sigma"],
             truth["principal_point_mm"],
         ),
         ("correlation of the two", data["correlation"], None, None),
-        ("residual of smooth model, raw angles, µm rms", data["rms_raw_um"], None, None),
-        ("residual of smooth model, compensated, µm rms", data["rms_compensated_um"], None, None),
-        ("error of distortion, raw angles, µm rms", truth["error_rms_raw_um"], None, None),
-        ("error of distortion, compensated, µm rms", truth["error_rms_compensated_um"], None, None),
+        ("residual of smooth model, raw angles [µm rms]", data["rms_raw_um"], None, None),
+        ("residual of smooth model, compensated [µm rms]", data["rms_compensated_um"], None, None),
+        ("error of distortion, raw angles [µm rms]", truth["error_rms_raw_um"], None, None),
+        ("error of distortion, compensated [µm rms]", truth["error_rms_compensated_um"], None, None),
     ]
     caption = (
         "f and p with compensated angles, by least squares with a constant, which is the unknown zero of the angles."
@@ -255,7 +264,7 @@ def _compensation(run: DistortionRun) -> Section:
         "distortion-reduction",
         "What compensation brings",
         "RMS over the points, and the largest.",
-        ("quantity", "raw, µm", "compensated, µm", "reduction, %", "largest raw, µm", "largest compensated, µm"),
+        ("quantity", "raw [µm]", "compensated [µm]", "reduction [%]", "largest raw [µm]", "largest compensated [µm]"),
         rows,
         (None, 2, 2, 0, 1, 1),
     )
@@ -298,10 +307,10 @@ def _estimates(run: DistortionRun) -> Section:
     text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
         "direction that is imaged to the line's middle. The middle was put on the pinhole to "
-        f"{run.truth.zero / ARCSEC:.2f}″, and the compensation at that reading has an error of its own. (2) turns such "
-        "an offset into a principal point, (3) leaves it in the distortion of every point. The constant finds it: "
-        f"{run.compensated.zero / ARCSEC:.2f}″, "
-        f"{zero:+.3f}″ from the truth.",
+        f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own. (2) "
+        "turns such an offset into a principal point, (3) leaves it in the distortion of every point. The constant "
+        f"finds it: {run.compensated.zero / ARCSEC:.2f} arcsec, "
+        f"{zero:+.3f} arcsec from the truth.",
         "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
         "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
         "own truth.",
@@ -312,8 +321,8 @@ def _estimates(run: DistortionRun) -> Section:
         "Equations (1) to (4) and fits with a constant",
         "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
         (
-            *("estimate", "f, mm", "sigma of f, mm", "error of f, mm"),
-            *("p, mm", "sigma of p, mm", "error of p, mm", "error of D, µm rms"),
+            *("estimate", "f [mm]", "sigma of f [mm]", "error of f [mm]"),
+            *("p [mm]", "sigma of p [mm]", "error of p [mm]", "error of D [µm rms]"),
         ),
         rows,
         (None, 3, 3, 3, 2, 2, 2, 2),

@@ -13,7 +13,7 @@ from twin.laboratory.focus_alignment import Alignment
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_plots import defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.run.artefact import SvgFigure, Table, fixed
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 
@@ -23,10 +23,14 @@ def focus_report(alignment: Alignment) -> Report:
     bench = alignment.bench
     data = focus_numbers(alignment)
     end = data["rounds"][-1]
-    lead = (
+    true, chips = data["truth"]["rounds"][-1]["confocal_um_max"], end["chips_um_rms"]
+    verdict = one_sentence(
         f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
-        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} µm from best focus, in every "
-        f"field and band, and the line to {abs(end['line_level_arcmin']):.2f}′ of level.",
+        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} ± "
+        f"{end['confocal_um_sigma']:.1f} µm from best focus (truly {true:.1f} µm), in every "
+        f"field and band, and the line to {abs(end['line_level_arcmin']):.2f} arcmin of level",
+        f"the CCDs do not stand in one plane, by {chips:.1f} µm rms, which no shim takes away" if chips > 0.0 else "",
+        "see the rounds of the alignment and the MTF",
     )
     images = {
         f"{bench.sites[i].band}_field{k}_{edge}": scan.frames[edge]
@@ -36,7 +40,8 @@ def focus_report(alignment: Alignment) -> Report:
     }
     return Report(
         f"Focal-plane alignment of {bench.setup.camera.name}",
-        lead,
+        verdict,
+        (),
         _facts(alignment),
         _summary(data),
         (_alignment_section(alignment), _mtf_section(alignment, data), _shim_section(alignment)),
@@ -104,7 +109,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
         "alignment",
         "Before and after",
         "Confocal error: largest distance of any CCD from best focus, over all fields and bands.",
-        ("", "confocal error, µm", "true", "line level, arcmin", "true"),
+        ("", "confocal error [µm]", "true", "line level [arcmin]", "true"),
         rows,
     )
 
@@ -219,10 +224,10 @@ def _shim_section(alignment: Alignment) -> Section:
                 f"Shims of round {number + 1}",
                 "Changes of thickness under each hole; their sigma has in it that the sites do not lie on one plane "
                 f"({UM * shimming.plane.extra_sigma:.1f} µm rms: chips, curvature of field). The turn in the mounting "
-                f"surface of {fixed(plan.turn / ARCMIN, 2)}′ is set by hand; without it the line would be off level by "
-                f"{fixed(plan.level_coupling / ARCMIN, 2)}′, "
+                f"surface of {fixed(plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off "
+                f"level by {fixed(plan.level_coupling / ARCMIN, 2)} arcmin, "
                 "since the mounting surface is not parallel to the focal plane.",
-                ("hole", "change, µm", "ground, µm", "new shim, µm", "slide, mm"),
+                ("hole", "change [µm]", "ground [µm]", "new shim [µm]", "slide [mm]"),
                 rows,
             )
         )

@@ -12,7 +12,7 @@ from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.turntable_numbers import turntable_numbers
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import SvgFigure, Table
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def comparison_figure(run: TurntableRun) -> Figure:
     bottom.plot(angle, series.rms_before / ARCSEC, "o-", color=GREY, ms=3.5, lw=0.9, label="all repeats")
     bottom.plot(angle, series.rms_after / ARCSEC, "o-", color=BLUE, ms=3.5, lw=0.9, label="after Chauvenet's criterion")
     bottom.axhline(series.averaging_alone / ARCSEC, color=INK, lw=0.8, ls="--", label="averaging alone, largest")
-    bottom.set(title="RMS of single comparisons", ylabel="arcsec", xlabel="reading of the table, deg")
+    bottom.set(title="RMS of single comparisons", ylabel="arcsec", xlabel="reading of the table [deg]")
     bottom.set_ylim(0.0, 1.35 * float(np.max(series.rms_before)) / ARCSEC)
     bottom.legend(loc="upper right", ncols=3)
     _finish(top, bottom)
@@ -85,7 +85,7 @@ def curve_figure(run: TurntableRun) -> Figure:
             capsize=1.5,
             label=f"{label}, mean ± σ",
         )
-    axes.set(title="Dividing error, reading − true angle", ylabel="arcsec", xlabel="reading of the table, deg")
+    axes.set(title="Dividing error, reading − true angle", ylabel="arcsec", xlabel="reading of the table [deg]")
     axes.margins(x=0.01, y=0.12)
     axes.legend(loc="best", ncols=2)
     _finish(axes)
@@ -116,10 +116,10 @@ def residual_figure(run: TurntableRun) -> Figure:
             lw=0.7,
         )
         rms = float(np.sqrt(np.mean(residual**2))) / ARCSEC
-        axes.set_title(f"{FIT_NAMES[name]}: {rms:.4f}″ RMS at the held-out readings", loc="left")
+        axes.set_title(f"{FIT_NAMES[name]}: {rms:.4f} arcsec RMS at the held-out readings", loc="left")
         axes.set_ylabel("arcsec")
         axes.set_ylim(-most, most)
-    panels[-1].set_xlabel("reading of the table, deg")
+    panels[-1].set_xlabel("reading of the table [deg]")
     panels[-1].margins(x=0.01)
     _finish(*panels)
     return figure
@@ -159,7 +159,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         f"Chauvenet's criterion rejects {series.rejected} of {series.comparisons.size} comparisons. It would reject "
         f"{result['rejected_expected_of_good']:.0f} on average if all were good: it trims normal noise, and the RMS "
         f"that remains is that of trimmed readings. All angles together, corrected for this, one comparison has "
-        f"σ = {result['repeatability_arcsec']:.4f}″.",
+        f"σ = {result['repeatability_arcsec']:.4f} arcsec.",
     ]
     if result["suspect_angles"]:
         text.append(
@@ -199,16 +199,16 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     periods = run.spec.calibration.step / subdivision.period
     text = [
         f"Five fits of the means, ranked at {len(run.held_out.angle)} held-out readings in the middle of the steps, "
-        f"measured in a series of their own with σ = {result['heldout_sigma_arcsec']:.4f}″ each. Cross-validation "
-        f"on the calibration points alone chooses the {FIT_NAMES[chosen]}; it has {held:.4f}″ at the held-out "
-        "readings." + ("" if best == chosen else f" There the {FIT_NAMES[best]} is the best.")
+        f"measured in a series of their own with σ = {result['heldout_sigma_arcsec']:.4f} arcsec each. "
+        f"Cross-validation on the calibration points alone chooses the {FIT_NAMES[chosen]}; it has {held:.4f} arcsec "
+        "at the held-out readings." + ("" if best == chosen else f" There the {FIT_NAMES[best]} is the best.")
     ]
     if abs(periods - round(periods)) < 1e-6:
         text.append(
             f"A step of the calibration is {round(periods)} whole periods of the grating's signal "
-            f"({subdivision.period / ARCSEC:.4g}″), so that all calibration points lie at one phase and cannot see the "
-            "subdivision error. The held-out readings lie at all phases, as the readings in use do: what no fit can "
-            "follow is in their residuals."
+            f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and cannot "
+            "see the subdivision error. The held-out readings lie at all phases, as the readings in use do: what no "
+            "fit can follow is in their residuals."
         )
     for name, failure in result["failed"].items():
         text.append(f"The {FIT_NAMES[name]} failed: {failure}.")
@@ -259,11 +259,12 @@ def turntable_report(run: TurntableRun) -> Report:
     chosen = data["chosen"]
     held = data["fits"][chosen]["heldout_rms_arcsec"]
     best = data["ranking"][0]
-    also = "" if best == chosen else f" There the {FIT_NAMES[best]} is the best of the five."
-    lead = (
-        f"Repeats scatter by {data['repeat_rms_arcsec']:.3f}″ RMS at worst, {data['chauvenet_rms_arcsec']:.3f}″ after "
-        f"Chauvenet's criterion. Cross-validation chooses the {FIT_NAMES[chosen]}, which misses held-out angles by "
-        f"{held:.3f}″ RMS.{also}",
+    also = "" if best == chosen else f"there the {FIT_NAMES[best]} is the best of the five"
+    verdict = one_sentence(
+        f"Cross-validation chooses the {FIT_NAMES[chosen]}, which misses held-out angles by {held:.3f} arcsec RMS",
+        also,
+        f"repeats scatter by {data['repeat_rms_arcsec']:.3f} arcsec RMS at worst, {data['chauvenet_rms_arcsec']:.3f} "
+        "arcsec after Chauvenet's criterion, see what the fits miss",
     )
     rows = [
         ("repeats, largest RMS of an angle", _text(data["repeat_rms_arcsec"])),
@@ -279,7 +280,8 @@ def turntable_report(run: TurntableRun) -> Report:
     ]
     return Report(
         "Dividing error of the turntable",
-        lead,
+        verdict,
+        (),
         (
             (
                 "Calibration",

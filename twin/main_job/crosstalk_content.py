@@ -14,7 +14,7 @@ from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import body_name
 from twin.main_job.report_labels import PARAMETERS
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
-from twin.run.artefact import SAME, fixed, plain, significant
+from twin.run.artefact import SAME, SYMBOLS, fixed, plain, shown_unit, significant
 
 WRONG = 0.1
 """A reading that departs from the truth by more than this part of it is marked ..."""
@@ -71,7 +71,7 @@ def _row(table: CameraCrosstalk, k: int, columns: list[list[tuple[str, str]]], f
         for _, estimator in columns[p]:
             reading = float(table.readings[estimator][p, k])
             cells.append({"text": significant(reading), "true": False, "wrong": is_wrong(reading, true, floors[p])})
-    return {"label": _short(motion.label), "unit": motion.unit.replace("um", "µm"), "cells": cells}
+    return {"label": _short(motion.label), "unit": shown_unit(motion.unit), "cells": cells}
 
 
 def _short(label: str) -> str:
@@ -135,13 +135,13 @@ def _factor(table: CameraCrosstalk, estimator: str, parameter: str) -> float:
 
 
 def statements(run: RenderRun) -> list[dict[str, Any]]:
-    """What kinds of focal-length change the spots see, and what they cannot tell apart."""
+    """What kinds of focal-length change the spots see, and how many motions they can tell apart."""
     out = []
     for name, table in run.crosstalk.items():
         labels = [f"{m.label} [{m.unit}]" for m in table.motions] + [m.label for m in table.motions]
-        statements = [_split(s, labels) for s in table.observability.statements]
+        first = _split(table.observability.statements[0], labels)
         focal = [_split(s, labels) for s in table.focal_length_statements()]
-        out.append({"name": name, "focal": focal, "first": statements[0]["text"], "motions": statements[1:]})
+        out.append({"name": name, "focal": focal, "first": first["text"]})
     return out
 
 
@@ -157,13 +157,10 @@ def _split(text: str, labels: list[str]) -> dict[str, str]:
 
 
 _TYPESET = (
-    ("d_alpha", "Δα"),
-    ("d_beta", "Δβ"),
-    ("d_gamma", "Δγ"),
-    ("d_f", "Δf"),
+    *SYMBOLS.items(),
     (" um", " µm"),
     ("[um]", "[µm]"),
-    ('"', "″"),
+    ('"', " arcsec"),
 )
 
 

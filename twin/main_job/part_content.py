@@ -12,8 +12,10 @@ from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import PARAMETERS
-from twin.monitor.image_quality import PLACES, CameraQuality
+from twin.main_job.verdict import sharpness_lost
+from twin.monitor.image_quality import PLACES, CameraQuality, ImageQuality
 from twin.monitor.time_series import TimeSeries
+from twin.path_tracing.families import Touch, family_name
 from twin.path_tracing.path_result import Family
 from twin.run.artefact import FAR, MINUS, decimals_for, fixed, plain, residual, residual_text, significant
 from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
@@ -109,6 +111,7 @@ def quality_content(run: RenderRun) -> dict[str, Any] | None:
         return None
     where = {place: quality.fields.index(field) for place, field in PLACES.items()}
     return {
+        "lost": _lost(quality),
         "wavelength": plain(1e9 * quality.wavelength),
         "fields": len(quality.fields),
         "places": list(where),
@@ -116,6 +119,13 @@ def quality_content(run: RenderRun) -> dict[str, Any] | None:
         "bodies": {name: ", ".join(camera.bodies) for name, camera in quality.cameras.items()},
         "rows": [_camera(name, camera, where) for name, camera in quality.cameras.items()],
     }
+
+
+def _lost(quality: ImageQuality) -> str:
+    share, where, change = sharpness_lost(quality)
+    if share <= 0.0:
+        return "The perturbation takes nothing of the MTF at Nyquist."
+    return f"At most {significant(100.0 * share, 2, floor=0.0)} % of the MTF at Nyquist are lost, {where}: {change}."
 
 
 def _camera(name: str, camera: CameraQuality, where: dict[str, int]) -> dict[str, Any]:
@@ -165,6 +175,7 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
         name = f"{channel.key}/area_ccd"
         families = [pair for pair in after.traced.relative(channel.key) if pair[0].detector == name]
         families.sort(key=lambda pair: -pair[1])
+        nominal = after.traced.runs[channel.key].nominal(name).touches
         by_kind = {kind: sum(share for f, share in families if f.kind == kind) for kind in ("ghost", "stray")}
         rows.append(
             {
@@ -173,7 +184,7 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
                 "ghosts": significant(by_kind["ghost"]),
                 "scattered": significant(by_kind["stray"]),
                 "peak": significant(float(after.photons[i].max())),
-                "families": [_family(f, share, name) for f, share in families[:STRONGEST]],
+                "families": [_family(f, share, name, nominal) for f, share in families[:STRONGEST]],
             }
         )
     taken = [
@@ -183,13 +194,14 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
     return {"paths": f"{after.paths:,}".replace(",", "\N{THIN SPACE}"), "rows": rows, "taken": taken}
 
 
-def _family(family: Family, share: float, detector: str) -> dict[str, str]:
+def _family(family: Family, share: float, detector: str, nominal: tuple[Touch, ...]) -> dict[str, str]:
     x, y = (fixed(1e6 * c, 1) for c in family.centroid)
     way = [str(touch) for touch in family.touches]
     common = _common(way)
     text = " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)
     return {
         "kind": family.kind,
+        "name": family_name(family.touches, nominal),
         "share": significant(share),
         "x": x,
         "y": y,

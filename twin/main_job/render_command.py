@@ -14,13 +14,15 @@ from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
-from twin.main_job.render_report import write_report
-from twin.main_job.render_results import PROGRAM, RenderRun, stated
+from twin.main_job.render_report import PICTURES, write_report
+from twin.main_job.render_results import PROGRAM, RenderRun
+from twin.main_job.report_labels import ANGLE, PARAMETERS, Parameter
 from twin.main_job.summary_plot import write_summary
+from twin.main_job.verdict import judge, recovered_numbers
 from twin.pictures.picture import write_pictures
 from twin.pictures.picture_light import PictureError
 from twin.pictures.scene_file import write_scene
-from twin.run.cli import print_whole, result_table
+from twin.run.cli import print_verdict, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings
 from twin.run.further_sections import further_sections
 from twin.run.page import write_artefacts
@@ -30,13 +32,8 @@ from twin.targets.edge_images import DIRECTIONS
 from twin.targets.target_images import PLACES
 from twin.targets.target_result import EdgeReading, TargetRun
 
-LABELS = {
-    "d_alpha_arcsec": ('d_alpha "', 4),
-    "d_beta_arcsec": ('d_beta "', 4),
-    "d_gamma_arcsec": ('d_gamma "', 3),
-    "d_f_um": ("d_f um", 2),
-}
-"""How the terminal's table names a parameter, and its decimals."""
+DECIMALS = {"d_alpha_arcsec": 4, "d_beta_arcsec": 4, "d_gamma_arcsec": 3, "d_f_um": 2, ANGLE.key: 4}
+"""Of a parameter in the terminal's table."""
 
 _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
 """How the terminal names the direction in which the MTF is measured."""
@@ -72,7 +69,6 @@ def _write(run: RenderRun, session: Session, picture: bool) -> str:
     folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
     sections = further_sections("render", run)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
-    folder.write_with("report.html", lambda file: write_report(run, file, sections))
     folder.write_with("summary.png", lambda file: write_summary(run, file))
     problem = ""
     if picture:
@@ -81,14 +77,18 @@ def _write(run: RenderRun, session: Session, picture: bool) -> str:
             write_pictures(instrument, session.backend, run.state, write, run.seed, session.advance)
         except PictureError as error:  # what took minutes to compute is not thrown away for a picture
             problem = f"the pictures are not complete: {error}"
-    entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": list(run.warnings)}
+    scene = (folder.path / "scene.glb").read_bytes()
+    pictures = [place for name in PICTURES if (place := folder.path / name).exists()]
+    folder.write_with("report.html", lambda file: write_report(run, file, sections, scene, pictures))
+    warnings = list(judge(run).warnings)
+    entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
     write_manifest(folder, PROGRAM, session.started, seconds, **entries)
     return problem
 
 
 def _numbers(run: RenderRun) -> dict[str, Any]:
     """What ``--json`` prints: contents of the files with the main results, by their kind."""
-    parts = {"truth": run.truth_dict(), "recovered": stated(run.recovered_dict())}
+    parts = {"truth": run.truth_dict(), "recovered": recovered_numbers(run)}
     if run.series is not None:
         parts["course"] = run.series.to_dict()
     if run.targets is not None:
@@ -97,24 +97,21 @@ def _numbers(run: RenderRun) -> dict[str, Any]:
 
 
 def _print_result(run: RenderRun, console: Console) -> None:
-    """Result table and what to bear in mind."""
+    """The verdict, the result table and what to bear in mind."""
+    told = judge(run)
+    print_verdict(console, told.verdict)
     print_whole(console, _table(run))
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:
             console.print(lines)
-    console.print(
-        "The model assumes that only the line CCD moves and the optics scale; other motions read as these: "
-        "see crosstalk in the report.",
-        style="dim",
-    )
     if run.series is not None:
         count, ends = len(run.series.times), [moment(float(run.series.times[k])) for k in (0, -1)]
         console.print(
             f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
             highlight=False,
         )
-    print_warnings(console, run.warnings)
+    print_warnings(console, told.warnings)
 
 
 def _mtf_table(targets: TargetRun) -> Table | None:
@@ -152,25 +149,27 @@ def _table(run: RenderRun) -> Table:
     if run.series is not None:
         title += f"\nat {moment(float(run.series.times[run.series.shown]))} of the course"
     table = result_table(title)
+    table.padding = 0
     table.add_column("", no_wrap=True)
     names = (name.replace("_", "\n") for name in ESTIMATORS)
     heads = ("true", *names, "sigma", "model\n- true", "in\nsigma")
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
 
-    def add(label: str, key: str, decimals: int, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
-        model, sigma = estimators["model"][key], estimators["model"][f"{key}_sigma"]
-        values = [true, *(estimators[name][key] for name in ESTIMATORS), sigma]
+    def add(p: Parameter, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
+        decimals = DECIMALS[p.key]
+        model, sigma = estimators["model"][p.key], estimators["model"][f"{p.key}_sigma"]
+        values = [true, *(estimators[name][p.key] for name in ESTIMATORS), sigma]
         # adding 0.0 after rounding leaves no minus before a zero
         cells = [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in values]
+        label = escape(f"{p.symbol} [{p.unit}]")
         table.add_row(label, *cells, f"{model - true:+.{decimals}f}", f"{(model - true) / sigma:+.1f}")
 
     for camera, estimators in recovered["cameras"].items():
         table.add_row(f"[bold]{escape(camera)}[/]")
-        for key, (label, decimals) in LABELS.items():
-            add(label, key, decimals, truth["cameras"][camera][key], estimators)
+        for p in PARAMETERS:
+            add(p, truth["cameras"][camera][p.key], estimators)
     if "intersection_angle" in truth:
-        true = truth["intersection_angle"]["change_arcsec"]
         table.add_row("[bold]both[/]")
-        add('angle "', "change_arcsec", 4, true, recovered["intersection_angle"])
+        add(ANGLE, truth["intersection_angle"][ANGLE.key], recovered["intersection_angle"])
     return table

@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.channel import Channel
-from twin.main_job.render_results import RenderRun, quality_dict, stated
+from twin.main_job.render_results import RenderRun, quality_dict
+from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
 from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
@@ -29,7 +30,7 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
     channels = run.experiment.path.channels
     folder.write_text("config.yaml", run.resolved.to_yaml())
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
-    recovered = stated(run.recovered_dict())
+    recovered = recovered_numbers(run)
     for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
         _write_numbers(folder, kind, data)
     for i, channel in enumerate(channels):

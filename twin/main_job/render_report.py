@@ -2,42 +2,69 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import cv2
 from markupsafe import Markup
 
 from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job import crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.light_path_plots import footprints_svg, side_view_svg
+from twin.main_job.motion_map import motion_map_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
+from twin.main_job.report_tables import report_tables, setup_tables
 from twin.main_job.series_plots import parameters_svg, temperatures_svg
 from twin.main_job.spot_plots import residuals_svg, spots_svg
 from twin.main_job.target_plots import curves_svg, images_svg, pupils_svg
+from twin.main_job.verdict import judge
 from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.viewer import viewer_markup, viewer_scripts
 from twin.run.artefact import FAR
-from twin.run.page import environment, reproduce, section_contents
+from twin.run.page import artefact_content, environment, reproduce, section_contents
 from twin.run.report import Section
 from twin.run.versions import versions
 
 __all__ = ["render_report", "write_report"]
 
 TEMPLATE = "report.html.j2"
+PICTURES = {
+    "picture.png": "The instrument",
+    "picture_prisms.png": "The central prism and what is next to it",
+    "picture_focal_plane.png": "The detectors of the first camera",
+}
+"""What the rendered pictures show."""
+JPEG_QUALITY = 88
 NUMBERS = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
 
 
-def write_report(run: RenderRun, place: Path, sections: Sequence[Section] = ()) -> None:
+def write_report(
+    run: RenderRun,
+    place: Path,
+    sections: Sequence[Section] = (),
+    scene: bytes | None = None,
+    pictures: Sequence[Path] = (),
+) -> None:
     """Write the report of a run.
 
     Args:
         run: the run.
         place: the HTML file.
         sections: beside the report's own.
+        scene: contents of scene.glb, for the view that can be turned; None leaves it out.
+        pictures: files in PICTURES that were rendered.
     """
-    place.write_text(render_report(run, sections), encoding="utf-8")
+    place.write_text(render_report(run, sections, scene, pictures), encoding="utf-8")
 
 
-def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
+def render_report(
+    run: RenderRun,
+    sections: Sequence[Section] = (),
+    scene: bytes | None = None,
+    pictures: Sequence[Path] = (),
+) -> str:
     """The page as text."""
     experiment, backend = run.experiment, run.experiment.backend.name
     paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
@@ -47,6 +74,7 @@ def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
     figures = {
         "spots": {name: Markup(spots_svg(run, name)) for name in names},
         "residuals": Markup(residuals_svg(report_content.residual_panels(tables), titles)),
+        "motions": Markup(motion_map_svg(run)),
         "side": Markup(side_view_svg(experiment.instrument, paths)),
         "footprints": Markup(footprints_svg(experiment.instrument, paths)),
     }
@@ -61,8 +89,17 @@ def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
     if run.quality is not None and run.quality.obstruction:
         figures["pupils"] = Markup(pupils_svg(run.quality))
     template = environment(__package__).get_template(TEMPLATE)
+    told, setup = judge(run), report_content.setup(run)
+    csvs = {name: artefact_content(table, None) for name, table in (report_tables(run) | setup_tables(setup)).items()}
     return template.render(
-        setup=report_content.setup(run),
+        title=f"{run.resolved.instrument.name}: what its monitor sees, and what it makes of it",
+        verdict=told.verdict,
+        warnings=told.warnings,
+        setup=setup,
+        csvs=csvs,
+        viewer=viewer_markup(", ".join(p["node"] for p in setup["perturbations"])) if scene else "",
+        scripts=viewer_scripts(scene) if scene else "",
+        pictures=[_picture(picture) for picture in pictures],
         course=part_content.series_content(run),
         stray=part_content.stray_content(run),
         targets=part_content.target_content(run),
@@ -88,3 +125,13 @@ def render_report(run: RenderRun, sections: Sequence[Section] = ()) -> str:
         versions=versions(),
         backend=backend,
     )
+
+
+def _picture(place: Path) -> dict[str, Any]:
+    """A rendered picture for the page, a fifth of the file's size."""
+    image = cv2.imread(str(place))
+    ok, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not ok:
+        raise OSError(f"the picture {place.name} cannot be encoded as JPEG")
+    address = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+    return {"name": place.name, "about": PICTURES[place.name], "address": address}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from twin.run.artefact import SYMBOLS
+
 PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001"
 
 
@@ -18,11 +20,16 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter("d_alpha_arcsec", "Δα", "arcsec", "rotation of the line of sight about Y, the line CCD"),
-    Parameter("d_beta_arcsec", "Δβ", "arcsec", "rotation of the line of sight about X, the flight direction"),
-    Parameter("d_gamma_arcsec", "Δγ", "arcsec", "rotation of the imaged line about the line of sight"),
-    Parameter("d_f_um", "Δf", "µm", "change of the principal distance"),
+    Parameter("d_alpha_arcsec", SYMBOLS["d_alpha"], "arcsec", "rotation of the line of sight about Y, the line CCD"),
+    Parameter(
+        "d_beta_arcsec", SYMBOLS["d_beta"], "arcsec", "rotation of the line of sight about X, the flight direction"
+    ),
+    Parameter("d_gamma_arcsec", SYMBOLS["d_gamma"], "arcsec", "rotation of the imaged line about the line of sight"),
+    Parameter("d_f_um", SYMBOLS["d_f"], "µm", "change of the principal distance"),
 )
+
+ANGLE = Parameter("change_arcsec", "Δθ", "arcsec", "change of the angle between the two lines of sight")
+"""Of two cameras together."""
 
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",

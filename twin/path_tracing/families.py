@@ -112,4 +112,80 @@ def touches(scenery: Scenery, codes: tuple[int, ...]) -> tuple[Touch, ...]:
     return tuple(out)
 
 
-__all__ = ["MARKS", "OUTSIDE", "Touch", "nominal_codes", "touches"]
+_COUNTS = {1: "single", 2: "double", 3: "triple"}
+_SAID = {
+    Event.DIFFUSE: "diffused by",
+    Event.SCATTER: "scattered by",
+    Event.SCATTER_THROUGH: "scattered through",
+    Event.REFLECT: "off",
+    Event.TRANSMIT: "through",
+}
+
+
+def family_name(family: tuple[Touch, ...], nominal: tuple[Touch, ...]) -> str:
+    """How a family differs from the nominal one, in a few words: ``prism_0 exit, entry: double, on the way back``.
+
+    First come the reflections at faces that nominal light passes, and how many they are, then what is scattered and
+    what else is met, then on which side of the nominal turning point it happens, or that this is not reached.
+
+    Args:
+        family: its events in order; empty when nobody looked them up.
+        nominal: those of the nominal family of the same detector.
+    """
+    if not family:
+        return "not looked up"
+    usual = {(touch.part, touch.event) for touch in nominal}
+    parts = {touch.part for touch in nominal}
+    ghosts, others, places = [], [], []
+    for place, touch in enumerate(family):
+        name = _short(touch.part, nominal)
+        known = (touch.part, touch.event) in usual
+        if known and not touch.outside:
+            continue
+        places.append(place)
+        if touch.event == Event.REFLECT and touch.part in parts and not known:
+            ghosts.append(name + " outside its aperture" * touch.outside)
+        else:
+            others.append(f"{_SAID[touch.event]} {name}" + " outside its aperture" * touch.outside)
+    said = []
+    if ghosts:
+        said.append(f"{_joined(ghosts)}: {_COUNTS.get(len(ghosts), f'{len(ghosts)}-fold')}")
+    said += dict.fromkeys(others)
+    if not said:
+        return "the nominal surfaces in another order"
+    # light comes back from the one surface that the nominal way meets in its middle
+    turn = nominal[len(nominal) // 2].part
+    turns = [place for place, touch in enumerate(family) if touch.part == turn]
+    if not turns:
+        said.append(f"without {_short(turn, nominal)}")
+    elif places[-1] < turns[0]:
+        said.append("on the way out")
+    elif places[0] > turns[-1]:
+        said.append("on the way back")
+    return ", ".join(said)
+
+
+def _short(part: str, nominal: tuple[Touch, ...]) -> str:
+    """A part's name without what the nominal way's own parts have in common: ``prism_0 exit``, ``M1``."""
+    own = {touch.part.rpartition("/")[0] for touch in nominal}
+    camera = nominal[0].part.partition("/")[0] + "/"
+    for holder in sorted(own, key=len, reverse=True):
+        channel = holder.rpartition("/")[0] + "/"
+        if "/" in holder and part.startswith(channel):
+            part = part.removeprefix(channel)
+            break
+    return part.removeprefix(camera).replace("/", " ")
+
+
+def _joined(names: list[str]) -> str:
+    """``prism_0 exit, entry``: the body once, where the same one follows."""
+    out: list[str] = []
+    last = ""
+    for name in names:
+        body, _, face = name.partition(" ")
+        out.append(face if face and body == last else name)
+        last = body
+    return ", ".join(out)
+
+
+__all__ = ["MARKS", "OUTSIDE", "Touch", "family_name", "nominal_codes", "touches"]

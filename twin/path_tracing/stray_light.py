@@ -17,6 +17,7 @@ from scipy.signal import fftconvolve
 from optics.geometry.tree import State
 from optics.waves.diffraction import Grid, image
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.path_tracing.families import Touch, family_name
 from twin.path_tracing.path_result import Family
 from twin.path_tracing.stray_rays import StrayResult, trace_stray
 
@@ -51,8 +52,9 @@ class StrayLight:
         for channel, run in self.traced.runs.items():
             families = sorted(self.traced.relative(channel), key=lambda pair: -pair[1])[:FAMILIES]
             balance = run.balance
+            nominal = run.nominal(f"{channel}/area_ccd").touches
             out[channel] = {
-                "families": [_family(family, share) for family, share in families],
+                "families": [_family(family, share, nominal) for family, share in families],
                 "balance": {
                     "emitted": balance.emitted,
                     "absorbed": dict(balance.absorbed),
@@ -65,10 +67,11 @@ class StrayLight:
         return {"paths_per_source": self.paths, "sources": out}
 
 
-def _family(family: Family, share: float) -> dict[str, Any]:
+def _family(family: Family, share: float, nominal: tuple[Touch, ...]) -> dict[str, Any]:
     return {
         "detector": family.detector,
         "kind": family.kind,
+        "name": family_name(family.touches, nominal),
         "surfaces": [str(touch) for touch in family.touches],
         "relative_to_nominal": share,
         "paths": family.count,

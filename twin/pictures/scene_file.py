@@ -4,20 +4,26 @@ The scene is in the base frame, in metres (X = flight direction, Y = along the l
 body of the tree is a node whose name is the body's path; a viewer shows the tree as the twin has it. Mirrors have their
 true shape and clear aperture; figure errors, far too small to be seen, are left out. What has no size of its own
 (board, reticle) is given one that is easy to see; the light-sensitive faces are to scale.
+
+The scene's ``extras`` hold ``motions``: body -> how it moved in its parent, so that a viewer can exaggerate it. k times
+the motion is the matrix ``nominal`` (column by column) times the turn by k ``rotate`` (rotation vector, radians) about
+``pivot`` and the shift by k ``shift``, metres, in the body's own nominal frame.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import assert_never
+from typing import Any, assert_never
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 from trimesh.visual.material import PBRMaterial
 
 from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.pose import Pose
 from optics.geometry.solid import solid_mesh
-from optics.geometry.tree import State
+from optics.geometry.tree import AT_REST, PlacedBodies, State
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
 from scenes.specs.baffle import Plate
@@ -33,6 +39,9 @@ SHEET = 0.001
 TUBE = 0.0015
 TUBE_SIDES = 5
 """Radius of drawn rays, metres, and their number of sides."""
+
+LEAST_MOTION = 1e-12
+"""Radians and metres below which a body did not move but for rounding."""
 
 _WORLD = "world"
 
@@ -69,7 +78,45 @@ def write_scene(experiment: MonitorExperiment, state: State, place: Path) -> Non
         place: the file, ``scene.glb``.
     """
     paths = trace_light_paths(experiment.instrument, experiment.backend, state)
-    place.write_bytes(build_scene(experiment.instrument, paths).export(file_type="glb"))
+    scene = build_scene(experiment.instrument, paths)
+    scene.metadata["motions"] = motions(experiment.instrument, state, paths.placed)
+    place.write_bytes(scene.export(file_type="glb"))
+
+
+def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
+    """Body -> its motion against its parent, as the scene's ``extras`` hold it; bodies at rest are left out.
+
+    Args:
+        instrument: the instrument.
+        state: what is perturbed, for the pivots.
+        placed: its bodies in that state.
+    """
+    nominal = instrument.assembly.place()
+    out = {}
+    for body in instrument.assembly.tree.bodies:
+        rest, moved = (_in_parent(body.path, where) for where in (nominal, placed))
+        change = rest.inverse() @ moved
+        pivot = np.array(body.pivots[state.get(body.path, AT_REST).pivot])
+        rotate = Rotation.from_matrix(change.rotation).as_rotvec()
+        shift = change.apply(pivot) - pivot
+        if max(np.abs(rotate).max(), np.abs(shift).max()) > LEAST_MOTION:
+            vectors = {"rotate": rotate, "shift": shift, "pivot": pivot}
+            numbers = {name: [float(number) for number in vector] for name, vector in vectors.items()}
+            out[body.path] = {"nominal": [float(number) for number in _matrix(rest).T.ravel()], **numbers}
+    return out
+
+
+def _in_parent(path: str, placed: PlacedBodies) -> Pose:
+    """A body's pose relative to its parent, or to the world."""
+    parent = path.rpartition("/")[0]
+    pose = placed.pose(path)
+    return placed.pose(parent).inverse() @ pose if parent else pose
+
+
+def _matrix(pose: Pose) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
+    return matrix
 
 
 def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -> trimesh.Scene:
@@ -79,10 +126,7 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
     placed = paths.placed
     for body in instrument.assembly.tree.bodies:
         parent = body.parent or _WORLD
-        pose = placed.pose(body.path)
-        relative = placed.pose(body.parent).inverse() @ pose if body.parent else pose
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = relative.rotation, relative.translation
+        matrix = _matrix(_in_parent(body.path, placed))
         scene.graph.update(body.path, parent, matrix=matrix)
         mesh = meshes.get(body.path)
         if mesh is not None:

@@ -15,8 +15,17 @@ from twin.run.data_files import csv_table
 MINUS = "\N{MINUS SIGN}"
 SAME = 1e-6
 """Below this a number per unit motion (arcsec, um) is rounding and is shown as 0."""
+SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
+"""How tables, figures and sentences call the changes of a camera; units stand in brackets: Δα [arcsec], Δf [µm], with
+the micro sign. Keys of files are plain letters with the unit at the end: d_alpha_arcsec, d_f_um.
+"""
 FAR = 3.0
 """Residuals beyond this many sigma are marked."""
+
+
+def shown_unit(unit: str) -> str:
+    """A unit as reports write it, of its name in files: ``µm`` of ``um``."""
+    return unit.replace("um", "µm")
 
 
 def _typeset(text: str) -> str:
@@ -190,6 +199,11 @@ class Table(Artefact):
             if len(row) != len(self.heads):
                 raise ValueError(f"artefact {self.name!r}: a row of {len(row)} cells under {len(self.heads)} heads")
         return csv_table([self.heads, *self.rows])
+
+    @property
+    def address(self) -> str:
+        """The table as a data address: a page can hand it out without a file beside it."""
+        return "data:text/csv;charset=utf-8;base64," + base64.b64encode(self.content()).decode("ascii")
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,6 +196,11 @@ def print_place(console: Console, target: Path) -> None:
     console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
+def print_verdict(console: Console, verdict: str) -> None:
+    """The sentence that a result begins with."""
+    console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
+
+
 def ending_signals() -> tuple[signal.Signals, ...]:
     """Signals that ask the program to end, Ctrl-C aside. SIGHUP does not when ``nohup`` has started it."""
     asked = (signal.SIGTERM, signal.SIGHUP)

@@ -30,6 +30,7 @@ from twin.run.cli import (
     exit_on_terminate,
     explained,
     print_place,
+    print_verdict,
     print_whole,
     progress_columns,
     result_table,
@@ -212,7 +213,8 @@ def run_test(
         procedure, report = load()
         number = setup.test.seed if options.seed is None else options.seed
         run, given = procedure.performed(setup, session.backend, number, session.advance)
-        numbers, shown = procedure.numbers(run), with_warnings(report(run), given)
+        shown = with_warnings(report(run), given)
+        numbers = {**procedure.numbers(run), "verdict": shown.verdict}
         config, name = setup.with_seed(number).to_yaml(), session.backend.name
         drawn = number if procedure.seeded else None
         facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
@@ -223,9 +225,10 @@ def run_test(
 
 
 def print_report(report: Report, console: Console) -> None:
-    """The main table of a report, and what was found."""
+    """The verdict, the main table of a report, and what else was found."""
     from twin.run.page import cell_text
 
+    print_verdict(console, report.verdict)
     summary = report.summary
     table = result_table(report.title)
     for k, head in enumerate(summary.heads):

@@ -36,12 +36,14 @@ def reproduce(*words: str) -> str:
 def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
     """An artefact, and the file that holds it, for the macro ``show``."""
     out: dict[str, Any] = {
+        "name": artefact.name,
         "title": artefact.title,
         "caption": artefact.caption,
         "file": file,
         "svg": None,
         "image": None,
         "table": None,
+        "csv": None,
     }
     if isinstance(artefact, SvgFigure):
         # drawn by this program, not by a user
@@ -52,6 +54,7 @@ def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
         rows = [[cell_text(value) for value in row] for row in artefact.shown()]
         texts = [all(isinstance(row[k], str) for row in artefact.rows) for k in range(len(artefact.heads))]
         out["table"] = {"heads": artefact.heads, "rows": rows, "texts": texts}
+        out["csv"] = artefact.address
     elif not isinstance(artefact, Data):
         raise TypeError(f"the report cannot show {type(artefact).__name__}")
     return out
@@ -128,6 +131,9 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
         .get_template(TEMPLATE)
         .render(
             kind=kind,
+            title=report.title,
+            verdict=report.verdict,
+            warnings=report.warnings,
             report=report,
             summary=artefact_content(report.summary, place(report.summary)),
             sections=section_contents(report.sections),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -27,13 +28,22 @@ class Section:
     artefacts: tuple[Artefact, ...] = ()
 
 
+def one_sentence(*parts: str) -> str:
+    """Statements, each with or without its full stop, as one sentence with semicolons; empty ones are left out."""
+    said = [part.strip().rstrip(".") for part in parts if part.strip()]
+    # a capital that does not begin a symbol or an abbreviation
+    rest = [part[0].lower() + part[1:] if re.match(r"[A-Z][a-z]|A ", part) else part for part in said[1:]]
+    return "; ".join([*said[:1], *rest]) + "."
+
+
 @dataclass(frozen=True, eq=False)
 class Report:
     """What a finished test has to say.
 
     Attributes:
         title: of the report.
-        lead: what was found, a sentence or a few.
+        verdict: what was found, how well, what limits it, what to look at: one sentence worked out from the numbers.
+        lead: what else was found, a few sentences.
         facts: what was set up, (label, text).
         summary: the main table, also printed in the terminal.
         sections: the rest of the report.
@@ -43,6 +53,7 @@ class Report:
     """
 
     title: str
+    verdict: str
     lead: tuple[str, ...]
     facts: tuple[tuple[str, str], ...]
     summary: Table
@@ -52,7 +63,9 @@ class Report:
     image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Refuse two artefacts of one name: they would be one file."""
+        """Refuse a verdict that is not one sentence, and two artefacts of one name: they would be one file."""
+        if not self.verdict.endswith(".") or re.search(r"[.!?]\s+[A-Z]", self.verdict):
+            raise ValueError(f"not one sentence: {self.verdict!r}")
         names = [artefact.name for section in self.sections for artefact in section.artefacts]
         names.append(self.summary.name)
         twice = sorted({name for name in names if names.count(name) > 1})

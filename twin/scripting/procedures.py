@@ -66,7 +66,7 @@ class TestResult:
         return target.target
 
     def _repr_html_(self) -> str:
-        lead = "".join(f"<p>{escape(line)}</p>" for line in self.report.lead)
+        lead = "".join(f"<p>{escape(line)}</p>" for line in (self.report.verdict, *self.report.lead))
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.report.warnings)
         return f"<h4>{escape(self.report.title)}</h4>{lead}{self.summary.to_html(index=False)}{notes}"
 
@@ -106,7 +106,8 @@ def perform(
     config = setup.with_seed(number).to_yaml()
     facts = RunFacts(config, str(file), backend, number, started, time.monotonic() - clock, f"twin.{program}", command)
     shown = with_warnings(report(run), given)
-    return TestResult(name, procedure.numbers(run), shown, setup, run, facts, procedure.kind)
+    numbers = {**procedure.numbers(run), "verdict": shown.verdict}
+    return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

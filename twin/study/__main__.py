@@ -24,6 +24,7 @@ from twin.run.cli import (
     Standing,
     explained,
     print_place,
+    print_verdict,
     print_whole,
     result_table,
     time_text,
@@ -194,6 +195,7 @@ def _print_result(run: StudyRun) -> None:
     for name, r in numbers["responses"].items():
         table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
     console = Terminal()
+    print_verdict(console, run.verdict)
     print_whole(console, table)
     print_place(console, run.folder)
 

@@ -9,13 +9,12 @@ from rich.console import Console
 
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.file_kinds import read_for
-from twin.run.artefact import significant
-from twin.run.cli import InputErrorText, Options, print_whole, result_table
+from twin.run.cli import InputErrorText, Options, print_verdict, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings, run_command
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
 from twin.study.gradient.gradient_numbers import gradient_numbers, whole_table
-from twin.study.gradient.gradient_report import response_table, write_report
+from twin.study.gradient.gradient_report import response_table, verdict, write_report
 from twin.study.gradient.study_gradient import Gradient, study_gradient
 from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM
@@ -54,7 +53,7 @@ def _work(setup: StudySetup, session: Session) -> Result:
     found = study_gradient(setup, session.backend, session.advance)
     session.advance(WRITE, 0, 1)
     folder = session.folder
-    numbers = described("gradient", gradient_numbers(found))
+    numbers = described("gradient", {**gradient_numbers(found), "verdict": verdict(found)})
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", whole_table(found).content())
@@ -66,8 +65,8 @@ def _work(setup: StudySetup, session: Session) -> Result:
 
 
 def _print_result(found: Gradient, warnings: Sequence[str], console: Console) -> None:
-    worst = f"; AD and differences agree to {significant(found.worst, 3, floor=0.0)}" if found.worst is not None else ""
-    table = result_table(f"{len(found.responses)} responses by {len(found.factors)} factors{worst}")
+    print_verdict(console, verdict(found))
+    table = result_table(f"{len(found.responses)} responses by {len(found.factors)} factors")
     picked = [0, 1, 2, 3, 4, 5, 8]
     heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
     for head, k in zip(heads, picked, strict=True):

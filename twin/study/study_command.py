@@ -66,12 +66,14 @@ class StudyRun:
 
     Attributes:
         numbers: contents of study.json.
+        verdict: what was found, in one sentence.
         folder: where it is.
         plan: all its runs.
         warnings: what the user should know.
     """
 
     numbers: dict[str, Any]
+    verdict: str
     folder: Path
     plan: Plan
     warnings: tuple[str, ...]
@@ -146,7 +148,7 @@ def run_study(
 
             result = store.result()
             numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
-            write_report(numbers.data, plan, folder.path, numbers.files, blurred)
+            verdict = write_report(numbers.data, plan, folder.path, numbers.files, blurred)
             entries = {
                 "backend": options.backend,
                 "seed": setup.study.design.seed,
@@ -155,7 +157,7 @@ def run_study(
             }
             entries |= {"runs": plan.runs, "failed": int(result.failed.sum())}
             write_manifest(folder, PROGRAM, started, engine.seconds, **entries)
-    return StudyRun(numbers.summary, folder.path, plan, tuple(warnings))
+    return StudyRun(numbers.summary, verdict, folder.path, plan, tuple(warnings))
 
 
 def _check_size(setup: StudySetup, confirmed: bool) -> None:

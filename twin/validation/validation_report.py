@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from twin.run.artefact import PngFigure, SvgFigure, decimals_for, fixed, plain, significant
+from twin.run.artefact import PngFigure, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.run.page import artefact_content, environment, reproduce
+from twin.run.report import one_sentence
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.run.versions import versions
 from twin.validation.checks.check import (
@@ -48,7 +49,7 @@ def summary_files(validation: Validation) -> dict[str, bytes]:
         lines += ["## Figures", ""]
     for name, artefact in figures.items():
         lines += [f"### {artefact.title}", "", f"![{artefact.title}]({name})", "", artefact.caption, ""]
-    page = "\n".join(lines).rstrip() + "\n"
+    page = _angles("\n".join(lines).rstrip() + "\n")
     return {PAGE: page.encode(), **{name: a.content() for name, a in figures.items()}}
 
 
@@ -160,11 +161,21 @@ def render_report(validation: Validation) -> str:
     template = environment(__package__).get_template(TEMPLATE)
     results = validation.results
     papers = [
-        {"number": number, "title": title, "rows": [_row(r) for r in results if r.paper == number]}
+        {
+            "number": number,
+            "title": title,
+            "rows": [_row(r) for r in results if r.paper == number],
+            "csv": artefact_content(_paper_table(number, [r for r in results if r.paper == number]), None),
+        }
         for number, title in PAPERS.items()
     ]
     groups = [_group(run) for run in validation.runs if run.artefacts or run.files]
-    return template.render(
+    count = len(results)
+    page = template.render(
+        title=f"Validation of the source papers: {count} check{'' if count == 1 else 's'}",
+        verdict=verdict(validation),
+        warnings=(),
+        counted=artefact_content(_count_table(validation), None),
         papers=[paper for paper in papers if paper["rows"]],
         groups=groups,
         counts=[
@@ -181,6 +192,32 @@ def render_report(validation: Validation) -> str:
         seed=validation.seed,
         versions=versions(),
     )
+    return _angles(page)
+
+
+def verdict(validation: Validation) -> str:
+    """What the checks gave, in one sentence."""
+    counts = ", ".join(f"{validation.counts[v]} {v}" for v in VERDICTS if validation.counts[v])
+    count, strange = len(validation.results), [r.id for r, _ in validation.unexpected]
+    expected = "every verdict is the one that earlier work leads one to expect"
+    if strange:
+        expected = f"{len(strange)} not as expected: look at {', '.join(strange)}"
+    return one_sentence(f"{count} check{'' if count == 1 else 's'}: {counts or 'no verdict'}", expected)
+
+
+def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
+    """The rows of a paper with all digits."""
+    heads = ("id", "equation", "statement", "printed", "measured", "sigma", "unit", "verdict", "finds", "how")
+    rows = [
+        (r.id, r.equation, r.statement, r.printed, r.measured, r.sigma, r.unit, str(r.verdict), r.power, r.how)
+        for r in results
+    ]
+    return Table(f"paper-{paper}", f"Paper {paper}", "", heads, rows)
+
+
+def _count_table(validation: Validation) -> Table:
+    rows = [(str(v), validation.counts[v], meaning) for v, meaning in VERDICTS.items()]
+    return Table("verdicts", "Verdicts", "", ("verdict", "checks", "meaning"), rows)
 
 
 def duration_text(seconds: float) -> str:
@@ -258,6 +295,13 @@ def _typeset(text: str) -> str:
     return re.sub(r"(?<![\w.,-])-(?=[\d.])|(?<=\de)-(?=\d)", "\N{MINUS SIGN}", text)
 
 
+def _angles(page: str) -> str:
+    """A page with angles in the units of all reports: papers, and with them the checks, print 0.1 arcsec as 0.1″."""
+    page = re.sub(r"(?<=/)\N{DOUBLE PRIME}", "arcsec", page)
+    page = re.sub(r"[ \N{NO-BREAK SPACE}]?\N{DOUBLE PRIME}", " arcsec", page)
+    return re.sub(r"(?<=[\d)])\N{PRIME}", " arcmin", page)
+
+
 def _group(run: GroupRun) -> dict[str, Any]:
     return {
         "prefix": run.group.prefix,
@@ -272,7 +316,7 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     for run in validation.runs:
         for artefact in run.artefacts:
             folder.write_bytes(run.place(artefact), artefact.content())
-    folder.write_json("validation.json", validation.to_dict())
+    folder.write_json("validation.json", {**validation.to_dict(), "verdict": verdict(validation)})
     folder.write_text("validation.html", render_report(validation))
     for name, content in summary_files(validation).items():
         folder.write_bytes(f"{SUMMARY}/{name}", content)

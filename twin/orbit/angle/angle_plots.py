@@ -64,7 +64,7 @@ def geometry_figure(run: AngleRun) -> Figure:
         above.plot(arm[:, 0], arm[:, 1], ".", color=colour, ms=3, label=f"{name.replace('_', ' ')}")
     for axes in (side, above):
         axes.plot(0.0, 0.0, "o", color=INK, ms=5)
-        axes.set_xlabel("X, forward, km")
+        axes.set_xlabel("X, forward [km]")
     side.annotate("O", (0.0, 0.0), (8, 2), textcoords="offset points")
     pitch = {
         name: float(np.arctan2(*(c.look(np.array([0.5 * (c.pixels - 1)]))[0, [0, 2]])))
@@ -80,8 +80,8 @@ def geometry_figure(run: AngleRun) -> Figure:
     side.invert_yaxis()
     side.set_aspect("equal")
     points = len(run.measurement.strips[flight.lines[0]].points)
-    side.set(title="From the side: the planes on edge", ylabel="Z, down, km")
-    above.set(title=f"From above: strips of {points} points, Y stretched", ylabel="Y, right, km")
+    side.set(title="From the side: the planes on edge", ylabel="Z, down [km]")
+    above.set(title=f"From above: strips of {points} points, Y stretched", ylabel="Y, right [km]")
     above.legend(loc="upper center", ncols=3, markerscale=2.0)
     above.margins(y=0.35)
     _finish(side, above)
@@ -109,7 +109,7 @@ def sensitivity_figure(run: AngleRun, name: str) -> Figure:
         axes.legend(loc="best", ncols=3)
         _finish(axes)
     for axes in grid[:, 0]:
-        axes.set_ylabel("resection − planes, arcsec")
+        axes.set_ylabel("resection − planes [arcsec]")
     return figure
 
 
@@ -123,7 +123,7 @@ def scatter_figure(run: AngleRun) -> Figure:
     names = signs(run.names)
     for axes, (title, scatter) in zip(grid, cases, strict=True):
         off = (scatter.values - scatter.truth) / ARCSEC
-        axes.set(title=title, xlabel=f"{names[0]} − truth, arcsec")
+        axes.set(title=title, xlabel=f"{names[0]} − truth [arcsec]")
         if len(names) > 1:
             axes.plot(off[:, 0], off[:, 1], ".", color=BLUE, ms=4, label=f"{len(off)} passes")
             axes.plot(*_ellipse(scatter).T, color=VERMILION, lw=1.2, label="95% by propagation")
@@ -138,7 +138,7 @@ def scatter_figure(run: AngleRun) -> Figure:
             bell = np.exp(-0.5 * (place / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
             axes.plot(place, bell, color=VERMILION, lw=1.2, label="by propagation")
         axes.legend(loc="upper right")
-    grid[0].set_ylabel(f"{names[1]} − truth, arcsec" if len(names) > 1 else "share of passes per arcsec")
+    grid[0].set_ylabel(f"{names[1]} − truth [arcsec]" if len(names) > 1 else "share of passes per arcsec")
     grid[0].margins(0.2 if len(names) > 1 else 0.05)
     _finish(*grid)
     return figure

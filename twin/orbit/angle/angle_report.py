@@ -13,8 +13,8 @@ from scenes.yaml.units import LENGTH, format_quantity
 from twin.orbit.angle.angle_plots import signs
 from twin.orbit.angle.angle_run import AngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections
-from twin.run.artefact import Cell, Table, fixed
-from twin.run.report import Report
+from twin.run.artefact import FAR, Cell, Table, fixed
+from twin.run.report import Report, one_sentence
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import AngleSetup
@@ -29,9 +29,11 @@ METHOD_NAMES = {
 
 def angle_report(run: AngleRun) -> Report:
     """Report of an intersection angle test."""
+    verdict, lead = _found(run)
     return Report(
         "Intersection angles from ground points",
-        _lead(run),
+        verdict,
+        lead,
         _facts(run.setup),
         _methods(run),
         sections(run),
@@ -39,32 +41,38 @@ def angle_report(run: AngleRun) -> Report:
     )
 
 
-def _lead(run: AngleRun) -> tuple[str, ...]:
+def _found(run: AngleRun) -> tuple[str, tuple[str, ...]]:
+    """The verdict, and what else is said at the top."""
     names, flight, few = signs(run.names), run.flight, run.narrow
     tls, along = run.estimate.angles["tls"], run.estimate.along
     truth = np.where(few, values_of(flight.along_track), values_of(flight.dihedral))
     found, sigma = np.where(few, along.values, tls.values), np.where(few, along.sigma, tls.sigma) / ARCSEC
     off, difference = (found - truth) / ARCSEC, run.difference / ARCSEC
-    lead = []
+    said, lead = [], []
     for which, by in ((np.flatnonzero(~few), "by planes"), (np.flatnonzero(few), "along the track, by planes")):
         if not len(which):
             continue
-        text = (
+        said.append(
             f"{listed([f'{names[k]} = {np.degrees(found[k]):.6f}°' for k in which])} with "
-            f"{'a sigma' if len(which) == 1 else 'sigmas'} of {listed([f'{sigma[k]:.2f}″' for k in which])} {by}, "
-            f"{listed([f'{fixed(off[k], 2)}″' for k in which])} from the truth. "
-            f"Planes minus resection: {listed([f'{fixed(difference[k], 3)}″' for k in which])}"
+            f"{'a sigma' if len(which) == 1 else 'sigmas'} of {listed([f'{sigma[k]:.2f} arcsec' for k in which])} "
+            f"{by}, "
+            f"{listed([f'{fixed(off[k], 2)} arcsec' for k in which])} from the truth"
         )
-        lead.append(f"{text}.")
+        lead.append(f"Planes minus resection: {listed([f'{fixed(difference[k], 3)} arcsec' for k in which])}.")
     if flight.trace:
         (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC
         at = run.names.index(name)
         sigma_1 = along.sigma[at] / ARCSEC
         lead.append(
-            f"Since the laboratory {names[at]} has changed by {fixed(change[at], 2)}″ ± {sigma_1:.2f}″ as seen from "
-            f"the ground; the trace of the instrument says {fixed(true / ARCSEC, 3)}″."
+            f"Since the laboratory {names[at]} has changed by {fixed(change[at], 2)} ± {sigma_1:.2f} arcsec as seen "
+            f"from the ground; the trace of the instrument says {fixed(true / ARCSEC, 3)} arcsec."
         )
-    return tuple(lead)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        worst = float(np.nanmax(np.abs(off) / sigma)) if np.any(sigma > 0.0) else None
+    if worst is not None:
+        held = "all are within" if worst <= FAR else "not all are within"
+        said.append(f"{held} {FAR:g} σ of the truth, the farthest {worst:.1f} σ: see the methods")
+    return one_sentence(*said), tuple(lead)
 
 
 def _methods(run: AngleRun) -> Table:
@@ -94,7 +102,7 @@ def _methods(run: AngleRun) -> Table:
         "angle along the track by less than 0.01 arcsec where the lines of sight begin within 20 arcsec of each other "
         "across the track. The planes are fitted in the Earth-fixed frame. Folded: below three sigmas, where an "
         "unsigned angle is pushed up by its noise.",
-        ("", "method", "angle", "deg", "σ, arcsec", "− truth, arcsec"),
+        ("", "method", "angle", "deg", "σ [arcsec]", "− truth [arcsec]"),
         rows,
         (None, None, None, 7, 3, 3),
     )

@@ -32,21 +32,21 @@ def _geometry(run: AngleRun) -> Section:
         "At one moment the station O and the ground points that one line sees lie in a plane. The angles between these "
         f"planes (Liu and Huang, 2014, eqs. 6 and 7): {listed(between)}.".replace("_", " "),
         "The planes give dihedral angles. The angles between the lines of sight of the lines' centres differ from them "
-        f"by {listed([f'{fixed(v, 4)}″' for v in apart])} for this camera, because its lines are not quite parallel "
-        "and do not begin at one place across the track. Heights are made by their part along the track.",
+        f"by {listed([f'{fixed(v, 4)} arcsec' for v in apart])} for this camera, because its lines are not quite "
+        "parallel and do not begin at one place across the track. Heights are made by their part along the track.",
     ]
     if any(np.any(v) for v in run.measurement.offset.values()):
         text.append(
             "The cameras' projection centres stand metres apart on the satellite and their lines are seen bent, by "
-            f"{_bow(run):.1f}″ at the ends. The analysis takes both from the laboratory: the attitude that the "
+            f"{_bow(run):.1f} arcsec at the ends. The analysis takes both from the laboratory: the attitude that the "
             "resection finds moves the points to where they would lie for one centre. The plane of a bent line depends "
             "on where the points lie, by a thousandth of an arcsecond; the line of sight of its centre does not."
         )
     heights = [f"{v:.2f} m for {signs([n])[0]}" for n, v in run.height.items() if v is not None]
     if heights:
         text.append(
-            f"An angle that is wrong by 1″ moves intersected heights by {listed(heights)}: the true line turned "
-            "by 1″ and its ray intersected with the other line's on the ground."
+            f"An angle that is wrong by 1 arcsec moves intersected heights by {listed(heights)}: the true line turned "
+            "by 1 arcsec and its ray intersected with the other line's on the ground."
         )
     figure = SvgFigure(
         "geometry", "Planes and strips", "In the orbital frame at the station.", figure_svg("geometry", run)
@@ -73,7 +73,7 @@ def _change(run: AngleRun) -> Section:
         "Ground: found from the ground points, minus the laboratory's angle. True: of the lines that the points were "
         "made with. Trace: the same change by chief rays of the instrument's truth, which knows neither orbit nor "
         "ground; only for the two cameras of a pair.",
-        ("angle", "ground, arcsec", "σ, arcsec", "true, arcsec", "trace, arcsec"),
+        ("angle", "ground [arcsec]", "σ [arcsec]", "true [arcsec]", "trace [arcsec]"),
         rows,
         (None, 3, 3, 4, 4),
     )
@@ -103,7 +103,7 @@ def _sections_scatter(run: AngleRun) -> Section:
         "Planes minus resection",
         "Dihedral angle of tls planes minus the size of the resection's angle; below 5° the signed angles along the "
         "track. The spread is that of the difference over the passes.",
-        ("angle", "difference, arcsec", "spread, arcsec"),
+        ("angle", "difference [arcsec]", "spread [arcsec]"),
         [(sign, float(difference[k]), float(spread[k])) for k, sign in enumerate(names)],
         (None, 3, 3),
     )
@@ -156,7 +156,7 @@ def _frames(run: AngleRun) -> Section:
         "the slopes the more, the smaller the normal's z. In the frame of such a line itself the plane is vertical and "
         "noise alone "
         f"decides: the printed form {_failure(worst)}. Total least squares does not depend on the frame: "
-        f"its angles agree to {spread / ARCSEC:.1g}″.",
+        f"its angles agree to {spread / ARCSEC:.1g} arcsec.",
         "Eq. 5 of Liu and Huang has the wrong sign on its right side. Both slopes of every plane then come out "
         "negated, which is one half turn of all planes about the frame's z axis: the angles are right, the planes are "
         "not.",
@@ -174,13 +174,13 @@ def _frames(run: AngleRun) -> Section:
 
 
 def _heads(run: AngleRun) -> list[str]:
-    return [f"{name}, arcsec" for name in signs(run.names)]
+    return [f"{name} [arcsec]" for name in signs(run.names)]
 
 
 def _failure(worst: float) -> str:
     if worst == 0.0:
         return "finds no plane at all"
-    size = f"{np.degrees(worst):.3g}°" if worst > np.radians(0.1) else f"{worst / ARCSEC:.3g}″"
+    size = f"{np.degrees(worst):.3g}°" if worst > np.radians(0.1) else f"{worst / ARCSEC:.3g} arcsec"
     return f"misses by up to {size}"
 
 
@@ -208,8 +208,8 @@ def _effects(run: AngleRun) -> Section:
     speed = float(np.linalg.norm(run.flight.velocity) / SPEED_OF_LIGHT / ARCSEC)
     text = (
         "Aberration tilts every line of sight toward the "
-        f"flight direction by v/c = {speed:.1f}″ times the sine of its angle from it, so that a plane near the nadir "
-        "turns more than others; refraction lets the inclined looks arrive nearer to the nadir.",
+        f"flight direction by v/c = {speed:.1f} arcsec times the sine of its angle from it, so that a plane near the "
+        "nadir turns more than others; refraction lets the inclined looks arrive nearer to the nadir.",
         "The corrections use the measured station, the velocity and the standard atmosphere, which here is also the "
         "true one: what is left shows that the correction is the inverse, not how well the atmosphere is known.",
     )

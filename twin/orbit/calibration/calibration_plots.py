@@ -63,8 +63,8 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
         if rows:
             height = [row.together.height for row in rows]
             left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
-    unit = "σ of d_α of an outer line, arcsec" if found.angle else "size of the drift against the file's"
-    left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points, m")
+    unit = "σ of Δα of an outer line [arcsec]" if found.angle else "size of the drift against the file's"
+    left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points [m]")
     names = list(found.sizes[0].without.schemes)
     here = found.at(1.0)
     bars: list[tuple[str, str, list[PooledErrors]]] = [
@@ -78,7 +78,7 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
         at = place + (k - 0.5 * (len(bars) - 1)) * width
         right.bar(at, [v.height for v in values], 0.92 * width, color=colour, label=label)
     title = "Without ground control, the file's drift"
-    right.set(title=title, xticks=place, xlabel="scheme", ylabel="height RMS at check points, m")
+    right.set(title=title, xticks=place, xlabel="scheme", ylabel="height RMS at check points [m]")
     right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
     for axes in (left, right):
         axes.set_ylim(0.0, None)
@@ -121,7 +121,7 @@ def schemes_figure(run: CalibrationRun) -> Figure:
         low, high = before.min(), before.max()
         axes.set_ylim(0.0, 1.35 * table.max())
         label = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
-        axes.set(title=f"RMS in {title}, m", xticks=place, xlabel="scheme")
+        axes.set(title=f"RMS in {title} [m]", xticks=place, xlabel="scheme")
         axes.text(0.5, 0.97, label, transform=axes.transAxes, ha="center", va="top", color=GREY, fontsize=8.5)
         if limit < 1.35 * table.max():
             axes.axhline(limit, color=GREY, lw=0.9, ls="--")
@@ -150,7 +150,7 @@ def latitude_figure(run: CalibrationRun) -> Figure:
         axes.errorbar(
             np.degrees(latitude), value, sigma, fmt="o", color=BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
         )
-        axes.set(title=f"{axis}, arcsec", xlabel="latitude, deg")
+        axes.set(title=f"{axis} [arcsec]", xlabel="latitude [deg]")
         _finish(axes)
         handles = axes.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=4)
@@ -242,12 +242,12 @@ def check_figure(run: CalibrationRun) -> Figure:
         )
         axes.quiverkey(arrows, 0.8, 0.04, size, f"{size:g} m in plan", labelpos="E", coordinates="axes")
         axes.set_title(f"{title}: plan {errors.plan_rms:.2f} m, height {errors.height_rms:.2f} m")
-        axes.set(xlabel="east, km")
+        axes.set(xlabel="east [km]")
         axes.set_aspect("equal")
         axes.margins(0.14)
-        figure.colorbar(arrows, ax=axes, shrink=0.75, label="height error, m", location="bottom")
+        figure.colorbar(arrows, ax=axes, shrink=0.75, label="height error [m]", location="bottom")
         _finish(axes)
-    panels[0].set_ylabel("north, km")
+    panels[0].set_ylabel("north [km]")
     return figure
 
 

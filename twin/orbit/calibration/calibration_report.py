@@ -14,7 +14,7 @@ from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.scheme_numbers import meets, schemes_within
 from twin.orbit.calibration.schemes import values_of
 from twin.run.artefact import Cell, Table
-from twin.run.report import Report
+from twin.run.report import Report, one_sentence
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_setup import CalibrationSetup
@@ -26,17 +26,23 @@ def calibration_report(run: CalibrationRun) -> Report:
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
     good = schemes_within(run)
-    verdict = f"schemes {', '.join(good)}" if good else "no scheme"
-    lead = (
-        f"Before calibration {plan:.0f} m in plan and {height:.0f} m in height, mean of the fields' RMS. "
-        + scheme_summary(run.scheme_means),
+    # of averaged parameters the scheme with most fields; the last one lets each field use its own
+    scheme = list(run.schemes)[-2:][0]
+    after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
+    verdict = one_sentence(
+        f"Calibration takes the errors from {plan:.0f} m in plan and {height:.0f} m in height to {after[0]:.2f} m and "
+        f"{after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
         f"{limits.plan:g} m in plan and {limits.height:g} m in height, assumed for 1:50 000, are met in every field by "
-        f"{verdict}.",
+        f"{'schemes ' + ', '.join(good) if good else 'no scheme'}: see the schemes",
+    )
+    lead = (
+        scheme_summary(run.scheme_means),
         *(() if run.monitoring is None else (monitor_gain(run.monitoring),)),
         *(() if run.strips is None else (strip_gain(run.schemes, run.strips),)),
     )
     return Report(
         "Calibration in orbit over test fields",
+        verdict,
         lead,
         _facts(setup),
         _summary(run),
@@ -57,7 +63,7 @@ def _summary(run: CalibrationRun) -> Table:
         "schemes",
         "Schemes of parameters, tested on all fields without ground control",
         "RMS at check points, metres: mean, standard deviation and largest of the fields.",
-        ("parameters", "plan, m", "spread", "largest", "height, m", "spread", "largest", "1:50 000"),
+        ("parameters", "plan [m]", "spread", "largest", "height [m]", "spread", "largest", "1:50 000"),
         rows,
         (None, 2, 2, 2, 2, 2, 2, None),
     )
@@ -114,7 +120,7 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
         )
     if run.surprises:
         first = run.surprises[0]
-        scale, shown = (ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "um")
+        scale, shown = (ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "µm")
         if "offset" in first.name:
             scale, shown = 1.0, "m"
         others = len(run.surprises) - 1

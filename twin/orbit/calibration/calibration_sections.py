@@ -36,8 +36,8 @@ def monitor_gain(found: Monitoring) -> str:
     scheme = list(none.without.schemes)[-2]
     still, blind = none.without.schemes[scheme].height, here.without.schemes[scheme].height
     text = (
-        f"With cameras that drift by {found.angle / ARCSEC:.2g}″ (d_alpha, 1σ) from field to field, heights without "
-        f"ground control (scheme {scheme}) are wrong by {blind:.2f} m RMS, {still:.2f} m without drift"
+        f"With cameras that drift by {found.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, heights "
+        f"without ground control (scheme {scheme}) are wrong by {blind:.2f} m RMS, {still:.2f} m without drift"
     )
     if here.monitored is None:
         return f"{text}."
@@ -48,13 +48,13 @@ def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     """Errors by size of the drift and by scheme."""
     spec = run.campaign.spec
     drifts = "; ".join(
-        f"{name} {_angles(one.angles)}, d_f {format_quantity(one.focal_length, LENGTH)}"
+        f"{name} {_angles(one.angles)}, Δf {format_quantity(one.focal_length, LENGTH)}"
         for name, one in spec.drift.items()
     )
     text = [
-        f"Each line camera differs in every field from its reference state, 1σ of d_alpha, d_beta, d_gamma: {drifts}. "
-        f"1″ of d_alpha of the forward line is {abs(found.metres):.2f} m of height; d_beta moves points across the "
-        "track, and d_gamma and d_f act at the ends of the lines.",
+        f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. "
+        f"1 arcsec of Δα of the forward line is {abs(found.metres):.2f} m of height; Δβ moves points across "
+        "the track, and Δγ and Δf act at the ends of the lines.",
         "Each row has the same points and the same noise. Adjusted as if nothing drifted, one interior orientation has "
         "to do for all fields: heights get worse with the drift. The fit sees it only when it is larger than the "
         "noise. Schemes without ground control use the mean of the parameters of their fields. Only a field that is "
@@ -62,7 +62,7 @@ def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     ]
     if spec.monitor is not None:
         text.append(
-            f"The monitor reads each camera in each pass with {_angles(spec.monitor.angles)} and d_f "
+            f"The monitor reads each camera in each pass with {_angles(spec.monitor.angles)} and Δf "
             f"{format_quantity(spec.monitor.focal_length, LENGTH)}, 1σ. Where a field is calibrated, its readings are "
             "observations of the drift, so that the interior orientation is that of the reference state; where a field "
             "is tested, the reference cameras are drifted by its own readings. What a reading has in common in all "
@@ -92,7 +92,7 @@ def _by_size(found: Monitoring) -> Table:
         "All fields adjusted at once",
         "RMS at check points of all fields, metres, each field with its own bias; chance of the fit, with the noise of "
         "the readings of attitude and orbit counted as independent (which makes it too near to 1).",
-        ("drift × file's", "σ d_alpha, arcsec", "plan", "height", "chance", "plan, told", "height, told", "chance"),
+        ("drift × file's", "σ Δα [arcsec]", "plan", "height", "chance", "plan, told", "height, told", "chance"),
         rows,
         (1, 2, 2, 2, 3, 2, 2, 3),
     )
@@ -182,9 +182,9 @@ def strips_section(run: CalibrationRun, found: Strips) -> Section:
     )
     tracker = run.campaign.spec.errors.star_tracker
     slow = max(tracker.slow.noise) / ARCSEC
-    noise = f"{max(tracker.noise) / ARCSEC:g}″ from reading to reading"
+    noise = f"{max(tracker.noise) / ARCSEC:g} arcsec from reading to reading"
     if slow:
-        noise += f" and {slow:g}″ that change within {tracker.slow.interval:g} s"
+        noise += f" and {slow:g} arcsec that change within {tracker.slow.interval:g} s"
     counts = ", ".join(f"{k} {n}" for k, n in found.ties.items())
     text = (
         f"Every pass is adjusted on points that three lines see ({counts}) without coordinates on the ground; the "
@@ -310,10 +310,10 @@ def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
         "from campaign to campaign; spread over the fields; in how many campaigns every field meets 1:50 000.",
         (
             "parameters",
-            "plan, m",
+            "plan [m]",
             "± campaign",
             "spread of fields",
-            "height, m",
+            "height [m]",
             "± campaign",
             "spread of fields",
             "1:50 000",

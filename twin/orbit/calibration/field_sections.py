@@ -35,7 +35,7 @@ def fields_section(run: CalibrationRun) -> Section:
         "Each field by itself",
         "Roll, pitch and yaw of the bias, arcseconds, and minus the truth at the field's middle. An offset of the "
         "orbit, which the twelve unknowns do not have, goes into roll and pitch: 0.3 m are 0.1 arcsec.",
-        ("field", "latitude, deg", *BIAS, "Δ roll", "Δ pitch", "Δ yaw", "chance of the fit"),
+        ("field", "latitude [deg]", *BIAS, "Δ roll", "Δ pitch", "Δ yaw", "chance of the fit"),
         rows,
         (None, 1, 3, 3, 3, 3, 3, 3, 3),
     )
@@ -61,7 +61,8 @@ def fields_section(run: CalibrationRun) -> Section:
     largest = max((r for r in found if r.name in BIAS), key=lambda r: r.scatter)
     text = (
         f"From field to field the interior orientation repeats to {1e3 * worst.scatter:.4f} mm or better (standard "
-        f"deviation, {worst.name}). The biases scatter by up to {largest.scatter / ARCSEC:.2f}″ ({largest.name}).",
+        f"deviation, {worst.name}). The biases scatter by up to {largest.scatter / ARCSEC:.2f} arcsec "
+        f"({largest.name}).",
         "Against the sigmas of single fields, in the table, a scatter is what their points allow, not a camera that "
         "changes, unless the chance is small. y of the outer lines goes with yaw, and both are known far less well "
         "than their sum.",
@@ -142,17 +143,18 @@ def biases_section(run: CalibrationRun) -> Section:
     weak = [f.axis for f in run.latitude if abs(f.amplitude) < 2.0 * f.amplitude_sigma]
     seen = f"in this campaign the drift does not show in {', '.join(weak)}" if weak else "the drift shows in all axes"
     reach = np.ptp(np.sin(run.latitude[0].latitude - run.latitude[0].reference))
-    rest = ", ".join(f"{f.remainder / ARCSEC:.2f}″ in {f.axis}" for f in run.latitude)
+    rest = ", ".join(f"{f.remainder / ARCSEC:.2f} arcsec in {f.axis}" for f in run.latitude)
     degrees = np.degrees(np.ptp(run.latitude[0].latitude))
     text = (
         f"The fields lie within {degrees:.0f}° of latitude, where the sine changes by {reach:.2f}, so that a drift of "
-        f"1″ amplitude makes {reach:.2f}″ between the first and the last. Beside it there remain {rest}, the season of "
-        f"each field: {seen} at two sigmas. More fields, or the same ones in all seasons, would tell them apart.",
-        f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f}″ together, {metres:.1f} m on the ground. By "
-        f"the rules of a mean, one field's bias leaves another field {np.sqrt(2.0) * metres:.1f} m RMS in plan, and "
-        f"the mean of {most} fields {np.sqrt(1.0 + 1.0 / most) * metres:.1f} m, beside the noise of its own: averaging "
-        "helps by less than a third, and no number of fields goes below the scatter itself. Only a field's own "
-        "parameters do, or a reading of the bias in every pass.",
+        f"1 arcsec amplitude makes {reach:.2f} arcsec between the first and the last. Beside it there remain {rest}, "
+        f"the season of each field: {seen} at two sigmas. More fields, or the same ones in all seasons, would tell "
+        "them apart.",
+        f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f} arcsec together, {metres:.1f} m on the "
+        f"ground. By the rules of a mean, one field's bias leaves another field {np.sqrt(2.0) * metres:.1f} m RMS in "
+        f"plan, and the mean of {most} fields {np.sqrt(1.0 + 1.0 / most) * metres:.1f} m, beside the noise of its "
+        "own: averaging helps by less than a third, and no number of fields goes below the scatter itself. Only a "
+        "field's own parameters do, or a reading of the bias in every pass.",
     )
     return Section("Biases against latitude", text, (figure, table))
 
@@ -342,14 +344,14 @@ def datum_section(run: CalibrationRun) -> Section:
         "most; mean changes of the orbit's offsets, metres; change of the chi-square and chance of the fit; RMS at "
         "check points in the right datum, each field with its own parameters, metres.",
         (
-            "shift, m",
+            "shift [m]",
             *BIAS,
             "interior",
             *OFFSET,
             "Δ chi-square",
             "chance of the fit",
-            "plan after, m",
-            "height after, m",
+            "plan after [m]",
+            "height after [m]",
         ),
         rows,
         (None, 2, 2, 2, None, 3, 3, 3, 1, 3, 2, 2),

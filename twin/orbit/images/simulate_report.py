@@ -17,7 +17,7 @@ from twin.orbit.images.simulate_files import camera_data, georeference_data, tra
 from twin.orbit.images.simulate_run import Simulation
 from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
 from twin.run.reference_frames import described
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def control_png(run: Simulation) -> bytes:
         control = run.patch.control
         _show_raster(photo, control.orthophoto, "gray")
         shown = _show_raster(heights, control.dem, "gist_earth")
-        photo.set(title="Orthophoto", ylabel="north, km")
+        photo.set(title="Orthophoto", ylabel="north [km]")
         heights.set(title="Elevation model, m above the ellipsoid")
         figure.colorbar(shown, ax=heights, fraction=0.045, pad=0.02)
         return to_png(figure, _DPI)
@@ -120,7 +120,7 @@ def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
     )
     extent = 1e-3 * ends[0], 1e-3 * ends[1], 1e-3 * ends[2], 1e-3 * ends[3]
     shown = axes.imshow(raster.values, cmap=colours, vmin=low, vmax=high, extent=extent, interpolation="antialiased")
-    axes.set(xlabel="east, km")
+    axes.set(xlabel="east [km]")
     return shown
 
 
@@ -153,7 +153,7 @@ def _images(run: Simulation) -> Section:
         "windows",
         "Windows and grey values",
         "Lines count from the begin of the orbit data, pixels from the first of the line.",
-        ("line", "first line", "first pixel", "mean, DN", "smallest", "largest", "saturated"),
+        ("line", "first line", "first pixel", "mean [DN]", "smallest", "largest", "saturated"),
         rows,
         (None, None, None, 1, None, None, None),
     )
@@ -210,16 +210,22 @@ def simulation_report(run: Simulation) -> Report:
     patch = run.spec.patch
     longitude, latitude = np.degrees(run.place)
     images = run.patch.images
-    lead = (
+    low = min(images, key=lambda name: min(images[name].nyquist))
+    full = [name for name, image in images.items() if image.saturated]
+    verdict = one_sentence(
         f"{len(images)} images of {patch.lines} lines and {patch.pixels} pixels near "
         f"{latitude:.3f}° N, {longitude:.3f}° E, "
-        "with orthophoto, elevation model, the laboratory's camera and the measured orbit and attitude.",
+        "with orthophoto, elevation model, the laboratory's camera and the measured orbit and attitude",
+        f"the softest is {low}, with a modulation of {min(images[low].nyquist):.3f} at half a cycle per sample: see "
+        "Sharpness",
+        f"pixels are saturated in {', '.join(full)}" if full else "",
     )
     files = {name: image.frame[None] for name, image in images.items()}
     files |= {"orthophoto": run.patch.control.orthophoto.values[None], "dem": run.patch.control.dem.values[None]}
     return Report(
         "Images of a patch of ground from orbit",
-        lead,
+        verdict,
+        (),
         _facts(run.setup),
         _summary(run),
         sections(run),
@@ -237,7 +243,7 @@ def _summary(run: Simulation) -> Table:
         "images",
         "Images",
         "Distance of samples on the ground and modulation transfer at half a cycle per sample, in the patch's middle.",
-        ("line", "along line, m", "along track, m", "MTF line", "MTF track", "mean, DN", "contrast, %"),
+        ("line", "along line [m]", "along track [m]", "MTF line", "MTF track", "mean [DN]", "contrast [%]"),
         rows,
         (None, 3, 3, 3, 3, 1, 1),
     )

@@ -54,11 +54,11 @@ def angle_figure(run: MonitorRun) -> Figure:
     true, monitored = run.angle_change / ARCSEC, run.angle / ARCSEC
     above.plot(minutes, true, color=INK, lw=1.3, label="true, traced")
     above.plot(minutes, monitored, "o", color=BLUE, ms=4, label="monitored")
-    above.set_ylabel("change of the angle, arcsec")
+    above.set_ylabel("change of the angle [arcsec]")
     above.legend(loc="best")
     below.axhline(0.0, color=GREY, lw=0.7)
     below.plot(minutes, monitored - true, "o-", color=VERMILION, ms=3, lw=1.0)
-    below.set(ylabel="monitored − true,\narcsec", xlabel="time, min")
+    below.set(ylabel="monitored − true,\narcsec", xlabel="time [min]")
     _finish(above, below)
     return figure
 
@@ -78,8 +78,8 @@ def height_figure(run: MonitorRun) -> Figure:
         above.plot(minutes, cases[name].camera, style, color=colour, ms=3.5, lw=1.2, label=label)
         below.plot(minutes, cases[name].height, style, color=colour, ms=3.5, lw=1.2)
     below.plot(minutes, cases["true"].height, ":", color=INK, lw=1.3, label="true cameras: image, orbit, attitude")
-    above.set_ylabel("mean height error\nby the cameras, m")
-    below.set(ylabel="RMS in height of\nall errors, m", xlabel="time, min")
+    above.set_ylabel("mean height error\nby the cameras [m]")
+    below.set(ylabel="RMS in height of\nall errors [m]", xlabel="time [min]")
     below.set_ylim(bottom=0.0)
     above.legend(loc="best")
     below.legend(loc="best")
@@ -105,7 +105,7 @@ def interval_figure(run: MonitorRun) -> Figure:
     marks = [v for v in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if low <= v <= high]
     if marks:
         axes.set_yticks(marks, [f"{v:g}" for v in marks])
-    axes.set(xlabel="interval between measurements, min", ylabel="RMS in height, m")
+    axes.set(xlabel="interval between measurements [min]", ylabel="RMS in height [m]")
     axes.legend(loc="best")
     _finish(axes)
     return figure
@@ -121,7 +121,7 @@ def parts_figure(run: MonitorRun) -> Figure:
     for name, part in run.parts.items():
         if np.abs(part).max() > _LEAST:
             axes.plot(minutes, part, "o-", color=_COLOURS[name], ms=3, lw=1.0, label=PART_NAMES[name])
-    axes.set(xlabel="time, min", ylabel="mean height error, m")
+    axes.set(xlabel="time [min]", ylabel="mean height error [m]")
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     _finish(axes)
     return figure

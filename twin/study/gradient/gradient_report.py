@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from scenes.yaml.errors import key_text
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, plain, significant
 from twin.run.page import artefact_content, environment, place, reproduce, write_artefacts
+from twin.run.report import one_sentence
 from twin.run.run_folder import RunFolder
 from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
 from twin.run.versions import versions
@@ -23,6 +25,10 @@ from twin.study.runs.setup import StudySetup
 from twin.study.runs.study_folder import PROGRAM
 
 TEMPLATE = "gradient.html.j2"
+DOUBTFUL_TEXT = (
+    "Differences that are not good to 1% of the response's largest change (their step crosses a bend, or the job "
+    "is noisy)"
+)
 
 
 def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
@@ -57,13 +63,14 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
         environment(__package__)
         .get_template(TEMPLATE)
         .render(
+            title=f"{setup.study.name}: gradient",
+            verdict=verdict(found),
+            warnings=[*warnings, *([f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if (bad := doubtful(found)) else ())],
             study=setup.study,
             found=found,
             exact=int((found.method == AD).sum()),
             entries=found.method.size,
             worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
-            doubtful=doubtful(found),
-            warnings=warnings,
             tables=[artefact_content(a, place(a)) for a in tables],
             figures=[artefact_content(a, place(a)) for a in figures],
             command=reproduce(PROGRAM, "config.yaml", "--gradient"),
@@ -71,6 +78,24 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
         )
     )
     folder.write_text("report.html", page)
+
+
+def verdict(found: Gradient) -> str:
+    """Which factors move most, and how sure that is, in one sentence."""
+    moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
+    strongest = Counter(found.factors[int(np.argmax(np.abs(found.change[i])))].name for i in moved)
+    total = len(found.responses)
+    first = [f"{name} moves {count} of {total} responses most" for name, count in strongest.most_common(2)]
+    still = total - len(moved)
+    sure = ""
+    if found.worst is not None:
+        sure = f"automatic differentiation and differences agree to {significant(found.worst, 2, floor=0.0)}"
+    return one_sentence(
+        ", ".join(first) or "No factor moves any response",
+        f"nothing moves {still} of them" if moved and still else "",
+        sure,
+        "see the figures of the sensitivity",
+    )
 
 
 def response_table(found: Gradient) -> Table:

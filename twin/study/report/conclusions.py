@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from scenes.specs.study import GRID, SAMPLERS
+from twin.run.report import one_sentence
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, StudyAnalysis
 from twin.study.report.study_runs import Response, typeset
@@ -134,6 +135,29 @@ def conclusions(found: StudyAnalysis) -> list[str]:
     if not found.runs.sampled:
         out += [_contributors(found, sigma) for sigma in found.runs.sigmas]
     return [text for text in out if text]
+
+
+def verdict(found: StudyAnalysis) -> str:
+    """A study in one sentence: how its requirements are met, or else what moves its first response, and whether its
+    runs are enough to say so.
+    """
+    runs = found.runs
+    failed = int(runs.failed.sum())
+    first = [f"{plural(runs.count, 'run')}, {failed} failed" if failed else plural(runs.count, "run")]
+    known = [r for r in found.requirements if r.share is not None]
+    if known:
+        # the last of several is all together
+        worst = min(known, key=lambda r: (r.share, r.name))
+        name = f"{worst.name} ({worst.text})" if worst.name else "all requirements together"
+        least = ", met least," if len(known) > 1 else ""
+        are = "is" if worst.name else "are"
+        first.append(f"{name}{least} {are} met by {worst.met} of {plural(worst.count, 'run')} with a number")
+    elif runs.responses:
+        first.append(_contributors(found, runs.responses[0]))
+    short = [name for name, statistics in found.convergences.items() if not all(one.enough for one in statistics)]
+    if short:
+        first.append(f"they are too few for some statistics of {plural(len(short), 'response')}: see the convergence")
+    return one_sentence(*(part for text in first for part in text.split(". ")))
 
 
 def _requirement_text(found: StudyAnalysis) -> str:

@@ -14,7 +14,7 @@ from scenes.specs.study import StudySpec
 from twin.run.artefact import Artefact
 from twin.run.page import artefact_content, environment, place, reproduce
 from twin.run.versions import versions
-from twin.study.report.conclusions import conclusions, design_title, warnings
+from twin.study.report.conclusions import conclusions, design_title, verdict, warnings
 from twin.study.report.study_analysis import StudyAnalysis, plain_data, summary
 from twin.study.report.study_runs import StudyRuns
 from twin.study.report.study_sections import factor_table, own_file, response_table, sections
@@ -28,7 +28,7 @@ STATISTICS = "statistics.json"
 ARTEFACTS = "artefacts"
 
 
-def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str], given: Sequence[str] = ()) -> None:
+def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str], given: Sequence[str] = ()) -> str:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
     Args:
@@ -37,8 +37,11 @@ def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str
         folder: of the study; it is complete but for the manifest, which is written afterwards.
         files: of the data set, in that folder.
         given: what is wrong with what the study is given, to be told before all else.
+
+    Returns:
+        The verdict that it begins with.
     """
-    write_study_report(data, plan.setup.study, folder, files, given)
+    return write_study_report(data, plan.setup.study, folder, files, given)
 
 
 def write_study_report(
@@ -47,7 +50,7 @@ def write_study_report(
     folder: Path,
     files: Sequence[str] = ("study.nc", "study.csv"),
     given: Sequence[str] = (),
-) -> None:
+) -> str:
     """As ``write_report``, for a study whose base is not at hand."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
     responses, factors = response_table(found), factor_table(found.runs)
@@ -58,12 +61,15 @@ def write_study_report(
     for artefact in (responses, factors, *(a for section in parts for a in section.artefacts)):
         if own_file(artefact):
             (folder / place(artefact)).write_bytes(artefact.content())
-    text = json.dumps(plain_data(found), indent=2, allow_nan=False) + "\n"
+    said = verdict(found)
+    text = json.dumps({**plain_data(found), "verdict": said}, indent=2, allow_nan=False) + "\n"
     (folder / STATISTICS).write_text(text, encoding="utf-8")
     page = (
         environment(__package__)
         .get_template(TEMPLATE)
         .render(
+            title=study.name,
+            verdict=said,
             study=study,
             runs=found.runs,
             failed=int(found.runs.failed.sum()),
@@ -86,6 +92,7 @@ def write_study_report(
         )
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
+    return said
 
 
 def _shown(artefact: Artefact) -> dict[str, Any]:

@@ -1,0 +1,243 @@
+"""The sentence that a run begins with is true, whatever was perturbed, and misreadings are warnings."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from optics.geometry.tree import Motion
+from scenes.specs.resolved import resolve
+from twin.main_job.render_job import render_job
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import ANGLE, PARAMETERS
+from twin.main_job.verdict import FALSE_ALARM, alarm_limit, judge, readings, recovered_numbers
+from twin.run.artefact import FAR
+
+OUTSIDE = "a motion that the model does not know"
+
+
+@pytest.fixture(scope="module")
+def job(backend, tmp_path_factory):
+    """Runs a job by what it perturbs; each once."""
+    place, done = tmp_path_factory.mktemp("jobs"), {}
+
+    def run(perturb: str, more: str = "", frames: int = 2, instrument: str = "gf7_pair") -> RenderRun:
+        key = (perturb, more, frames, instrument)
+        if key not in done:
+            file = place / f"job{len(done)}.yaml"
+            file.write_text(
+                f"instrument: {instrument}\nperturb: {perturb}\n{more}\nrender: {{frames: {frames}, seed: 3}}\n"
+            )
+            done[key] = render_job(resolve(file), backend)
+        return done[key]
+
+    return run
+
+
+def good(run: RenderRun) -> tuple[int, int]:
+    """How many readings of the model are within FAR sigmas of the truth, worked out from the files' contents."""
+    recovered, truth = run.recovered_dict(), run.truth_dict()
+    pairs = [
+        (recovered["cameras"][c]["model"], truth["cameras"][c], p.key) for c in truth["cameras"] for p in PARAMETERS
+    ]
+    pairs.append((recovered["intersection_angle"]["model"], truth["intersection_angle"], ANGLE.key))
+    return sum(abs(r[key] - t[key]) <= FAR * r[f"{key}_sigma"] for r, t, key in pairs), len(pairs)
+
+
+def one_sentence(verdict: str) -> None:
+    assert verdict.endswith(".")
+    assert not re.search(r"[.!?]\s+[A-Z]", verdict)
+    assert len(verdict.split()) <= 100
+
+
+def test_nothing_perturbed(job) -> None:
+    told = judge(job("{}"))
+    one_sentence(told.verdict)
+    assert told.verdict.startswith("Nothing was perturbed and nothing is read: all 9 readings")
+    assert told.warnings == ()
+    # a motion of size zero is none
+    assert judge(job("{base/forward/M2: {shift: [0 um, 0 um, 0 um]}}")).verdict.startswith("Nothing was perturbed")
+
+
+def test_what_noise_hides_is_three_sigma(job) -> None:
+    run = job("{}")
+    worst = max(r.sigma for r in readings(run, "model") if r.parameter.key == "d_f_um")
+    assert f"Δf {FAR * worst:.2f} µm" in judge(run).verdict
+    assert "with 2 frames" in judge(run).verdict
+
+
+def test_noise_that_looks_like_a_change_is_called_noise(job) -> None:
+    """Of nothing perturbed one reading is moved by 3.2 sigma, then by 9: the first happens, the second does not."""
+    run = job("{}")
+    small, large = (judge(moved(run, 0, sigmas)).verdict for sigmas in (3.2, 9.0))
+    assert "1 of 9 readings of the model is beyond 3 σ" in small
+    assert "which noise alone does now and then" in small
+    assert "look at the warnings" in large
+    assert any("misread" in warning for warning in judge(moved(run, 0, 9.0)).warnings)
+    assert judge(moved(run, 0, 3.2)).warnings == ()
+
+
+def moved(run: RenderRun, parameter: int, sigmas: float) -> RenderRun:
+    """The run with one reading of the model that many sigmas from the truth, which is zero."""
+    camera = next(iter(run.recovery.parameters))
+    estimators = dict(run.recovery.parameters[camera])
+    model = estimators["model"]
+    names = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
+    value = sigmas * model.sigma[:, parameter]
+    estimators["model"] = replace(model, **{names[parameter]: value})
+    parameters = {**run.recovery.parameters, camera: estimators}
+    return replace(run, recovery=replace(run.recovery, parameters=parameters))
+
+
+def test_beneath_the_noise(job) -> None:
+    run = job("{base/forward/focal_plane: {shift: [0.003 um, 0 um, 0 um]}}")
+    told = judge(run)
+    one_sentence(told.verdict)
+    assert told.verdict.startswith("The perturbation stays beneath the noise: no true change reaches 3 σ")
+    assert all(abs(r.true) < FAR * r.sigma for r in readings(run, "model"))
+    # noise falls with the root of the number of frames
+    found = re.search(r"about (\d+) frames would show it", told.verdict)
+    assert found is not None
+    clearest = max(readings(run, "model"), key=lambda r: abs(r.true / r.sigma))
+    assert clearest.sigma * np.sqrt(run.frames / int(found[1])) == pytest.approx(abs(clearest.true) / FAR, rel=0.1)
+
+
+@pytest.mark.slow
+def test_no_camera_changed(job) -> None:
+    """A 180-deg prism may turn as it likes."""
+    told = judge(job("{base/forward/monitor/left/prism_180: {rotate: [1 arcsec, 0 arcsec, 3 arcsec]}}"))
+    assert told.verdict.startswith("What was perturbed changes no camera, and nothing is read")
+
+
+def test_recovered(job) -> None:
+    run = job("{base/forward/focal_plane: {shift: [3 um, -2 um, 0 um], rotate: [0 arcsec, 0 arcsec, 5 arcsec]}}")
+    told = judge(run)
+    one_sentence(told.verdict)
+    assert good(run) == (9, 9)
+    seen = sum(abs(r.true) > FAR * r.sigma for r in readings(run, "model"))
+    assert told.verdict.startswith(f"Recovered: all 9 readings of the model are within 3 σ of the truth, {seen} of")
+    # the printed formula reads it twice, which is an error as large as the change
+    assert [w for w in told.warnings if w.startswith("Δγ of forward [arcsec] is misread by more than the change")]
+
+
+def test_another_motion_is_named_with_its_share(job) -> None:
+    run = job("{base/forward/M2: {shift: [0 um, 0 um, 3 um]}}", frames=9)
+    told = judge(run)
+    one_sentence(told.verdict)
+    count, of = good(run)
+    assert count < of
+    assert told.verdict.startswith(f"{count} of {of} changes are recovered within 3 σ, {of - count} are not")
+    assert f"the cause is {OUTSIDE} (M2 along Z, 3 µm)" in told.verdict
+    worst = max((r for r in readings(run, "model") if r.camera), key=lambda r: abs(r.ratio))
+    assert f"the worst, {worst.name}, is read as {worst.read} and is {worst.shown(worst.true)}" in told.verdict
+    assert f"{100.0 * abs(worst.error / worst.true):.0f} % of the change" in told.verdict
+
+
+def test_readings_larger_than_the_change(job) -> None:
+    run = job("{base/forward/focal_plane: {rotate: [20 arcsec, 0 arcsec, 0 arcsec]}}")
+    told = judge(run)
+    assert "which is more than the change itself" in told.verdict
+    assert f"the cause is {OUTSIDE} (focal plane about X (tilt), 20 arcsec)" in told.verdict
+    (warning,) = [w for w in told.warnings if w.startswith("Δγ of forward [arcsec]")]
+    for r in readings(run, "model"):
+        if r.name == "Δγ of forward":
+            assert f"it is {r.shown(r.true)}, read as" in warning
+            assert re.search(rf"{r.shown(r.value)} ± {r.shown(r.sigma)} \([^)]*\bmodel\)", warning)
+
+
+@pytest.mark.slow
+def test_the_common_reference_is_a_change_of_both_cameras(job) -> None:
+    told = judge(job("{base/central_prism: {rotate: [0 arcsec, 2 arcsec, 0 arcsec]}}"))
+    assert "(central prism about Y, 2 arcsec)" in told.verdict
+    misread = {warning.partition(" is misread")[0] for warning in told.warnings}
+    assert misread >= {"Δα of forward [arcsec]", "Δα of backward [arcsec]"}
+
+
+@pytest.mark.parametrize(
+    ("figure", "words"),
+    [
+        ("{Z5: 20 nm}", f"{OUTSIDE} (M1 figure Z5 (astigmatism), 20 nm)"),
+        pytest.param("{Z11: 20 nm}", "knows nothing of base/forward/M1", marks=pytest.mark.slow),
+    ],
+)
+def test_figure_errors(job, figure, words) -> None:
+    told = judge(job(f"{{base/forward/M1: {{figure: {figure}}}}}"))
+    one_sentence(told.verdict)
+    assert words in told.verdict
+
+
+def test_heat(job) -> None:
+    told = judge(job("{base/forward: {temperature: {change: 1 K, gradient: [1 K/m, 0 K/m, 0 K/m]}}}"))
+    one_sentence(told.verdict)
+    assert "the model knows nothing of temperatures (expansion, bending, change of index)" in told.verdict
+    assert any(warning.startswith("Δf of forward [µm] is misread") for warning in told.warnings)
+
+
+def test_lost_light_is_told(job) -> None:
+    """A spot with a third of its light says so, whatever is read."""
+    run = job("{}")
+    photons = run.photons_after.copy()
+    photons[0] /= 3.0
+    dimmed = judge(replace(run, photons_after=photons)).verdict
+    assert "light is lost on the way (forward/left 33 % of the nominal light left)" in dimmed
+    one_sentence(dimmed)
+
+
+def test_a_course_is_judged_over_its_times(job) -> None:
+    course = (
+        "course: {times: [0 min, 10 min, 20 min], temperature: {base/forward: "
+        "{change: [0 K, 0.1 K, 0.2 K], gradient: [[0 mK/m, 0 mK/m, 0 mK/m], [10 mK/m, 0 mK/m, 0 mK/m], "
+        "[20 mK/m, 0 mK/m, 0 mK/m]]}}}"
+    )
+    run = job("{}", course, instrument="monitor_pair")
+    told = judge(run)
+    one_sentence(told.verdict)
+    assert run.series is not None
+    assert "over 3 times from 0 s to 20 min" in told.verdict.replace("0 min to", "0 s to")
+    found = readings(run, "model")
+    far = [r for r in found if r.far]
+    assert f"{len(found) - len(far)} of {len(found)} changes" in told.verdict
+    first = found[0]
+    error = run.series.parameters["forward"]["model"].d_alpha_rad - run.series.truth["forward"][0]
+    assert first.error == pytest.approx(float(np.sqrt(np.mean(error**2))) * 3600.0 * 180.0 / np.pi, rel=1e-12)
+
+
+def test_files_and_json_hold_the_same_sentence(job) -> None:
+    run = job("{base/forward/focal_plane: {rotate: [20 arcsec, 0 arcsec, 0 arcsec]}}")
+    numbers, told = recovered_numbers(run), judge(run)
+    assert numbers["verdict"] == told.verdict
+    assert numbers["warnings"] == list(told.warnings)
+
+
+def test_the_sentence_does_not_depend_on_how_motions_are_written(job) -> None:
+    """A turn about another pivot plus the shift that makes it the same motion reads the same."""
+    run = job("{base/forward/M2: {shift: [0 um, 0 um, 3 um]}}", frames=9)
+    state = {path: Motion(shift=motion.shift) for path, motion in run.state.items()}
+    assert judge(replace(run, state=state)) == judge(run)
+
+
+def test_rate_of_false_alarms() -> None:
+    """Of readings that are all noise at most FALSE_ALARM of the runs are warned of; 5 sigma of the binomial on top."""
+    count, runs = 36, 100_000
+    worst = np.abs(np.random.default_rng(1).standard_normal((runs, count))).max(axis=1)
+    rate = np.mean(worst > alarm_limit(count))
+    assert rate < FALSE_ALARM + 5.0 * np.sqrt(FALSE_ALARM / runs)
+    assert rate > 0.5 * FALSE_ALARM
+
+
+def test_softer_images_are_told_where_it_matters(job) -> None:
+    """Half of the MTF lost at one place is in the sentence, with that place; a loss of a hundredth is not."""
+    run = job("{}")
+    still = np.array([[0.3, 0.2], [0.3, 0.2]])
+
+    def quality(after: float) -> SimpleNamespace:
+        softer = SimpleNamespace(mtf_along_line=np.array([[0.3, 0.2], [0.3, after]]), mtf_along_track=still)
+        same = SimpleNamespace(mtf_along_line=still, mtf_along_track=still)
+        return SimpleNamespace(cameras={"forward": same, "backward": softer}, fields=(0.0, 0.9))
+
+    told = judge(replace(run, quality=quality(0.1))).verdict
+    one_sentence(told)
+    assert "the MTF at Nyquist of backward along the line, at 0.9 of half the line, falls from 0.200 to 0.100" in told
+    assert "MTF" not in judge(replace(run, quality=quality(0.198))).verdict

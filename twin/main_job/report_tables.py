@@ -1,0 +1,225 @@
+"""Every table of the main report with all its digits, a number to a cell, to be taken away as CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.recovery import ESTIMATORS
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import ANGLE, PARAMETERS
+from twin.main_job.systematics import systematics
+from twin.main_job.verdict import Reading, readings
+from twin.monitor.image_quality import PLACES
+from twin.path_tracing.families import family_name
+from twin.run.artefact import Cell, Table, shown_unit
+from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
+from twin.targets.target_result import EdgeReading
+
+SPOT_COORDINATES = ("left y", "left x", "right y", "right x")
+"""Of a spot shift, in the order of the results: rows lie along the line, the camera's Y, columns along X."""
+
+
+def report_tables(run: RenderRun) -> dict[str, Table]:
+    """Name -> table, of what the run has."""
+    found = [_results(run), _spots(run), _residuals(run), _factors(run), _motions(run), *_parts(run)]
+    return {table.name: table for table in found}
+
+
+def setup_tables(setup: Mapping[str, Any]) -> dict[str, Table]:
+    """What was set up, as ``report_content.setup`` tells it."""
+    moved: list[list[Cell]] = [[p["node"], p["motion"], p["pivot"]] for p in setup["perturbations"]]
+    keys = ("name", "model", "look", "focal", "f_number", "pixels", "pitch_um", "length_mm", "separation")
+    cameras: list[list[Cell]] = [[c[key] for key in keys] for c in setup["cameras"]]
+    heads = ["camera", "prescription", "look angle [deg]", "principal distance [m]", "F-number", "pixels"]
+    heads += ["pitch [µm]", "line [mm]", "distance of the area CCDs [mm]"]
+    tables = (_table("perturbation", ["body", "motion", "pivot"], moved), _table("cameras", heads, cameras))
+    return {table.name: table for table in tables}
+
+
+def _table(name: str, heads: list[str], rows: list[list[Cell]]) -> Table:
+    return Table(name, name.replace("_", " "), "", heads, rows)
+
+
+def _value_and_sigma(label: str) -> list[str]:
+    return [f"{estimator.title}{said}" for estimator in ESTIMATORS.values() for said in (label, " sigma")]
+
+
+def _results(run: RenderRun) -> Table:
+    """One row for each change; over a course root mean squares of truth and errors over its times."""
+    course = run.series is not None
+    heads = ["camera", "parameter", "unit", "true rms" if course else "true"]
+    heads += _value_and_sigma(" error rms" if course else "")
+    rows: list[list[Cell]] = []
+    for same in zip(*(readings(run, estimator) for estimator in ESTIMATORS), strict=True):
+        first: Reading = same[0]
+        row: list[Cell] = [first.camera or "both", first.parameter.symbol, first.parameter.unit, first.true]
+        for one in same:
+            row += [one.error if course else one.value, one.sigma]
+        rows.append(row)
+    return _table("results", heads, rows)
+
+
+def _shown_state(run: RenderRun) -> Table:
+    """As the results, of the one state of a course that is shown in full."""
+    recovered, truth = run.recovered_dict(), run.truth_dict()
+    rows: list[list[Cell]] = []
+    for camera, estimators in recovered["cameras"].items():
+        for p in PARAMETERS:
+            row: list[Cell] = [camera, p.symbol, p.unit, truth["cameras"][camera][p.key]]
+            for estimator in ESTIMATORS:
+                row += [estimators[estimator][p.key], estimators[estimator][f"{p.key}_sigma"]]
+            rows.append(row)
+    if "intersection_angle" in truth:
+        key, row = ANGLE.key, ["both", ANGLE.symbol, ANGLE.unit, truth["intersection_angle"][ANGLE.key]]
+        for estimator in ESTIMATORS:
+            found = recovered["intersection_angle"][estimator]
+            row += [found[key], found[f"{key}_sigma"]]
+        rows.append(row)
+    return _table("shown_time", ["camera", "parameter", "unit", "true", *_value_and_sigma("")], rows)
+
+
+def _spots(run: RenderRun) -> Table:
+    pitch = 1e6 * run.experiment.path.pitch
+    rows: list[list[Cell]] = []
+    r = run.recovery
+    for i, channel in enumerate(run.experiment.path.channels):
+        for k, axis in enumerate(("row", "column")):
+            before, after = float(r.before[0, i, k]), float(r.after[0, i, k])
+            camera = list(run.experiment.instrument.cameras).index(channel.camera)
+            place = 2 * (channel.side == "right") + k
+            sigma = float(r.shift_covariance[0, camera, place, place]) ** 0.5
+            start, end = float(r.sigma_before[0, i, k]), float(r.sigma_after[0, i, k])
+            row: list[Cell] = [channel.key, axis, before, start, after, end, after - before, sigma]
+            rows.append([*row, (after - before) * pitch, sigma * pitch])
+    heads = ["channel", "axis", "before [px]", "sigma [px]", "after [px]", "sigma [px]", "shift [px]", "sigma [px]"]
+    return _table("spots", [*heads, "shift [µm]", "sigma [µm]"], rows)
+
+
+def _residuals(run: RenderRun) -> Table:
+    recovered, truth = run.recovered_dict()["cameras"], run.truth_dict()["cameras"]
+    rows: list[list[Cell]] = []
+    for name in run.crosstalk:
+        bias = systematics(run, name).bias["model"]
+        for k, p in enumerate(PARAMETERS):
+            model = recovered[name]["model"]
+            error = model[p.key] - truth[name][p.key]
+            expected = float(bias[k])
+            rows.append([name, p.symbol, p.unit, error, model[f"{p.key}_sigma"], expected, error - expected])
+    heads = ["camera", "parameter", "unit", "model - true", "sigma", "expected from the crosstalk", "left over"]
+    return _table("residuals", heads, rows)
+
+
+def _factors(run: RenderRun) -> Table:
+    rows: list[list[Cell]] = [
+        [name, f.formula, f.parameter, f.motion, float(f.by_model), float(f.by_truth)]
+        for name, table in run.crosstalk.items()
+        for f in table.factors
+    ]
+    heads = ["camera", "formula", "parameter", "motion", "of the paper's model", "of the real camera"]
+    return _table("factors", heads, rows)
+
+
+def _motions(run: RenderRun) -> Table:
+    """Per unit of each motion: where the spots go, the true change, and every estimator's reading."""
+    pitch = 1e6 * run.experiment.path.pitch
+    heads = ["camera", "motion", "body", "per", *(f"{name} [µm]" for name in SPOT_COORDINATES)]
+    heads += [f"{p.symbol} [{p.unit}] true" for p in PARAMETERS]
+    heads += [f"{p.symbol} [{p.unit}] {estimator.title}" for estimator in ESTIMATORS.values() for p in PARAMETERS]
+    rows: list[list[Cell]] = []
+    for name, table in run.crosstalk.items():
+        for k, motion in enumerate(table.motions):
+            row: list[Cell] = [name, motion.label, motion.body, shown_unit(motion.unit)]
+            row += [float(shift) * pitch for shift in table.spot_shift[:, k]]
+            row += [float(true) for true in table.true[:, k]]
+            for estimator in ESTIMATORS:
+                row += [float(reading) for reading in table.readings[estimator][:, k]]
+            rows.append(row)
+    return _table("motions", heads, rows)
+
+
+def _parts(run: RenderRun) -> Iterator[Table]:
+    """Of what not every run has."""
+    if run.series is not None:
+        yield _shown_state(run)
+        yield _course(run)
+    if run.stray is not None:
+        yield from _stray(run)
+    if run.quality is not None:
+        yield _quality(run)
+    if run.targets is not None:
+        yield _mtf(run)
+
+
+def _course(run: RenderRun) -> Table:
+    """Every reading of every time."""
+    assert run.series is not None
+    rows: list[list[Cell]] = []
+    for camera, estimators in run.series.parameters.items():
+        for k, p in enumerate(PARAMETERS):
+            for t, time in enumerate(run.series.times):
+                row: list[Cell] = [float(time), camera, p.symbol, p.unit]
+                row.append(float(run.series.truth[camera][k, t] * PER_SI[k]))
+                for found in estimators.values():
+                    row += [float(found.vector[t, k] * PER_SI[k]), float(found.sigma[t, k] * PER_SI[k])]
+                rows.append(row)
+    return _table("course", ["time [s]", "camera", "parameter", "unit", "true", *_value_and_sigma("")], rows)
+
+
+def _stray(run: RenderRun) -> Iterator[Table]:
+    assert run.stray is not None
+    after = run.stray.after
+    shares = after.share(run.photons_after - after.photons)
+    amounts: list[list[Cell]] = []
+    rows: list[list[Cell]] = []
+    for i, channel in enumerate(run.experiment.path.channels):
+        name = f"{channel.key}/area_ccd"
+        nominal = after.traced.runs[channel.key].nominal(name).touches
+        families = [pair for pair in after.traced.relative(channel.key) if pair[0].detector == name]
+        by_kind = [sum(share for f, share in families if f.kind == kind) for kind in ("ghost", "stray")]
+        amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
+        for f, share in sorted(families, key=lambda pair: -pair[1]):
+            x, y = (1e6 * c for c in f.centroid)
+            chain = " ".join(map(str, f.touches))
+            rows.append([channel.key, f.kind, family_name(f.touches, nominal), share, x, y, f.count, chain])
+    heads = ["area CCD", "all / spot", "ghosts / spot", "scattered / spot", "brightest pixel [photons]"]
+    yield _table("stray", heads, amounts)
+    heads = ["area CCD", "kind", "name", "share of the spot", "x [µm]", "y [µm]", "paths", "surfaces in order"]
+    yield _table("stray_families", heads, rows)
+    taken: list[list[Cell]] = [[o.body, o.beam, 100.0 * o.share, 100.0 * o.used] for o in run.stray.obstructions]
+    yield _table("stray_prisms", ["prism", "beam", "takes [%]", "of it used by its channel [%]"], taken)
+
+
+def _quality(run: RenderRun) -> Table:
+    """At every field, not only at those that the report shows."""
+    assert run.quality is not None
+    places = {k: place for place, field in PLACES.items() for k in [run.quality.fields.index(field)]}
+    rows: list[list[Cell]] = []
+    for name, camera in run.quality.cameras.items():
+        for s, when in enumerate(("before", "after")):
+            for k, field in enumerate(run.quality.fields):
+                numbers = (camera.wfe, camera.wfe_refocused, 1e6 * camera.defocus, camera.mtf_along_line)
+                values = [float(n[s, k]) for n in (*numbers, camera.mtf_along_track, 1e2 * camera.light_lost)]
+                rows.append([name, when, float(field), places.get(k, ""), *values])
+    heads = ["camera", "state", "field", "place", "wavefront error [waves]", "at best focus [waves]"]
+    heads += ["best focus - line CCD [µm]", "MTF at Nyquist along the line", "MTF at Nyquist along the track"]
+    return _table("quality", [*heads, "light taken [%]"], rows)
+
+
+def _mtf(run: RenderRun) -> Table:
+    assert run.targets is not None
+    rows: list[list[Cell]] = []
+    for name, camera in run.targets.cameras.items():
+        for place, targets in camera.places.items():
+            for direction in DIRECTIONS:
+                for when, shots in targets.shots.items():
+                    for kind, reading in (("edge", shots.edges.get(direction)), ("bars", shots.bars.get(direction))):
+                        if reading is None:
+                            continue
+                        found = reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
+                        value, sigma = found if found is not None else (None, None)
+                        where: list[Cell] = [name, camera.band, place, DIRECTION_NAMES[direction], when, kind]
+                        rows.append([*where, value, sigma, reading.true_nyquist])
+    heads = ["camera", "band", "place", "direction", "state", "target", "MTF at Nyquist", "sigma", "true"]
+    return _table("mtf", heads, rows)
