@@ -197,8 +197,8 @@ def distortion_figure(run: CameraRun) -> Figure:
         for line in (*places, *np.swapaxes(places, 0, 1)):
             left.plot(1e3 * line[:, 0], 1e3 * line[:, 1], color=colour, lw=width)
     left.set_title(f"Grid of fields, departures {factor:g} times")
-    left.set_xlabel("along the line, mm")
-    left.set_ylabel("along the track, mm")
+    left.set_xlabel("along the line [mm]")
+    left.set_ylabel("along the track [mm]")
     _lines(right, run)
     plain_axes(left)
     return figure

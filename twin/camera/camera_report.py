@@ -207,7 +207,7 @@ def _spots(run: CameraRun) -> Section:
         [degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
         for s in run.spots
     ]
-    heads = ("field", "rms, µm", "along line, µm", "along track, µm", "largest, µm", "rms / Airy radius")
+    heads = ("field", "rms [µm]", "along line [µm]", "along track [µm]", "largest [µm]", "rms / Airy radius")
     return Section(
         "Spots",
         (),
@@ -288,7 +288,7 @@ def _field(run: CameraRun) -> Section:
          float(curves.illumination[k]), float(curves.vignetted[k])]
         for k, a in enumerate(x)
     ]  # fmt: skip
-    heads = ("field, deg", "focus line, µm", "focus track, µm", "focus, µm", "illumination", "vignetted")
+    heads = ("field [deg]", "focus line [µm]", "focus track [µm]", "focus [µm]", "illumination", "vignetted")
     line: list[list[Cell]] = [
         [1e3 * float(p), float(np.degrees(w)), 1e6 * float(r)]
         for p, w, r in zip(d.position, d.angle, d.residual, strict=True)
@@ -310,7 +310,7 @@ def _field(run: CameraRun) -> Section:
                 lambda: curves_figure(run),
             ),
             Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
-            Table("distortion-line", "Distortion along the line", "", ("L, mm", "W, deg", "distortion, µm"), line,
+            Table("distortion-line", "Distortion along the line", "", ("L [mm]", "W [deg]", "distortion [µm]"), line,
                   (3, 5, 3)),
         ),
     )  # fmt: skip

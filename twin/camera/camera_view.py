@@ -53,8 +53,8 @@ class SpotView(Spot):
             axes = figure.subplots()
             draw_spot(axes, self)
             axes.set_title(f"field {field_text(self.field)}: rms radius {1e6 * self.rms:.3g} \N{MICRO SIGN}m")
-            axes.set_xlabel("along the line, \N{MICRO SIGN}m")
-            axes.set_ylabel("along the track, \N{MICRO SIGN}m")
+            axes.set_xlabel("along the line [\N{MICRO SIGN}m]")
+            axes.set_ylabel("along the track [\N{MICRO SIGN}m]")
         return figure
 
 

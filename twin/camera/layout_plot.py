@@ -39,7 +39,7 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
         one.set_title(title, loc="left")
         one.set_ylabel(f"{name}, m")
         plain_axes(one)
-    axes[1].set_xlabel("z along the parent axis, m")
+    axes[1].set_xlabel("z along the parent axis [m]")
     return figure
 
 
