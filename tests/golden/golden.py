@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.golden.compare import Comparison, compare, compare_elsewhere
+from tests.golden.fields import fields_of, kept_fields, write_fields
 from tests.golden.jobs import Job, run
 from tests.golden.snapshot import Reader
 
@@ -96,13 +97,13 @@ def golden_file(name: str) -> Path:
     return FOLDER / f"{name}.json"
 
 
-def take(job: Job) -> tuple[dict[str, Any], float]:
-    """A job's snapshot, as it is after writing and reading, and the seconds that the command took."""
+def take(job: Job) -> tuple[dict[str, Any], dict[str, Any], float]:
+    """A job's snapshot and the fields of its files, as they are after writing and reading; the seconds that it took."""
     with tempfile.TemporaryDirectory(prefix="golden-") as here:
         start = time.perf_counter()
         done = run(job, Path(here))
         seconds = time.perf_counter() - start
-        return json.loads(json.dumps(Reader(done).snapshot())), seconds
+        return json.loads(json.dumps(Reader(done).snapshot())), json.loads(json.dumps(fields_of(done.out))), seconds
 
 
 def write(job: Job) -> tuple[int, float]:
@@ -111,7 +112,8 @@ def write(job: Job) -> tuple[int, float]:
     Returns:
         its size in bytes, and the seconds that the command took.
     """
-    snapshot, seconds = take(job)
+    snapshot, fields, seconds = take(job)
+    write_fields(job.name, fields)
     parts = {"job": job.name, "words": list(job.words), **machine()}
     lines = [f"{json.dumps(key)}: {_compact(value)}" for key, value in parts.items()]
     run_lines = [f"{json.dumps(key)}: {_compact(value)}" for key, value in snapshot.items()]
@@ -142,6 +144,7 @@ def check(job: Job) -> Outcome:
     if other:
         raise NotComparable(f"{job.name}: made with other packages: {', '.join(other)}")
     elsewhere = here["processor"] != kept["processor"]
-    snapshot, seconds = take(job)
+    snapshot, fields, seconds = take(job)
     found = compare_elsewhere(kept["run"], snapshot, job.promised) if elsewhere else compare(kept["run"], snapshot)
-    return Outcome(job.name, seconds, found, elsewhere)
+    same = compare({"fields": kept_fields(job.name)}, {"fields": fields})
+    return Outcome(job.name, seconds, Comparison([*found.differences, *same.differences]), elsewhere)
