@@ -38,7 +38,18 @@ Text = Annotated[str, Field(strict=True, max_length=2000)]
 """Free text."""
 
 
-def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], Any]) -> AfterValidator:
+@dataclass(frozen=True)
+class Catalogued(AfterValidator):
+    """Validator of a name that a catalogue knows.
+
+    Attributes:
+        names: that may be given.
+    """
+
+    names: Iterable[str] = ()
+
+
+def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], Any]) -> Catalogued:
     """A name that a catalogue knows, brought to the catalogue's own spelling.
 
     Args:
@@ -53,7 +64,7 @@ def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], An
         except KeyError:
             raise Problem(f"no such {what}", shown(name), names_text(catalogue), nearest(name, catalogue)) from None
 
-    return AfterValidator(check)
+    return Catalogued(check, catalogue)
 
 
 @dataclass(frozen=True, eq=False)
