@@ -1,0 +1,136 @@
+"""The page of the commands: every program that can be run, its arguments and options, as its own parser knows them."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import typer
+
+from docs.site.markdown import anchor, code, prose, sentence, table
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("twin", "analysis", "scenes", "optics")
+FIRST = ("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design")
+"""Programs that stand first; the others follow by name."""
+NOT_FOR_USERS = {"twin.run.probe": "the doctor's own helper"}
+"""Modules that can be run and are no commands, with the reason."""
+
+
+@cache
+def programs() -> tuple[str, ...]:
+    """Modules of the packages that can be run by ``python -m``, those for users."""
+    found = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if _runs(path):
+                name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__main__")
+                found.append(name)
+    rank = {name: k for k, name in enumerate(FIRST)}
+    return tuple(sorted((n for n in found if n not in NOT_FOR_USERS), key=lambda n: (rank.get(n, len(rank)), n)))
+
+
+def _runs(path: Path) -> bool:
+    """Whether a file, run as a program, starts one at its end."""
+    text = path.read_text("utf-8")
+    last = ast.parse(text).body[-1:] if '__name__ == "__main__"' in text else []
+    return any(isinstance(node, ast.If) and ast.unparse(node.test) == "__name__ == '__main__'" for node in last)
+
+
+@cache
+def parser(program: str) -> Any:
+    """The command of a program, with its parser; of a program with subcommands the group.
+
+    Raises:
+        LookupError: neither a Typer application ``app`` nor a function ``main``.
+    """
+    module = importlib.import_module(program)
+    if hasattr(module, "__path__"):
+        module = importlib.import_module(f"{program}.__main__")
+    app = getattr(module, "app", None)
+    if app is None:
+        if not hasattr(module, "main"):
+            raise LookupError(f"{program}: neither app nor main")
+        app = typer.Typer(add_completion=False)
+        app.command()(module.main)
+    return typer.main.get_command(app)
+
+
+def commands(program: str) -> dict[str, Any]:
+    """Words that call a command -> the command, of all subcommands of a program."""
+    command = parser(program)
+    below = getattr(command, "commands", None)
+    return {f"{program} {name}": one for name, one in below.items()} if below else {program: command}
+
+
+def command_page() -> str:
+    """Markdown of the page."""
+    parts = [
+        """# Commands
+
+Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), and has a `--help` that says the
+same as this page. All that make a run folder share `--out`, `--seed`, `--backend`, `--force`, `--json` and `--quiet`;
+what is in the folders says [the next page](run_folders/index.md). Exit codes: 0 success, 2 bad input (one line for
+each fault with file, line and key; nothing is written), 1 anything else, 130 interrupted.
+"""
+    ]
+    for program in programs():
+        parts.append(_program(program))
+    return "\n".join(parts)
+
+
+def _program(program: str) -> str:
+    group = parser(program)
+    below = getattr(group, "commands", None)
+    if not below:
+        return f"## {code(program)}\n\n{_command(program, group)}"
+    parts = [f"## {code(program)}\n\n{help_text(group)}"]
+    parts += [f"### {code(f'{program} {name}')}\n\n{_command(f'{program} {name}', one)}" for name, one in below.items()]
+    return "\n".join(parts)
+
+
+def help_text(command: Any) -> str:
+    """What ``--help`` says above the options; indented lines of it are shown as they stand."""
+    text = inspect.cleandoc(command.help or "").replace("\b", "").replace("\f", "")
+    out: list[str] = []
+    for indented, blocks in groupby(text.split("\n\n"), lambda block: block.startswith(" ")):
+        if indented:
+            out.append(f"```text\n{dedent(chr(10).join(blocks)).strip()}\n```")
+        else:
+            out += [prose(" ".join(block.split())) for block in blocks]
+    return "\n\n".join(out) + "\n"
+
+
+def _command(words: str, command: Any) -> str:
+    arguments = [p for p in command.params if not p.opts[0].startswith("-")]
+    usage = " ".join(["python -m", words, *(p.name.upper() for p in arguments), "[OPTIONS]"])
+    rows = [_row(words, p) for p in command.params]
+    options = table(["Option", "Takes", "Default", "Meaning"], rows, "options")
+    return f"```text\n{usage}\n```\n\n{help_text(command)}\n{options}"
+
+
+def _row(words: str, param: Any) -> list[str]:
+    is_option = param.opts[0].startswith("-")
+    names = [*param.opts, *param.secondary_opts] if is_option else [param.name.upper()]
+    shown = ", ".join(map(code, names))
+    place = f"{words} {names[0]}".replace(".", "-")
+    default = "must be given" if param.required else "" if param.default in (None, False) else code(str(param.default))
+    return [f"{anchor(place)}{shown}", _takes(param), default, prose(sentence(param.help or ""))]
+
+
+def _takes(param: Any) -> str:
+    if getattr(param, "is_flag", False):
+        return "nothing"
+    sort = getattr(param.type_descriptor, "annotation", str)
+    words = {int: "whole number", float: "number", str: "text", Path: "path"}
+    what = words.get(sort, getattr(sort, "__name__", str(sort)))
+    bounds = [f"{word} {value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if value != 2**63 - 1 else f"{word} 2⁶³ − 1"
+              for word, value in (("at least", getattr(param, "min", None)), ("at most", getattr(param, "max", None)))
+              if value is not None]  # fmt: skip
+    return "; ".join((what, *bounds))

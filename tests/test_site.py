@@ -1,0 +1,339 @@
+"""The documentation's site: the reference leaves nothing out, its examples are right, and its links lead somewhere."""
+
+import importlib
+import inspect
+import json
+import re
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+
+import twin
+from docs.site.api_page import api_page
+from docs.site.build import NEEDED, BuildError, build, index_page, written_pages
+from docs.site.command_pages import NOT_FOR_USERS, command_page, commands, parser, programs
+from docs.site.file_pages import READ_BY, file_pages
+from docs.site.link_check import faults
+from docs.site.markdown import slug
+from docs.site.node_pages import ACTIONS, node_table
+from docs.site.run_files import FILES, described, known
+from docs.site.run_files import commands as golden_commands
+from docs.site.run_pages import run_pages
+from docs.site.spec_examples import accepted, examples, kinds_of, shipped
+from docs.site.spec_keys import flow
+from scenes.schema import MODELS, json_schema
+from scenes.yaml.yaml_file import parse_yaml
+from tests.golden.fields import fields_file, fields_of, json_fields, kept_fields
+from tests.golden.golden import golden_file
+from tests.golden.jobs import ALL
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    return file_pages()
+
+
+@pytest.fixture(scope="module")
+def folders() -> dict[str, str]:
+    return run_pages()
+
+
+# --- keys of files ---------------------------------------------------------------------------------------
+
+
+def models_below(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Models that a type mentions, at any depth."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in typing.get_args(annotation):
+        yield from models_below(part)
+
+
+def keys_below(model: type[BaseModel], seen: set[type[BaseModel]]) -> Iterator[tuple[type[BaseModel], str]]:
+    """(model, key) of everything that a file may hold, by the models themselves."""
+    if model in seen:
+        return
+    seen.add(model)
+    for name, info in model.model_fields.items():
+        yield model, name
+        for below in models_below(info.annotation):
+            yield from keys_below(below, seen)
+
+
+def rows(page: str) -> dict[str, str]:
+    """Place of a key -> its row in the page's tables."""
+    return {found[1]: found[0] for found in re.finditer(r'^\| <span id="([^"]+)"></span>.*$', page, re.M)}
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_key_stands_in_the_reference(kind: str, pages: dict[str, str]) -> None:
+    """Each model's keys in one table, as many tables as there are models, each row with all five columns filled."""
+    found = rows(pages[f"reference/files/{kind}.md"])
+    wanted = list(keys_below(MODELS[kind], set()))
+    assert len(found) == len(wanted)
+    assert sorted(place.split(".")[-1] for place in found) == sorted(slug(name) for _, name in wanted)
+    for row in found.values():
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]]
+        assert len(cells) == 5
+        assert all(cells), row
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_key_of_the_json_schema_stands_in_the_reference(kind: str, pages: dict[str, str]) -> None:
+    """The schemas for editors are made in another way: by pydantic, terms of a surface as keys of their own."""
+    schema, page = json_schema(kind), pages[f"reference/files/{kind}.md"]
+    named = set(re.findall(r"`([A-Za-z0-9_]+)`", page))
+
+    def keys(node: Any) -> Iterator[str]:
+        if isinstance(node, dict):
+            yield from node.get("properties", {})
+            for below in node.values():
+                yield from keys(below)
+        elif isinstance(node, list):
+            for below in node:
+                yield from keys(below)
+
+    assert set(keys(schema)) <= named
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_example_is_taken_by_its_model(kind: str) -> None:
+    """As it is shown: the line is read as YAML and put into the mapping that it is an example in."""
+    for (model, name), example in examples(kind).items():
+        data = parse_yaml(example.text).data
+        assert list(data) == [name]
+        assert accepted(model, {**example.mapping, **data}), example.text
+        assert not accepted(model, {**example.mapping, "no_such_key": 1})
+
+
+def test_an_example_that_is_wrong_would_be_found() -> None:
+    (model, _), example = next((key, one) for key, one in examples("job").items() if key[1] == "frames")
+    assert not accepted(model, {**example.mapping, "frames": 0})
+    assert not accepted(model, {**example.mapping, "frames": "9 s"})
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "2 um",
+        "name",
+        "a: b",
+        "# no comment",
+        "null",
+        "true",
+        "1.5",
+        "",
+        "-",
+        "[x",
+        "it's",
+        7,
+        0.1,
+        True,
+        ["a, b", {"k": "v: w"}],
+    ],
+)
+def test_a_value_in_one_line_of_yaml_reads_back(value: Any) -> None:
+    assert parse_yaml(f"x: {flow(value)}\n").data == {"x": value}
+
+
+def test_every_sort_of_file_says_what_reads_it_and_ships_an_example(pages: dict[str, str]) -> None:
+    assert set(READ_BY) == set(MODELS)
+    assert all(shipped().values())
+    words = " ".join(READ_BY.values())
+    for line in re.findall(r"python -m ([\w.]+(?: [a-z]+)?)", words):
+        assert line.split(" ")[0] in programs()
+        assert line in commands(line.split(" ")[0]) or line.split(" ")[0] == line
+    for kind, files in shipped().items():
+        for file in files:
+            assert kinds_of(file) == (kind,)
+            assert file.read_text("utf-8").rstrip() in pages[f"reference/files/{kind}.md"]
+
+
+# --- nodes, commands, library ----------------------------------------------------------------------------
+
+
+def test_every_node_stands_in_the_reference(gf7_pair) -> None:
+    table = node_table("gf7_pair", gf7_pair.nodes)
+    for path, info in gf7_pair.nodes.items():
+        row = next(line for line in table.splitlines() if f"`{path}`" in line)
+        cells = [cell.strip() for cell in row.split("|")[1:-1]]
+        assert {action for action, mark in zip(ACTIONS, cells[1:-1], strict=True) if mark} == set(info.allows)
+        assert set(re.findall(r"`(\w+)`", cells[-1])) == {"origin", *info.pivots}
+
+
+def test_every_command_and_every_option_stands_in_the_reference() -> None:
+    page = command_page()
+    assert {"twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.doctor",
+            "analysis.mtf", "scenes.schema"} <= set(programs())  # fmt: skip
+    for program in programs():
+        assert f"## `{program}`" in page
+        for words, command in commands(program).items():
+            section = page[page.index(f"# `{words}`") :].split("\n## ")[0].split("\n### ")[0]
+            # as --help finds them, the text of which stands above the table
+            options = [
+                name for param in command.params for name in (*param.opts, *param.secondary_opts) if name[0] == "-"
+            ]
+            assert options
+            assert all(f"`{name}`" in section for name in options)
+            assert set(re.findall(r"^\| .*?`(--[\w-]+)`", section, re.M)) <= set(options)
+
+
+def test_a_command_that_is_not_for_users_has_a_reason() -> None:
+    for module, reason in NOT_FOR_USERS.items():
+        assert importlib.util.find_spec(module) is not None
+        assert reason
+    with pytest.raises(LookupError):
+        parser("scenes.specs.job")
+
+
+def test_everything_in_the_library_stands_in_the_reference_and_has_a_docstring() -> None:
+    page = api_page()
+    for name in twin.__all__:
+        assert f"## `twin.{name}`" in page
+        thing = getattr(twin, name)
+        assert inspect.getdoc(thing)
+        if inspect.isclass(thing):
+            public = [member for key, member in vars(thing).items() if not key.startswith("_")]
+            assert all(inspect.getdoc(member) for member in public)
+
+
+# --- run folders -----------------------------------------------------------------------------------------
+
+
+def test_fields_are_kept_of_every_golden_run() -> None:
+    """Of each the same files as its golden file lists, so that neither is renewed without the other."""
+    for job in ALL:
+        if golden_file(job.name).exists():
+            files = json.loads(golden_file(job.name).read_text("utf-8"))["run"]["files"]
+            kept = kept_fields(job.name)
+            assert sorted(kept) == sorted(files) or (not kept and job.name == "schema"), job.name
+    names = {job.name for job in ALL}
+    assert {path.stem for path in fields_file("x").parent.glob("*.json")} <= names
+
+
+def test_every_file_of_every_command_is_described(folders: dict[str, str]) -> None:
+    for command, jobs in golden_commands().items():
+        page = next(text for text in folders.values() if text.startswith(f"# Files of `{command}`"))
+        for job in jobs:
+            for name, told in kept_fields(job).items():
+                one = described(command, name)
+                assert one is not None, f"{command}: {name}"
+                assert f"`{one.shown}`" in page
+                assert all(f"`{column}`" in page or "artefacts" in name for column in told.get("columns", ()))
+                for group in told.get("groups", {}).values():
+                    assert all(f"`{variable}`" in page for variable in group["variables"])
+                assert all(f"`{tag}`" in page for tag in told.get("tags", ()))
+
+
+def test_every_field_of_every_file_stands_in_the_reference(folders: dict[str, str]) -> None:
+    """By its own name, below the mappings that hold it; names of one sort of thing may be more than are shown."""
+    for command, jobs in golden_commands().items():
+        page = next(text for text in folders.values() if text.startswith(f"# Files of `{command}`"))
+        shown = set(re.findall(r"[\w]+", " ".join(re.findall(r"`([^`]+)`", page))))
+        for job in jobs:
+            for name, told in kept_fields(job).items():
+                for path in told.get("fields", ()):
+                    last = re.sub(r"(\[\])+$", "", re.split(r"\.(?![^{]*\})", path)[-1])
+                    if not path.startswith("reference_frames") and "{" not in last:
+                        known_words = re.findall(r"\w+", last)
+                        assert shown.issuperset(known_words) or "…" in page, f"{command}: {name}: {path}"
+
+
+def test_no_file_is_described_that_no_command_leaves() -> None:
+    rare = {"study.parquet", "picture*.png", "chunks/*"}
+    for command in FILES:
+        names = [name for job in golden_commands().get(command, ()) for name in kept_fields(job)]
+        if names:
+            for one in known(command):
+                used = any(re.fullmatch(one.pattern, name) for name in names)
+                assert (
+                    used
+                    or one.shown in {*rare, "artefacts/*"}
+                    or one.shown in ("config.yaml", "manifest.json", "report.html")
+                )
+
+
+def test_fields_of_json_are_found_in_lists_and_under_names() -> None:
+    tree = {"a": 1, "b": [{"c_um": 1.5}, {"c_um": None, "d": "x"}], "cameras": {"p": {"f": 1}, "q": {"f": 2}}, "e": []}
+    assert json_fields(tree) == {
+        "a": "number",
+        "b[].c_um": "number or null",
+        "b[].d": "text",
+        "cameras.{p|q}.f": "number",
+        "e[]": "",
+    }
+
+
+def test_fields_of_a_folder_are_those_of_its_files(tmp_path: Path) -> None:
+    (tmp_path / "numbers.json").write_text('{"x_um": 1}')
+    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "chunks").mkdir()
+    (tmp_path / "chunks/1.npz").write_bytes(b"")
+    assert fields_of(tmp_path) == {"numbers.json": {"fields": {"x_um": "number"}}, "table.csv": {"columns": ["a", "b"]}}
+
+
+# --- the site --------------------------------------------------------------------------------------------
+
+
+def test_every_page_of_docs_stands_in_the_contents() -> None:
+    listed = set(re.findall(r"^(?:.* <)?((?:docs|reference)/[^>\s]+|README)>?$", index_page(), re.M))
+    written = {page.relative_to(ROOT).with_suffix("").as_posix() for page in written_pages()}
+    assert written <= listed
+    assert {"README", "reference/commands", "reference/nodes", "reference/api"} <= listed
+
+
+def write_site(folder: Path, **pages: str) -> Path:
+    for name, text in pages.items():
+        (folder / f"{name}.html").write_text(f"<html><body>{text}</body></html>")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("page", "said"),
+    [
+        ('<a href="other.html">x</a>', None),
+        ('<a href="other.html#here">x</a>', None),
+        ('<a href="#top">x</a><p id="top"></p><a href="other.html">o</a>', None),
+        ('<a href="https://example.org/">x</a><a href="other.html">o</a>', None),
+        ('<a href="gone.html">x</a><a href="other.html">o</a>', "gone.html leads nowhere"),
+        ('<a href="other.html#there">x</a>', "names no place in other.html"),
+        ('<a href="other.html">x</a><img src="https://example.org/a.png">', "from the network"),
+        ('<a href="other.html">x</a><script src="//cdn.example.org/a.js"></script>', "from the network"),
+        ('<a href="other.html">x</a><link rel="stylesheet" href="a.css">', "a.css, which is not there"),
+        ("nothing", "other.html cannot be reached"),
+    ],
+)
+def test_a_broken_site_is_found(page: str, said: str | None, tmp_path: Path) -> None:
+    found = faults(write_site(tmp_path, index=page, other='<p id="here"></p>'))
+    assert (said is None and found == []) or any(said in line for line in found if said)
+
+
+def test_a_style_sheet_that_loads_from_the_network_is_found(tmp_path: Path) -> None:
+    write_site(tmp_path, index="")
+    (tmp_path / "a.css").write_text("@font-face { src: url(https://example.org/f.woff) }")
+    assert len(faults(tmp_path)) == 1
+
+
+def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(BuildError):
+        build(tmp_path, notebooks=False)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_without_a_broken_link(tmp_path: Path) -> None:
+    """With its notebooks run; `build` fails on any warning of Sphinx and on any fault of a link."""
+    for name in NEEDED:
+        pytest.importorskip(name)
+    count = build(tmp_path / "site")
+    assert count > 40
+    assert (tmp_path / "site/searchindex.js").exists()
+    # in place of a former site
+    assert "Every quantity" in (tmp_path / "site/reference/files/index.html").read_text("utf-8")
