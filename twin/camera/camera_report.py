@@ -323,6 +323,6 @@ def _bodies(run: CameraRun) -> Section:
     ]
     rows.append(["all together, of the light", *(100.0 * float(v) for v in run.quality.light_lost[0])])
     text = "Bodies of the instrument that stand in the beam; MTF and through focus are without what they take."
-    heads = ("body", "right end, %", "middle, %", "left end, %")
+    heads = ("body", "right end [%]", "middle [%]", "left end [%]")
     table = Table("bodies", "Share of the beam", "", heads, rows, (None, 2, 2, 2))
     return Section("In the instrument", (text,), (table,))

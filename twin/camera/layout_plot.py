@@ -37,7 +37,7 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
         one.set_ylim(box[2], box[3])
         one.set_aspect("equal")
         one.set_title(title, loc="left")
-        one.set_ylabel(f"{name}, m")
+        one.set_ylabel(f"{name} [m]")
         plain_axes(one)
     axes[1].set_xlabel("z along the parent axis [m]")
     return figure
