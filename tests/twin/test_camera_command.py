@@ -202,7 +202,7 @@ def test_the_command_refocuses(blurred, monkeypatch) -> None:
     assert "most of it coma" in told["verdict"]
     assert told["verdict"] in " ".join(result.stdout.split("\n"))
     page = (out / "report.html").read_text("utf-8")
-    first = re.search(r'<p class="lead">(.*?)</p>', page)
+    first = re.search(r'<p class="answer">(.*?)</p>', page)
     assert first is not None
     assert first[1].startswith("Not diffraction limited in ")
     assert page.count("<svg") == 10
