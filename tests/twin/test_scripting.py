@@ -56,6 +56,12 @@ def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot
                 for key in PARAMETERS
             }
             assert stated(own) == {key: recovered["cameras"][camera][name][key] for key in own}
+    # and the run folder that it saves is the command's
+    saved = twin.load("scenes/examples/perturb.yaml").render().save(tmp_path / "saved")
+    listed = [json.loads((folder / "manifest.json").read_text())["sha256"] for folder in (out, saved)]
+    assert listed[0].keys() == listed[1].keys()
+    assert {name for name in listed[0] if listed[0][name] != listed[1][name]} <= {"report.html"}  # it names durations
+    assert shot.verdict == recovered["verdict"]
     truth = json.loads((out / "truth.json").read_text())
     for camera in pair.cameras:
         for key in PARAMETERS:

@@ -53,12 +53,17 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
         InputError: the job cannot be: its perturbation, its targets.
     """
     run = render_job(resolved, session.backend, frames, seed, session.advance)
-    problem = _write(run, session, picture)
+    problem = write_run(run, session, picture)
     return Result(_numbers(run), lambda console: _print_result(run, console), problem)
 
 
-def _write(run: RenderRun, session: Session, picture: bool) -> str:
+def write_run(run: RenderRun, session: Session, picture: bool = False) -> str:
     """Write all files of a run: its data, then what they look like.
+
+    Args:
+        run: what was computed.
+        session: with the open run folder.
+        picture: also render pictures of the instrument.
 
     Returns:
         Why the pictures are not complete, empty when they are or nobody asked for them.

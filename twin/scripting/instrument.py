@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -147,7 +148,8 @@ class InstrumentTwin:
             **render,
         }
         job = self._with_job(plain).resolved
-        return _shot_of(render_job(job, self._bench.backend, experiment=self._bench.experiment))
+        started, backend = time.time(), self._bench.backend
+        return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
 
     def recover(self, before: Any, after: Any, centroid: str | None = None) -> Found:
         """What every estimator reads from images, given the calibration of the unperturbed instrument alone.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +16,14 @@ import xarray as xr
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import ESTIMATORS, Recovery
 from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import RenderRun
+from twin.main_job.verdict import judge
+from twin.run.command import Session
+from twin.run.procedure import silent
 from twin.run.reference_frames import frames_text
+from twin.run.run_folder import RunFolder
 from twin.targets.target_result import PlaceTargets
 
 ANGLE = "angle_change_arcsec"
@@ -32,6 +39,7 @@ class Shot:
         expected: expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc.
         truth: true changes of every camera, by exact tracing: parameters of each ``camera`` and, of two cameras,
             ``angle_change_arcsec``.
+        verdict: what was recovered, how well, and what limits it.
         warnings: what one should know before using the numbers.
         run: everything that the command ``twin.render`` would write: image quality, targets, stray light, course.
     """
@@ -40,8 +48,30 @@ class Shot:
     after: xr.DataArray
     expected: xr.Dataset
     truth: xr.Dataset
+    verdict: str
     warnings: tuple[str, ...]
     run: RenderRun = field(repr=False)
+    _backend: Backend = field(repr=False)
+    _started: float = field(repr=False)
+    _seconds: float = field(repr=False)
+
+    def save(self, folder: str | Path, force: bool = False) -> Path:
+        """Write the run folder that the command would write, with its report.
+
+        Args:
+            folder: to be made.
+            force: replace it if it is a run folder.
+
+        Raises:
+            RunFolderError: it is there already, or cannot be written.
+        """
+        # what draws waits until it is asked for
+        from twin.main_job.render_command import write_run
+
+        with RunFolder(Path(folder), force) as target:
+            clock = time.monotonic() - self._seconds
+            write_run(self.run, Session(target, self._backend, silent, self._started, clock))
+        return target.target
 
     @property
     def mtf(self) -> pd.DataFrame:
@@ -62,7 +92,8 @@ class Shot:
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
-        return f"{truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
+        told = f"<p>{escape(self.verdict)}</p>"
+        return f"{told}{truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +178,8 @@ def truth_frame(truth: xr.Dataset) -> pd.DataFrame:
     return truth[list(PARAMETERS)].to_dataframe()
 
 
-def shot_of(run: RenderRun) -> Shot:
-    """What a script sees of a run."""
+def shot_of(run: RenderRun, backend: Backend, started: float) -> Shot:
+    """What a script sees of a run that was traced there and begun then, seconds since the epoch."""
     path = run.experiment.path
     keys = [channel.key for channel in path.channels]
     about = {
@@ -163,13 +194,18 @@ def shot_of(run: RenderRun) -> Shot:
         dims = ("channel", "frame", "row", "column")
         return xr.DataArray(values, dims=dims, coords={"channel": keys}, name=name, attrs=about)
 
+    told = judge(run)
     return Shot(
         before=frames("before", run.before),
         after=frames("after", run.after),
         expected=irradiance(run),
         truth=_truth(run),
-        warnings=run.warnings,
+        verdict=told.verdict,
+        warnings=tuple(told.warnings),
         run=run,
+        _backend=backend,
+        _started=started,
+        _seconds=time.time() - started,
     )
 
 
