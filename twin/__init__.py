@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from scenes.yaml.errors import InputError
-    from twin.scripting.instrument import InstrumentTwin, load, load_camera
+    from twin.scripting.instrument_twin import InstrumentTwin, load, load_camera
     from twin.scripting.procedures import TestResult, perform
     from twin.scripting.results import Found, Shot
     from twin.study.scripted import study
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["Found", "InputError", "InstrumentTwin", "Shot", "TestResult", "load", "load_camera", "perform", "study"]
 
 _PLACES = {
-    "load": "twin.scripting.instrument",
-    "load_camera": "twin.scripting.instrument",
-    "InstrumentTwin": "twin.scripting.instrument",
+    "load": "twin.scripting.instrument_twin",
+    "load_camera": "twin.scripting.instrument_twin",
+    "InstrumentTwin": "twin.scripting.instrument_twin",
     "Shot": "twin.scripting.results",
     "Found": "twin.scripting.results",
     "TestResult": "twin.scripting.procedures",

@@ -337,7 +337,7 @@ def _summary(
     total = np.einsum("np,np->n", about, about)
     redundancy = grey.shape[1] - design.shape[1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.sqrt(np.clip(1.0 - square / total, 0.0, 1.0)) * np.sign(linear[:, 1])
+        correlation = np.sqrt(np.maximum(1.0 - square / total, 0.0)) * np.sign(linear[:, 1])
         side = 2 * reach + 1
         plane = grey.reshape(-1, side, side)
         checker = plane[:, 1:, 1:] - plane[:, 1:, :-1] - plane[:, :-1, 1:] + plane[:, :-1, :-1]

@@ -66,8 +66,8 @@ class ResidualCorrelation:
         matrix = self.white + np.einsum("l,nlij->nij", np.median(chosen, axis=0), self.influence)
         # in units of the white one, so that no direction falls below its share
         (a, b), (_, c) = np.moveaxis(self.white, 0, -1)
-        # NaN compares false
-        finite = np.isfinite(matrix).all(axis=(1, 2)) & (a * c > b * b)
+        # where there is no fit all is NaN, which compares false
+        finite = a * c > b * b
         matrix[~finite] = np.nan
         root = np.linalg.cholesky(self.white[finite])
         back = np.linalg.inv(root)

@@ -32,8 +32,8 @@ class EdgeMtf:
     position, position_sigma: column (axis "x") or row (axis "y") of the edge's half height in the region's middle, px.
     curvature, curvature_sigma: second derivative of the edge's column (row) by its row (column), 1/px; a straight edge
         was used all the same.
-    place, esf, lsf: (S,) px along the normal from the dark side to the bright; grey values; line-spread function, 1/px,
-        integral 1.
+    place, esf, lsf: (S,) px along the normal from the dark side to the bright, 16 to a pixel, as far as there are
+        pixels on both sides; grey values; line-spread function, 1/px, integral 1.
     pixel_place, pixel_grey: (N,) all pixels, projected, as used.
     dark, bright: grey values far from the edge, tails accounted for.
     noise_dark, noise_bright: rms noise of one pixel there.

@@ -81,13 +81,10 @@ def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]])
 
     pairs: indices into `planes`. Raises AngleError when planes belong to different stations or methods, or coincide.
     """
-    first = planes[0]
     for plane in planes[1:]:
-        if plane.method != first.method:
-            raise AngleError(f"angles: a {first.method} and a {plane.method} plane have no angle in common")
-        same = np.array_equal(plane.station.position, first.station.position)
-        if not (same and np.array_equal(plane.station.covariance, first.station.covariance)):
-            raise AngleError("angles: the planes must be fitted through one and the same station")
+        if plane.method != planes[0].method:
+            raise AngleError(f"angles: a {planes[0].method} and a {plane.method} plane have no angle in common")
+    station = _common_station(planes)
     normals = np.array([plane.normal for plane in planes])
     values, printed = np.empty(len(pairs)), np.empty(len(pairs))
     gradient = np.zeros((len(pairs), len(planes), 3))
@@ -102,17 +99,27 @@ def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]])
         side = np.copysign(1.0, dot)
         gradient[row, i] = -(side * b - abs(dot) * a) / sine
         gradient[row, j] = -(side * a - abs(dot) * b) / sine
-    covariance = _propagated(gradient, planes)
+    covariance = _propagated(gradient, planes, station)
     folded = values < _FOLDED * np.sqrt(np.diag(covariance))
     return PlaneAngles(values, printed, covariance, gradient, folded)
 
 
-def _propagated(gradient: Array, planes: Sequence[PlaneFit]) -> Array:
-    """(m, m) covariance of what depends on the planes' normals by `gradient` (m, k, 3)."""
+def _common_station(planes: Sequence[PlaneFit]) -> Station:
+    """Through which all planes were fitted. Raises AngleError for several."""
+    first = planes[0].station
+    for plane in planes[1:]:
+        same = np.array_equal(plane.station.position, first.position)
+        if not (same and np.array_equal(plane.station.covariance, first.covariance)):
+            raise AngleError("angles: the planes must be fitted through one and the same station")
+    return first
+
+
+def _propagated(gradient: Array, planes: Sequence[PlaneFit], station: Station) -> Array:
+    """(m, m) covariance of what depends on the planes' normals, by `gradient` (m, k, 3), and on their station."""
     points = np.array([plane.point_covariance for plane in planes])
     shared = np.einsum("mki,kij->mj", gradient, np.array([plane.station_gain for plane in planes]))
     own = np.einsum("mki,kij,lkj->ml", gradient, points, gradient)
-    return np.asarray(own + shared @ planes[0].station.covariance @ shared.T)
+    return np.asarray(own + shared @ station.covariance @ shared.T)
 
 
 def intersection_angles(forward: PlaneFit, nadir: PlaneFit, aft: PlaneFit) -> PlaneAngles:
@@ -272,8 +279,11 @@ def along_track_angles(lines: Sequence[LineFrame], pairs: Sequence[tuple[int, in
     """Signed angles between pairs of lines seen from one station, with their joint covariance.
 
     A plane that turns about its line's direction moves its central ray by as much; turns within a plane count only by
-    the angle between the two lines, and are left out of the covariance. pairs: indices into `lines`. Raises AngleError.
+    the angle between the two lines, and are left out of the covariance. pairs: indices into `lines`. Raises AngleError,
+    for several stations, too.
     """
+    planes = [line.plane for line in lines]
+    station = _common_station(planes)
     gradient = np.zeros((len(pairs), len(lines), 3))
     values, sign = np.empty(len(pairs)), np.zeros((len(pairs), len(lines)))
     for row, (i, j) in enumerate(pairs):
@@ -285,7 +295,7 @@ def along_track_angles(lines: Sequence[LineFrame], pairs: Sequence[tuple[int, in
             gradient[row, k] = -way * line.central * np.copysign(1.0, line.plane.normal @ line.forward)
             sign[row, k] = way
     own = np.array([line.variance for line in lines])
-    covariance = _propagated(gradient, [line.plane for line in lines]) + (sign * own) @ sign.T
+    covariance = _propagated(gradient, planes, station) + (sign * own) @ sign.T
     return AlongTrackAngles(values, covariance)
 
 

@@ -96,6 +96,14 @@ def test_a_free_bend_costs_what_it_should():
     assert free.variance == pytest.approx(1.25 * mean, rel=0.3)  # 20 places drawn at random
 
 
+def test_lines_seen_from_two_stations():
+    """Their common error would be taken for one of the first station."""
+    forward = frames(SCENE, ("forward",))
+    for other in (frames(SCENE, ("nadir",), sigma_station=0.6), frames(descending_pass(height=501e3), ("nadir",))):
+        with pytest.raises(AngleError, match="one and the same station"):
+            along_track_angles([*forward, *other], PAIR)
+
+
 def test_lines_counted_from_opposite_ends():
     forward, nadir = frames(SCENE, ("forward", "nadir"))
     with pytest.raises(AngleError, match="opposite directions"):

@@ -58,6 +58,20 @@ def test_shift_without_noise_and_pixel_locking(clean, templates):
     assert np.abs(fits.place - PLACES).max() < 1e-3
 
 
+def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
+    """Whole pixels, so that the window ends on the first or last row or column, or one beyond it."""
+    first = 15 - MatchOptions().margin
+    last = SIZE - 1 - first
+    inside = np.array([[first, 100], [last, 100], [100, first], [100, last], [first, last]], float)
+    beyond = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, 0]], float)
+    fits = least_squares(
+        clean, texture.patches(np.concatenate([inside, inside + beyond])), [*inside, *(inside + beyond)]
+    )
+    assert np.all(fits.reason == [Reason.ACCEPTED] * 5 + [Reason.OUTSIDE] * 5)
+    assert np.abs(fits.place[:5] - inside).max() < 0.005
+    assert np.all(np.isnan(fits.place[5:]))
+
+
 def test_affine_change_without_noise(texture, templates):
     matrix = np.array([[1.03, 0.02], [-0.04, 0.98]])
     shift = np.array([12.3, 20.7])

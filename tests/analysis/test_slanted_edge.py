@@ -17,7 +17,7 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
-from analysis.mtf.edge_location import _direction
+from analysis.mtf.edge_location import _direction, locate_edge
 from analysis.mtf.rice import rice_bias
 from analysis.mtf.slanted_edge import EdgeError, measure_edge
 from analysis.spots.noise import NoiseModel
@@ -215,7 +215,11 @@ def test_spread_functions():
         edge.esf[near], DARK + (BRIGHT - DARK) * truth(edge.place[near]), atol=5e-4 * (BRIGHT - DARK)
     )
     np.testing.assert_allclose(edge.lsf[near], truth(edge.place[near], 1), atol=0.005)
-    assert edge.place[-1] > 25
+    # 16 to a pixel, alike on both sides, to the last pixel of the side that has fewer
+    assert np.diff(edge.place) == pytest.approx(1 / 16, abs=1e-12)
+    assert edge.place == pytest.approx(-edge.place[::-1], abs=1e-12)
+    reach = min(edge.pixel_place.max(), -edge.pixel_place.min())
+    assert 25 < edge.place[-1] <= reach < edge.place[-1] + 1 / 16
 
 
 def test_interpolation_and_mtf50():
@@ -438,6 +442,19 @@ def half_an_edge():
 def test_an_edge_has_to_be_there_in_most_rows():
     with pytest.raises(EdgeError, match="cannot be followed"):
         measure_edge(noisy(half_an_edge()))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_edges_up_to_40_deg_have_a_direction(turned):
+    """Steeper ones are near 45 deg, whichever way they are counted."""
+    for degrees in (39.0, 41.0):
+        image = edge_image(degrees, 24, 96)
+        image = image.T if turned else image
+        if degrees < 40.0:
+            assert math.degrees(locate_edge(image).angle) == pytest.approx(degrees, abs=0.1)
+        else:
+            with pytest.raises(EdgeError, match=r"near 45 deg.*tilt the target"):
+                locate_edge(image)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -307,6 +307,10 @@ def test_bad_input_is_told():
         LineModel.of(2 * np.eye(3), INTERIOR["nadir"])
     with pytest.raises(ValueError, match="behind a camera"):
         partials(cameras()["nadir"], rays, 2 * rays.station, np.zeros(3), np.zeros(3))
+    level = Rays.of(rays.point, rays.image, 0.0 * rays.station, np.tile(np.eye(3), (40, 1, 1)))
+    # beside it, where the depth is zero
+    with pytest.raises(ValueError, match="behind a camera"):
+        partials(LineModel.of(np.eye(3), [0.65, 0, 0]), level, np.tile([5e5, 0, 0], (40, 1)), np.zeros(3), np.zeros(3))
     with pytest.raises(CalibrationError, match="no point is seen by two lines"):
         intersect({"nadir": rays}, cameras(), Noise(PITCH))
     with pytest.raises(CalibrationError, match="parallel"):

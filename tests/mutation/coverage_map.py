@@ -30,10 +30,13 @@ class CoverageMap:
     seconds: dict[str, float]
 
     def covering(self, path: str, lines: tuple[int, int]) -> list[str]:
-        """The tests that run one of the lines, the quickest first; for what runs at import, all that run the file."""
+        """The tests that run one of the lines, the quickest first; for what runs at import, all that run the file.
+
+        A test that is the first of its own file to import the module runs such lines, too, and is not the only one.
+        """
         by_line = self.tests.get(path, {})
         names = {name for line in range(lines[0], lines[1] + 1) for name in by_line.get(line, [])}
-        if names == {""}:
+        if "" in names:
             names = {name for found in by_line.values() for name in found}
         return sorted(names & self.seconds.keys(), key=lambda name: (self.seconds[name], name))
 

@@ -2,8 +2,8 @@
 
 One mutant is one expression replaced by another that a slip of the pen could have written: a sign, a factor, a term
 left out, a sine for a cosine, a check that is not made. What cannot change a number or a decision is left alone:
-annotations, decorators, docstrings, messages of errors, and floats below 1e-6 or above 1e6, which are tolerances and
-guards.
+annotations, decorators, docstrings, messages of errors, assertions and ``strict=`` of zip, and floats below 1e-6 or
+above 1e6, which are tolerances and guards.
 """
 
 from __future__ import annotations
@@ -138,6 +138,8 @@ def _places(node: ast.AST, scope: str) -> Iterator[Place]:
             yield from _places(part, inside)
         return
     if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.Import | ast.ImportFrom):
+        return
+    if isinstance(node, ast.keyword) and node.arg == "strict":
         return
     if isinstance(node, ast.AnnAssign):
         if node.value is not None:

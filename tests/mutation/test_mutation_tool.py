@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from tests.mutation.__main__ import app, drawn, equivalents, summary
 from tests.mutation.campaign import read_verdicts, run_campaign
-from tests.mutation.coverage_map import measure, read_map
+from tests.mutation.coverage_map import CoverageMap, measure, read_map
 from tests.mutation.mutants import mutants_below, mutants_of
 
 SOURCE = b'''"""A toy."""
@@ -46,6 +46,14 @@ def test_each_mutant_changes_one_expression_and_still_parses():
     assert ("x / LENGTH", "(x * LENGTH)") in texts
     assert ("x / LENGTH - 0.0 * x", "(x / LENGTH)") in texts
     assert not any("x + 1" in before for before, _ in texts)
+    assert not mutants_of("toy.py", b"def pairs(a, b):\n    return zip(a, b, strict=True)\n")
+
+
+def test_what_runs_at_import_is_met_by_all_tests_of_the_file():
+    """Test b is the first of its file to import the module: it runs the constant's line and not the function's."""
+    known = CoverageMap({"toy.py": {2: ["", "b"], 7: ["a", "c"]}}, {"a": 2.0, "b": 1.0, "c": 0.5})
+    assert known.covering("toy.py", (2, 2)) == ["c", "b", "a"]
+    assert known.covering("toy.py", (7, 7)) == ["c", "a"]
 
 
 def test_keys_differ_and_do_not_move_with_other_code():

@@ -208,6 +208,7 @@ def test_half_plane_takes_the_tangent(mirrored: bool) -> None:
         (lambda: Polygon(SQUARE).mapped(lambda p: p + RNG.normal(0.0, 1e-6, p.shape)), "bends an edge too much"),
         (lambda: Polygon(SQUARE).mapped(affine, 0.0), "tolerance must be positive"),
         (lambda: HalfPlane((0.0, 0.0), (1.0, 0.0)).mapped(lambda p: p * [0.0, 1.0]), "no inverse"),
+        (lambda: Polygon(SQUARE).spectrum(np.zeros((2, 1, 1)), np.zeros((1, 2, 3))), "at most two axes, found 3"),
     ],
 )
 def test_bad_input_is_refused(make, message: str) -> None:

@@ -16,7 +16,7 @@ from twin.compare.comparison import compare, numbers, verdict
 from twin.compare.run_differences import read_run
 from twin.main_job.render_job import render_job
 from twin.run.run_folder import RunFolder, write_manifest
-from twin.scripting.instrument import load
+from twin.scripting.instrument_twin import load
 
 
 @pytest.fixture(scope="module")
