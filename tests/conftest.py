@@ -42,10 +42,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Several threads of OpenBLAS wait actively, for each other's processor. Dr.Jit's wait asleep and stay as they are.
 
-    Under ``nohup`` every process starts deaf to SIGHUP, and the programs respect it; the tests of that signal do not
-    mean it.
+    Under ``nohup`` every process starts deaf to SIGHUP, in the background of a shell script to SIGINT, and the programs
+    respect it; the tests of these signals do not mean it.
     """
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if getattr(config.option, "numprocesses", None):
         for library in ("OPENBLAS", "OMP", "MKL"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")

@@ -33,8 +33,8 @@ class Flights:
         plan_floor, height_floor: (N, K) with the true camera and the true bias: the check points' own noise.
         expected: (N, S, K) RMS in plan that the true biases of fields and scheme imply.
         fits: campaign -> roll, pitch, yaw against latitude, from the estimated biases.
-        true_amplitude, true_told: (N, 3) amplitude from the true biases, by unweighted least squares, and how many of
-            its standard deviations it is.
+        true_amplitude, true_significance: (N, 3) amplitude from the true biases, by unweighted least squares, and how
+            many of its standard deviations it is.
     """
 
     fields: tuple[str, ...]
@@ -101,7 +101,7 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
             "height_floor": values_of(floor, "height_rms"),
         }
         new["expected"] = _expected(one, names, new["plan_floor"])
-        new["true_amplitude"], new["true_told"] = _slopes(latitude, true)
+        new["true_amplitude"], new["true_significance"] = _slopes(latitude, true)
         for key, value in new.items():
             rows.setdefault(key, []).append(value)
         fits.append(tuple(fitted(a, latitude, bias[:, k], np.diag(sigma[:, k] ** 2)) for k, a in enumerate(BIAS)))
