@@ -212,7 +212,7 @@ def _moved(rays: Rays, corrections: Sequence[tuple[str, Array]]) -> Rays:
     if not corrections or not len(rays.point):
         return rays
     turn, shift = (sum((c for k, c in corrections if k == kind), np.zeros(3)) for kind in ("attitude", "station"))
-    turns = Rotation.from_rotvec(turn + np.zeros(rays.station.shape)).as_matrix()
+    turns = Rotation.from_rotvec(np.broadcast_to(turn, rays.station.shape).copy()).as_matrix()
     return replace(rays, attitude=rays.attitude @ turns, station=rays.station + shift)
 
 

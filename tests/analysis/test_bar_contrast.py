@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.mtf.bar_contrast import BarError, measure_bars
+from analysis.mtf.bar_contrast import BarError, _design, _waves, measure_bars
 from analysis.spots.noise import NoiseModel
 
 FALSE_ALARM = 1e-6
@@ -62,6 +62,9 @@ def test_mtf_is_exact(f, degrees, how):
     if f < 0.5 or how != "found":
         # at Nyquist the direction of the tilt cannot be seen: the other alias is longer
         assert bars.cycles_per_pixel == pytest.approx(f, abs=1e-4)
+    if f < 0.5:
+        # of f and -f, which are the same wave, the one that points along the row
+        assert bars.frequency == pytest.approx(vector(f, degrees), abs=1e-4)
 
 
 @pytest.mark.parametrize("f", [0.2, 0.3, 0.5])
@@ -84,11 +87,22 @@ def test_near_horizontal_bars():
     np.testing.assert_allclose(np.abs(bars.frequency), np.abs(vector(0.3, 4)[::-1]), atol=1e-5)
 
 
+@pytest.mark.parametrize("stated", [None, 0.3, -0.3])
+def test_bars_parallel_to_the_pixels(stated):
+    """Where nothing is along the row, the frequency points down the column. Its length has no sign."""
+    image = bar_image(0.3, 0)
+    for across, expected in ((image, (0.0, 0.3)), (image.T, (0.3, 0.0))):
+        bars = measure_bars(across, frequency=stated, **CALM)
+        assert bars.frequency == pytest.approx(expected, abs=1e-5)
+        assert bars.mtf == pytest.approx(transfer(0.3, 0.0), abs=1e-5)
+
+
 def test_bars_above_nyquist_are_measured_when_the_frequency_is_stated():
     """0.7 cycles/pixel looks like 0.3; what it is has to be said."""
-    bars = measure_bars(bar_image(0.7, 4), frequency=0.7, **CALM)
-    assert bars.cycles_per_pixel == pytest.approx(0.7, abs=1e-4)
-    assert bars.mtf == pytest.approx(transfer(0.7, math.radians(4)), abs=1e-5)
+    for stated in (0.7, -0.7, vector(0.7, 4), -vector(0.7, 4)):
+        bars = measure_bars(bar_image(0.7, 4), frequency=stated, **CALM)
+        assert bars.cycles_per_pixel == pytest.approx(0.7, abs=1e-4)
+        assert bars.mtf == pytest.approx(transfer(0.7, math.radians(4)), abs=1e-5)
 
 
 @pytest.mark.parametrize("f", [0.498, 0.499, 0.501, 0.502])
@@ -115,6 +129,92 @@ def test_contrast_and_coltman():
     with_offset = measure_bars(image + 200, CALM["dark"] + 200, CALM["bright"] + 200, 0.5, offset=200.0)
     assert with_offset.contrast == pytest.approx(bars.contrast)
     assert with_offset.coltman == pytest.approx(bars.coltman)
+
+
+def test_no_contrast_where_its_levels_cancel():
+    """An offset halfway between the extremes leaves a sum of 0 to divide by; the MTF does not need it."""
+    image = np.round(bar_image(0.3, 5))
+    bars = measure_bars(image, frequency=0.3, offset=(image.max() + image.min()) / 2, **CALM)
+    assert math.isnan(bars.contrast)
+    assert bars.mtf == pytest.approx(transfer(0.3, math.radians(5)), abs=1e-3)
+
+
+@pytest.mark.parametrize(("scale", "level"), [(1e-9, 0.0), (1e-3, -7.0), (1.0, 1e6)])
+@pytest.mark.parametrize("stated", [None, 0.3])
+def test_levels_and_scale_do_not_matter(scale, level, stated):
+    image, noise = bar_image(0.3, 5), np.random.default_rng(6).normal(0.0, 1.0, (64, 64))
+    one, other = (
+        measure_bars(k * (image + noise) + b, k * CALM["dark"] + b, k * CALM["bright"] + b, stated, saturation=math.inf)
+        for k, b in ((1.0, 0.0), (scale, level))
+    )
+    # a level of 1e6 costs 1e-10 of a contrast of 1e3
+    assert other.mtf == pytest.approx(one.mtf, rel=1e-7)
+    assert other.frequency == pytest.approx(one.frequency, abs=1e-7)
+    assert other.sigma == pytest.approx(one.sigma, rel=1e-5)
+    assert other.amplitude == pytest.approx(scale * one.amplitude, rel=1e-7)
+
+
+def test_turned_and_mirrored_regions_say_the_same():
+    """Noise and all: 180 deg, left to right, rows for columns. The frequency turns with the image."""
+    image = bar_image(0.3, 5) + np.random.default_rng(8).normal(0.0, 20.0, (64, 64))
+    one = measure_bars(image, frequency=0.3, **CALM)
+    down, along = one.frequency
+    for changed, expected in (
+        (image[::-1, ::-1], (down, along)),
+        (image[:, ::-1], (-down, along)),
+        (image[::-1], (-down, along)),
+        (image.T, (along, down)),
+    ):
+        other = measure_bars(changed, frequency=0.3, **CALM)
+        # where the steps of the fit end: 1e-7 of a cycle over the region
+        assert other.mtf == pytest.approx(one.mtf, rel=1e-6)
+        assert other.sigma == pytest.approx(one.sigma, rel=1e-6)
+        # f and -f are the same wave
+        sign = np.sign(other.frequency @ expected)
+        assert sign * other.frequency == pytest.approx(np.array(expected), abs=1e-7)
+
+
+def test_sigma_without_a_model_is_that_with_the_right_one():
+    """200 regions of 16 x 16 px in white noise of 2 DN: the variance of one is known to sqrt(2 / 245), the mean to
+    0.6%. The fit weighs its pixels and takes out a little less than one for each of its eleven unknowns: at most 2.6%.
+    """
+    rng, model = np.random.default_rng(9), NoiseModel(1e-6, 1e6 * math.sqrt(4 - 1 / 12), 0.0, 0.0, 0.0, 0.0, 60000.0)
+    image, dark, bright = bar_image(0.3, 5, 16), np.tile(CALM["dark"], 100), np.tile(CALM["bright"], 100)
+    stated, found = np.array(
+        [
+            [measure_bars(noisy, dark, bright, vector(0.3, 5), noise=n).sigma for n in (model, None)]
+            for noisy in image + rng.normal(0.0, 2.0, (200, 16, 16))
+        ]
+    ).T
+    assert 1.0 - 3 * 0.0064 < np.mean(found**2) / np.mean(stated**2) < 1.026 + 3 * 0.0064
+
+
+@pytest.mark.parametrize(
+    ("f", "seen"),
+    [
+        (1 / 4, []),  # 3 f = 1 - f, 5 f = 1 + f, 7 f = 2 - f
+        (1 / 6, []),  # 3 f = 1/2, where a sine vanishes; 5 f = 1 - f, 7 f = 1 + f
+        (1 / 5, [3]),  # 5 f = 1, 7 f = 2 - 3 f
+        (3 / 10, [3]),  # 5 f = 3/2, 7 f = 3 - 3 f
+        (1 / 7, [3, 5]),  # 7 f = 1
+        (1 / 9, [3, 5, 7]),  # seen at 3, 4 and 2 of 9 cycles
+        (1 / 12, [3, 5]),  # 7 f = 1 - 5 f
+    ],
+)
+def test_harmonics_whose_aliases_fall_together_are_left_out(f, seen):
+    """Of bars parallel to the pixels, whose phases repeat."""
+    assert list(measure_bars(bar_image(f, 0, size=72), frequency=f, **CALM).harmonics) == seen
+
+
+def test_the_design_holds_derivatives_by_the_frequency():
+    """A complex step has no truncation."""
+    rng = np.random.default_rng(7)
+    place, parameters, frequency = rng.uniform(-9, 9, (2, 30)), rng.standard_normal(9), np.array([0.07, 0.31])
+    rows = _design(place, frequency, (3, 5, 7), parameters)
+    for k in range(2):
+        stepped = parameters @ _waves(place, frequency + 1e-40j * np.eye(2)[k], (3, 5, 7))
+        assert rows[k - 2] == pytest.approx(stepped.imag / 1e-40, rel=1e-9, abs=1e-9)
+    assert rows[:-2] == pytest.approx(_waves(place, frequency, (3, 5, 7)))
 
 
 MODEL = NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 60000.0)
@@ -199,6 +299,34 @@ def test_a_quarter_without_bars_is_named(row, column):
     image[rows, columns] = 650.0
     with pytest.raises(BarError, match=f"amplitude in its {row} {column} quarter"):
         measure_bars(image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), 0.3)
+
+
+@pytest.mark.parametrize(("uneven", "refused"), [(0.14, False), (0.16, True)])
+def test_quarters_may_differ_by_15_per_cent(uneven, refused):
+    """Two opposite quarters stronger, two weaker by as much: the amplitude of the whole stays as it is."""
+    side = np.sign(np.arange(64) - 31.5)
+    image = 650.0 + (GOOD - 650.0) * (1.0 + uneven * side * side[:, None])
+    calm = NoiseModel(1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 60000.0)
+    if refused:
+        with pytest.raises(BarError, match=r"quarter is off by 16%"):
+            measure_bars(image, CALM["dark"], CALM["bright"], 0.3, noise=calm)
+    else:
+        found = measure_bars(image, CALM["dark"], CALM["bright"], 0.3, noise=calm)
+        assert found.mtf == pytest.approx(transfer(0.3, math.radians(4)), rel=0.01)
+
+
+@pytest.mark.parametrize("frames", [1, 16])
+def test_levels_have_the_noise_of_their_pixels(frames):
+    """Photon transfer by hand: gain 0.5 DN/e, 20 e dark signal and a black level of 64 DN, 2% PRNU, 10 e DSNU."""
+    model = NoiseModel(0.5, 6.0, 20.0, 64.0, 0.02, 10.0, 60000.0)
+    bars = measure_bars(GOOD, np.full(400, DARK), np.full(100, BRIGHT), 0.3, noise=model, frames=frames)
+    for level, sigma, count in ((DARK, bars.dark_sigma, 400), (BRIGHT, bars.bright_sigma, 100)):
+        electrons = (level - 64.0) / 0.5
+        temporal = 0.25 * (electrons + 36.0) + 1 / 12
+        fixed = 0.25 * ((0.02 * (electrons - 20.0)) ** 2 + 100.0)
+        assert sigma == pytest.approx(math.sqrt((temporal / frames + fixed) / count), rel=1e-9)
+    # the contrast of the levels is in the sigma of the MTF, beside the noise of the bars
+    assert bars.sigma > bars.mtf * math.hypot(bars.dark_sigma, bars.bright_sigma) / (BRIGHT - DARK)
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,8 @@ def test_covariances_weigh_and_scatter_is_what_they_lack():
     place, found, _, bad, _ = scene(2, 2000, 0.2, sigma)
     covariance = sigma[:, None, None] ** 2 * np.eye(2)
     result = consensus(place, found, covariance=covariance, false_alarm=0.01)
+    # two normal errors of unit variance: Rayleigh's distribution
+    assert result.limit == pytest.approx(stats.rayleigh.isf(0.01))
     lost = (~result.accepted & ~bad).sum()
     # a scatter estimated slightly above 0 lowers the rate a little
     low, high = stats.binom.ppf([1e-5, 1 - 1e-5], (~bad).sum(), 0.01)

@@ -63,13 +63,30 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     first = 15 - MatchOptions().margin
     last = SIZE - 1 - first
     inside = np.array([[first, 100], [last, 100], [100, first], [100, last], [first, last]], float)
-    beyond = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, 0]], float)
-    fits = least_squares(
-        clean, texture.patches(np.concatenate([inside, inside + beyond])), [*inside, *(inside + beyond)]
-    )
-    assert np.all(fits.reason == [Reason.ACCEPTED] * 5 + [Reason.OUTSIDE] * 5)
+    beyond = inside + np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, 0]])
+    places = np.concatenate([inside, beyond, np.full((2, 2), 100.0)])
+    start = places.copy()
+    start[[10, 11], [0, 1]] = np.nan
+    fits = least_squares(clean, texture.patches(places), start)
+    assert np.all(fits.reason == [Reason.ACCEPTED] * 5 + [Reason.OUTSIDE] * 5 + [Reason.TEMPLATE] * 2)
     assert np.abs(fits.place[:5] - inside).max() < 0.005
     assert np.all(np.isnan(fits.place[5:]))
+
+
+def test_as_many_steps_as_were_counted_are_enough(clean, templates):
+    """Each limit refuses the fits that need more. Where the smoothing is chosen anew the steps begin anew, too, and the
+    limit holds for either."""
+    free = least_squares(clean, templates[:32], started()[:32])
+    needed = np.zeros(32, int)
+    for limit in range(1, int(free.iterations.max()) + 1):
+        fits = least_squares(clean, templates[:32], started()[:32], MatchOptions(iterations=limit))
+        rests = fits.reason == Reason.ACCEPTED
+        assert np.all(rests | (fits.reason == Reason.DIVERGED))
+        assert np.array_equal(fits.place[rests], free.place[rests])
+        needed[rests & (needed == 0)] = limit
+    assert needed.min() > 0
+    assert np.all((needed <= free.iterations) & (free.iterations <= 2 * needed))
+    assert np.mean(needed == free.iterations) > 0.3
 
 
 def test_affine_change_without_noise(texture, templates):

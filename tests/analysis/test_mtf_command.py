@@ -198,6 +198,16 @@ def test_tone_curves(tmp_path):
     assert run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1").stderr == ""
 
 
+def test_real_numbers_have_no_tone_curve(tmp_path):
+    path = tmp_path / "real.tiff"
+    tifffile.imwrite(path, edge_frame().astype(np.float32))
+    assert run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1").exit_code == 0
+    for gamma in ("srgb", "2.2"):
+        result = run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", gamma)
+        assert result.exit_code == 2
+        assert "real numbers have no full scale" in result.stderr
+
+
 def test_a_png_that_names_its_curve_gives_a_warning(tmp_path):
     cv2.imwrite(str(tmp_path / "plain.png"), edge_frame())
     data = (tmp_path / "plain.png").read_bytes()

@@ -2,8 +2,8 @@
 
 One mutant is one expression replaced by another that a slip of the pen could have written: a sign, a factor, a term
 left out, a sine for a cosine, a check that is not made. What cannot change a number or a decision is left alone:
-annotations, decorators, docstrings, messages of errors, assertions and ``strict=`` of zip, and floats below 1e-6 or
-above 1e6, which are tolerances and guards.
+annotations, decorators, docstrings, messages of errors, assertions, ``strict=`` of zip, -1 of reshape (any
+negative number says the same), and floats below 1e-6 or above 1e6, which are tolerances and guards.
 """
 
 from __future__ import annotations
@@ -141,6 +141,8 @@ def _places(node: ast.AST, scope: str) -> Iterator[Place]:
         return
     if isinstance(node, ast.keyword) and node.arg == "strict":
         return
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "reshape":
+        node = ast.Call(node.func, [one for one in node.args if ast.unparse(one) != "-1"], node.keywords)
     if isinstance(node, ast.AnnAssign):
         if node.value is not None:
             yield from _places(node.value, scope)

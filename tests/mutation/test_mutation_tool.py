@@ -46,7 +46,8 @@ def test_each_mutant_changes_one_expression_and_still_parses():
     assert ("x / LENGTH", "(x * LENGTH)") in texts
     assert ("x / LENGTH - 0.0 * x", "(x / LENGTH)") in texts
     assert not any("x + 1" in before for before, _ in texts)
-    assert not mutants_of("toy.py", b"def pairs(a, b):\n    return zip(a, b, strict=True)\n")
+    assert not mutants_of("toy.py", b"def pairs(a, b):\n    return zip(a.reshape(-1), b, strict=True)\n")
+    assert [one.after for one in mutants_of("toy.py", b"def half(a):\n    return a.reshape(2, -1)\n")] == ["3"]
 
 
 def test_what_runs_at_import_is_met_by_all_tests_of_the_file():

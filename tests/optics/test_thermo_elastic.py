@@ -104,6 +104,17 @@ class TestMeshes:
         distance, _ = cKDTree(here.p.T + shift).query(there.p.T)
         assert distance.max() < 1e-12
 
+    @pytest.mark.parametrize("scale", [1e-4, 1e4])
+    def test_a_polyhedron_is_cut_the_same_way_at_any_size(self, scale: float) -> None:
+        for corners, spacing in BODIES.values():
+            one, other = (
+                polyhedron_mesh(corners @ TURN.T, spacing),
+                polyhedron_mesh(scale * corners @ TURN.T, scale * spacing),
+            )
+            assert other.t.shape == one.t.shape
+            distance, _ = cKDTree(one.p.T).query(other.p.T / scale)
+            assert distance.max() < 1e-12
+
     @pytest.mark.parametrize("behind", [1.0, -1.0])
     @pytest.mark.parametrize(
         "aperture", [Circle(0.3, (0.0, -0.4)), Circle(0.3, (0.0, 0.0), 0.1), Rectangle(0.3, 0.1, (0.05, -0.3))]
