@@ -141,8 +141,6 @@ def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
         d = float(np.exp(log_distance))
         if d <= 1.0 - sine:
             arc = 2.0 * np.pi
-        elif d >= 1.0 + sine:
-            arc = 0.0
         else:
             arc = 2.0 * float(np.arccos(np.clip((d * d + sine * sine - 1.0) / (2.0 * d * sine), -1.0, 1.0)))
         return float(scatter.bsdf(d)) * d * d * arc

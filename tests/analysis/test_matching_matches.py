@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.matching.consensus import consensus
-from analysis.matching.correlation import distinct_points, search
+from analysis.matching.correlation import _apart, _second, distinct_points, search
 from analysis.matching.matches import Matches, MatchOptions, Reason, match
 from tests.analysis.texture_image import Texture, detected
 
@@ -180,7 +180,8 @@ def test_points_are_distinct_and_spread(texture, frame, points):
     assert len(chosen) == 300
     assert weak[chosen[:, 1].astype(int)].mean() < 0.1
     assert len(distinct_points(np.random.default_rng(4).poisson(800, (300, 300)), 200, spacing=10, border=10)) < 5
-    assert len(distinct_points(np.full((100, 100), 7), 20, spacing=5, border=5)) == 0
+    for even in (7.0, np.nan):
+        assert len(distinct_points(np.full((100, 100), even), 20, spacing=5, border=5)) == 0
     with pytest.raises(ValueError, match="leaves nothing"):
         distinct_points(frame, 5, spacing=5, border=400)
 
@@ -198,6 +199,35 @@ def test_strong_texture_takes_no_points_from_the_weak(texture):
     assert 0.95 * 144 < occupied <= len(points) == 144
     assert np.array_equal(np.sort(cells[:occupied]), np.arange(occupied))
     assert (points[:, 1] < 140).sum() == pytest.approx(48, abs=144 - occupied)
+
+
+def test_points_apart_are_those_of_all_pairs():
+    """One after the other, each kept unless one that was kept before lies within the reach along both axes."""
+    place = np.random.default_rng(5).integers(0, 60, (400, 2))
+    for reach in (0, 1, 4):
+        kept = []
+        for one in place:
+            if all(np.abs(one - other).max() > reach for other in kept):
+                kept.append(one)
+        assert 10 < len(kept) < 400
+        assert np.array_equal(_apart(place, reach), kept)
+
+
+def test_second_peaks_count_from_four_pixels_on():
+    """The main lobe is three pixels to each side."""
+    for down, across in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1)):
+        field = np.zeros((41, 41), np.float32)
+        field[20, 20] = 0.9
+        field[20 + 3 * down, 20 + 3 * across] = 0.7
+        assert _second(field, 20, 20) == 0.0
+        field[20 + 4 * down, 20 + 4 * across] = 0.6
+        # a lower one within 5 x 5 pixels of a higher is its slope
+        assert _second(field, 20, 20) == 0.0
+        field[20 + 3 * down, 20 + 3 * across] = 0.0
+        assert _second(field, 20, 20) == pytest.approx(0.6)
+    corner = np.full((9, 9), -0.5, np.float32)
+    corner[0, 1] = 0.8
+    assert _second(corner, 0, 1) == 0.0
 
 
 def test_missing_pixels_have_no_points_around_them_and_leave_the_others(frame, points):

@@ -267,6 +267,21 @@ def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
     assert all(edge.sigma[0] < 1e-9 for edge in edges)
 
 
+def test_the_line_is_that_of_least_squares():
+    """Residuals say nothing more of its offset and slope: in units of what noise alone would make of them, second
+    order and the finer knots of the last spread function are left."""
+    left = []
+    for edge in repeats(4000)[:50]:
+        inside = np.flatnonzero(np.abs(edge.pixel_place) <= edge.core / 4)
+        x, along = edge.pixel_place[inside], inside // 64 - 31.5
+        expected, slope = CubicSpline(edge.place, edge.esf)(x), CubicSpline(edge.place, edge.lsf)(x)
+        share = (expected - edge.dark) / (edge.bright - edge.dark)
+        sigma = np.sqrt((1 - share) * edge.noise_dark**2 + share * edge.noise_bright**2)
+        parts = slope, slope * along
+        left.append([part @ (edge.pixel_grey[inside] - expected) / np.linalg.norm(part * sigma) for part in parts])
+    assert np.all(np.mean(np.square(left), axis=0) < 0.3**2)
+
+
 def test_no_bias_where_the_signal_is_long():
     edges = repeats(4000)
     for k in (8, 16, 24):
