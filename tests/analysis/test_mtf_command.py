@@ -198,6 +198,37 @@ def test_tone_curves(tmp_path):
     assert run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1").stderr == ""
 
 
+def test_a_tiff_of_8_bits_with_a_colour_profile_gives_a_warning(tmp_path):
+    frame = np.round(edge_frame() / 60.0)
+    for dtype, profile, warned in ((np.uint8, True, True), (np.uint16, True, False), (np.uint8, False, False)):
+        tifffile.imwrite(tmp_path / "one.tiff", frame.astype(dtype), iccprofile=bytes(200) if profile else None)
+        result = run(tmp_path / "one.tiff", "--roi", ROI, "--pixel-size", "7 um")
+        assert result.exit_code == 0
+        assert ("its 8-bit pages have a colour profile" in result.stderr) == warned
+
+
+def test_a_jpeg_may_have_its_tables_before_its_frame(tmp_path):
+    """The order of segments before the scan is free but for the tables that it needs."""
+    cv2.imwrite(str(tmp_path / "plain.jpg"), np.round(edge_frame() / 60.0).astype(np.uint8))
+    data = (tmp_path / "plain.jpg").read_bytes()
+    segments, place = [], 2
+    while data[place + 1] != 0xDA:  # start of scan
+        end = place + 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        segments.append(data[place:end])
+        place = end
+    frames = [one for one in segments if one[1] == 0xC0]
+    tables = [one for one in segments if one[1] != 0xC0]
+    assert len(frames) == 1
+    assert any(one[1] == 0xC4 for one in tables)
+    (tmp_path / "turned.jpg").write_bytes(data[:2] + b"".join(tables + frames) + data[place:])
+    plain, turned = (
+        run(tmp_path / name, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1", "--json")
+        for name in ("plain.jpg", "turned.jpg")
+    )
+    assert plain.exit_code == turned.exit_code == 0
+    assert json.loads(turned.stdout)["mtf"] == json.loads(plain.stdout)["mtf"]
+
+
 def test_real_numbers_have_no_tone_curve(tmp_path):
     path = tmp_path / "real.tiff"
     tifffile.imwrite(path, edge_frame().astype(np.float32))

@@ -507,7 +507,16 @@ def test_bad_points():
     for wrong in (lost, points[:, :2], points[0]):
         with pytest.raises(PlaneError, match="strip"):
             Strip.of(wrong, 1.0)
-    for noise in (0.0, -1.0, np.nan, np.ones(7), np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.ones((4, 4))):
+    for noise in (
+        0.0,
+        -1.0,
+        np.nan,
+        np.ones(7),
+        np.zeros((3, 3)),
+        np.diag([1.0, 1.0, -1.0]),
+        np.diag([1.0, 1.0, np.inf]),
+        np.ones((4, 4)),
+    ):
         with pytest.raises(PlaneError, match="strip"):
             Strip.of(points, noise)
     with pytest.raises(PlaneError, match="symmetric"):
@@ -515,6 +524,22 @@ def test_bad_points():
     for wrong in ([1.0, 2.0], [np.nan, 0, 0]):
         with pytest.raises(PlaneError, match="station"):
             Station.of(wrong)
+
+
+@pytest.mark.parametrize("method", ["tls", "corrected"])
+def test_normals_point_down(method):
+    """Whichever way a plane lies and its points are numbered."""
+    rng = np.random.default_rng(12)
+    for _ in range(20):
+        normal = rng.standard_normal(3)
+        points = rng.uniform(-1e3, 1e3, (12, 3))
+        points -= np.outer(points @ normal, normal) / (normal @ normal)
+        found = fit_plane(
+            Station.of(np.zeros(3), 0.1), Strip.of(points + rng.normal(0, 0.1, points.shape), 0.1), method
+        )
+        assert found.normal[2] < 0
+        # 0.1 m over some 1000 m, with twelve points
+        assert np.linalg.norm(np.cross(found.normal, normal / np.linalg.norm(normal))) < 1e-3
 
 
 def test_bad_pairs():
@@ -526,6 +551,8 @@ def test_bad_pairs():
         off_axis_angle(nadir, nadir)
     with pytest.raises(AngleError, match="finite tangents"):
         central_ray(nadir, [0.0])
+    with pytest.raises(AngleError, match="finite tangents"):
+        central_ray(nadir, np.where(np.arange(len(SCENE.tangents["nadir"])) == 1, np.nan, SCENE.tangents["nadir"]))
     with pytest.raises(AngleError, match="wrong tangents"):
         central_ray(nadir, 2 * SCENE.tangents["nadir"])
     with pytest.raises(AngleError, match="printed plane"):

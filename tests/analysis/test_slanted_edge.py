@@ -18,7 +18,7 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from analysis.mtf.edge_location import _direction, locate_edge, pixel_noise
-from analysis.mtf.rice import rice_bias
+from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
 from analysis.mtf.slanted_edge import EdgeError, measure_edge
 from analysis.spots.noise import NoiseModel
 
@@ -225,6 +225,8 @@ def test_spread_functions():
 def test_interpolation_and_mtf50():
     edge = measure_edge(edge_image(5))
     f = 0.3337
+    two = measure_edge(edge_image(5), frequency=[0.0, 0.5])
+    assert two.mtf == pytest.approx([1.0, edge.mtf[32]], abs=1e-12)
     assert edge.at(f)[0] == pytest.approx(transfer(np.array([f]), math.radians(5))[0], abs=ACCURACY)
     half, sigma = edge.frequency_at(0.5)
     assert transfer(np.array([half]), math.radians(5))[0] == pytest.approx(0.5, abs=ACCURACY)
@@ -308,6 +310,18 @@ def test_noise_bias_at_low_light(k):
     # what is reported knows no truth; where signal and noise are alike it is good to a factor of two
     reported = np.mean([edge.noise_bias[k] for edge in edges])
     assert 0.5 < reported / float(rice_bias(truth, across)) < 2.0
+
+
+def test_the_angle_enters_the_sigma():
+    """A slope that is wrong by d shifts row v by v d cos: 1 - mean cos(2 pi f v d cos) is k z^2 of a normal z, whose
+    mean square is 3 k^2. The angle's sigma is that of d times cos^2. Even in this noise it counts for little."""
+    for edge in repeats(200)[:3]:
+        cosine, rows = math.cos(edge.angle), np.arange(64) - 31.5
+        k = 0.5 * (2 * np.pi * edge.frequency * edge.angle_sigma / cosine) ** 2 * np.mean(rows**2)
+        signal = signal_modulus(edge.mtf, edge.sigma_along, edge.sigma_across)
+        noise = rice_sigma(signal, edge.sigma_along, edge.sigma_across)
+        assert edge.sigma**2 == pytest.approx(noise**2 + 3 * (k * edge.mtf) ** 2, rel=1e-9)
+        assert np.any(edge.sigma[:33] > 1.00001 * noise[:33])
 
 
 def test_frames_and_fixed_pattern_enter_the_sigma():

@@ -239,6 +239,18 @@ def test_drift_has_the_signs_of_the_conventions():
         camera.drifted(np.zeros(3))
 
 
+@pytest.mark.parametrize("line", LOOKS)
+def test_points_along_the_directions_close(line):
+    """Distortion, drift, bias and all: 500 km along a direction lies the ground point, to 1e-9 m of rounding."""
+    camera = replace(
+        cameras()[line], k1=20.0, k2=3e4, drift=np.array([0.02, -0.03, 0.05, 0.01]), position=np.array([0.3, -0.2, 0.1])
+    )
+    rays = make_rays(SEEN)[line]
+    body = (bias_rotation(BIAS) @ (camera.position + 5e5 * camera.directions(rays.image)).T).T
+    ground = rays.station + OFFSET + np.einsum("nij,nj->ni", rays.attitude, body)
+    assert np.abs(misclosure(camera, rays, ground, BIAS, OFFSET)).max() < 1e-14
+
+
 def close(found, expected):
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
 
@@ -303,8 +315,17 @@ def test_bad_input_is_told():
         Rays.of(np.zeros(40, int), rays.image, rays.station, rays.attitude)
     with pytest.raises(ValueError, match=r"image must be \(40, 2\)"):
         Rays.of(rays.point, rays.image[:, :1], rays.station, rays.attitude)
-    with pytest.raises(ValueError, match="must be a rotation"):
-        LineModel.of(2 * np.eye(3), INTERIOR["nadir"])
+    for matrix in (2 * np.eye(3), np.diag([1.0, 1.0, -1.0])):
+        with pytest.raises(ValueError, match="must be a rotation"):
+            LineModel.of(matrix, INTERIOR["nadir"])
+    for sizes in (((3, 2), 3, 3), ((3, 3), 2, 3), ((3, 3), 3, 4)):
+        with pytest.raises(ValueError, match=r"to_body must be \(3, 3\), interior and position \(3,\)"):
+            LineModel.of(*(np.ones(size) for size in sizes))
+    for interior, position, k1 in (([0, 0, 0], 0.0, 0.0), ([0.65, np.nan, 0], 0.0, 0.0), ([0.65, 0, 0], np.inf, 0.0)):
+        with pytest.raises(ValueError, match="finite and f positive"):
+            LineModel.of(np.eye(3), interior, [position, 0, 0], k1)
+    with pytest.raises(ValueError, match="finite and f positive"):
+        LineModel.of(np.eye(3), [0.65, 0, 0], k1=np.nan)
     with pytest.raises(ValueError, match="behind a camera"):
         partials(cameras()["nadir"], rays, 2 * rays.station, np.zeros(3), np.zeros(3))
     level = Rays.of(rays.point, rays.image, 0.0 * rays.station, np.tile(np.eye(3), (40, 1, 1)))
