@@ -2,6 +2,9 @@
 
 import os
 
+from pygments.lexers.special import TextLexer
+from sphinx.application import Sphinx
+
 project = "Space camera twin"
 author = "the space-camera-twin authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
@@ -36,3 +39,8 @@ napoleon_use_ivar = True
 add_module_names = False
 maximum_signature_line_length = 80
 toc_object_entries = False
+
+
+def setup(app: Sphinx) -> None:
+    """Tables in CSV have no colours."""
+    app.add_lexer("csv", TextLexer)
