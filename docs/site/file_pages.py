@@ -14,7 +14,7 @@ FOLDER = "reference/files"
 READ_BY = {
     "job": "`python -m twin.render FILE`; in a script `twin.load(FILE)`; a study's base `render`",
     "instrument": 'jobs and tests, which name it: `instrument: gf7_pair`; in a script `twin.load("gf7_pair")`',
-    "camera": "instruments, tests of the laboratory and designs, which name it: `camera: gf7`",
+    "camera": "`python -m twin.camera FILE`; instruments, tests and designs, which name it: `camera: gf7`",
     "camera_design": "`python -m twin.design FILE`",
     "detector": "instruments, bands of cameras and lines of payloads, which name it: `detector: monitor_ccd`",
     "error_budget": "`python -m twin.validate --only 001.table3,001.table4,001.table5`",
