@@ -42,6 +42,7 @@ def run(site: Path, folder: Path, *words: object) -> subprocess.CompletedProcess
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.slow
 def test_the_printed_script_runs(installed: Path, tmp_path: Path) -> None:
     tail = "assert runs.sizes['run'] == 100 and not runs.failed.any()\nassert twin.__file__.startswith({!r})\n"
     script = tmp_path / "script.py"
