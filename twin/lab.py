@@ -7,12 +7,11 @@ if __name__ == "__main__":
 
     end_quietly()
 
-from typing import Any
-
 import typer
 
 from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.run.command import Test, add_test
+from twin.laboratory.laboratory_tests import LABORATORY_TESTS
+from twin.run.command import add_test
 
 PROGRAM = "twin.lab"
 
@@ -35,33 +34,12 @@ def main() -> None:
     """
 
 
-def _focus() -> Test[Any]:
-    from twin.laboratory.focus_numbers import FOCUS
-    from twin.laboratory.focus_report import focus_report
-
-    return FOCUS, focus_report
-
-
-def _distortion() -> Test[Any]:
-    from twin.laboratory.distortion_numbers import DISTORTION
-    from twin.laboratory.distortion_report import distortion_report
-
-    return DISTORTION, distortion_report
-
-
-def _turntable() -> Test[Any]:
-    from twin.laboratory.turntable_numbers import TURNTABLE
-    from twin.laboratory.turntable_report import turntable_report
-
-    return TURNTABLE, turntable_report
-
-
 add_test(
     app,
     PROGRAM,
     "focus",
     resolve_focus,
-    _focus,
+    LABORATORY_TESTS["focus"],
     """Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
     shims, and the same again.
 
@@ -77,7 +55,7 @@ add_test(
     PROGRAM,
     "distortion",
     resolve_distortion,
-    _distortion,
+    LABORATORY_TESTS["distortion"],
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
 
@@ -94,7 +72,7 @@ add_test(
     PROGRAM,
     "turntable",
     resolve_turntable,
-    _turntable,
+    LABORATORY_TESTS["turntable"],
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`

@@ -7,12 +7,11 @@ if __name__ == "__main__":
 
     end_quietly()
 
-from typing import Any
-
 import typer
 
 from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
-from twin.run.command import Test, add_test
+from twin.orbit.orbit_tests import ORBIT_TESTS
+from twin.run.command import add_test
 
 PROGRAM = "twin.orbit"
 
@@ -34,40 +33,12 @@ def main() -> None:
     """
 
 
-def _angle() -> Test[Any]:
-    from twin.orbit.angle.angle_numbers import ANGLE
-    from twin.orbit.angle.angle_report import angle_report
-
-    return ANGLE, angle_report
-
-
-def _calibration() -> Test[Any]:
-    from twin.orbit.calibration.calibration_numbers import CALIBRATION
-    from twin.orbit.calibration.calibration_report import calibration_report
-
-    return CALIBRATION, calibration_report
-
-
-def _monitor() -> Test[Any]:
-    from twin.orbit.monitoring.monitoring_numbers import MONITOR
-    from twin.orbit.monitoring.monitoring_report import monitor_report
-
-    return MONITOR, monitor_report
-
-
-def _simulate() -> Test[Any]:
-    from twin.orbit.images.simulate_numbers import SIMULATE
-    from twin.orbit.images.simulate_report import simulation_report
-
-    return SIMULATE, simulation_report
-
-
 add_test(
     app,
     PROGRAM,
     "angle",
     resolve_angle,
-    _angle,
+    ORBIT_TESTS["angle"],
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
 
@@ -83,7 +54,7 @@ add_test(
     PROGRAM,
     "calibrate",
     resolve_calibration,
-    _calibration,
+    ORBIT_TESTS["calibrate"],
     """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
     parameters tested on all fields without ground control (paper 003).
 
@@ -99,7 +70,7 @@ add_test(
     PROGRAM,
     "monitor",
     resolve_monitor,
-    _monitor,
+    ORBIT_TESTS["monitor"],
     """Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
     monitor, heights as in papers 000 and 003).
 
@@ -115,7 +86,7 @@ add_test(
     PROGRAM,
     "simulate",
     resolve_simulate,
-    _simulate,
+    ORBIT_TESTS["simulate"],
     """Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 

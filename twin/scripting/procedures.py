@@ -17,6 +17,8 @@ from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.spec import Source
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
+from twin.laboratory.laboratory_tests import LABORATORY_TESTS
+from twin.orbit.orbit_tests import ORBIT_TESTS
 from twin.run.command import Test
 from twin.run.page import RunFacts, cell_text, write_test
 from twin.run.report import Report, with_warnings
@@ -119,63 +121,8 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
     return out
 
 
-# Only the test that is asked for is imported.
-def _focus() -> Test[Any]:
-    from twin.laboratory.focus_numbers import FOCUS
-    from twin.laboratory.focus_report import focus_report
-
-    return FOCUS, focus_report
-
-
-def _distortion() -> Test[Any]:
-    from twin.laboratory.distortion_numbers import DISTORTION
-    from twin.laboratory.distortion_report import distortion_report
-
-    return DISTORTION, distortion_report
-
-
-def _turntable() -> Test[Any]:
-    from twin.laboratory.turntable_numbers import TURNTABLE
-    from twin.laboratory.turntable_report import turntable_report
-
-    return TURNTABLE, turntable_report
-
-
-def _angle() -> Test[Any]:
-    from twin.orbit.angle.angle_numbers import ANGLE
-    from twin.orbit.angle.angle_report import angle_report
-
-    return ANGLE, angle_report
-
-
-def _calibrate() -> Test[Any]:
-    from twin.orbit.calibration.calibration_numbers import CALIBRATION
-    from twin.orbit.calibration.calibration_report import calibration_report
-
-    return CALIBRATION, calibration_report
-
-
-def _monitor() -> Test[Any]:
-    from twin.orbit.monitoring.monitoring_numbers import MONITOR
-    from twin.orbit.monitoring.monitoring_report import monitor_report
-
-    return MONITOR, monitor_report
-
-
-def _simulate() -> Test[Any]:
-    from twin.orbit.images.simulate_numbers import SIMULATE
-    from twin.orbit.images.simulate_report import simulation_report
-
-    return SIMULATE, simulation_report
-
-
 TESTS: dict[str, Callable[[], Test[Any]]] = {
-    "lab focus": _focus,
-    "lab distortion": _distortion,
-    "lab turntable": _turntable,
-    "orbit angle": _angle,
-    "orbit calibrate": _calibrate,
-    "orbit monitor": _monitor,
-    "orbit simulate": _simulate,
+    **{f"lab {name}": load for name, load in LABORATORY_TESTS.items()},
+    **{f"orbit {name}": load for name, load in ORBIT_TESTS.items()},
 }
 """As the commands are called -> what runs a test and what shows it."""

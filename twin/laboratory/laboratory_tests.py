@@ -1,0 +1,37 @@
+"""The tests of the laboratory by name, for the command and for scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from twin.run.command import Test
+
+
+def _focus() -> Test[Any]:
+    from twin.laboratory.focus_numbers import FOCUS
+    from twin.laboratory.focus_report import focus_report
+
+    return FOCUS, focus_report
+
+
+def _distortion() -> Test[Any]:
+    from twin.laboratory.distortion_numbers import DISTORTION
+    from twin.laboratory.distortion_report import distortion_report
+
+    return DISTORTION, distortion_report
+
+
+def _turntable() -> Test[Any]:
+    from twin.laboratory.turntable_numbers import TURNTABLE
+    from twin.laboratory.turntable_report import turntable_report
+
+    return TURNTABLE, turntable_report
+
+
+LABORATORY_TESTS: dict[str, Callable[[], Test[Any]]] = {
+    "focus": _focus,
+    "distortion": _distortion,
+    "turntable": _turntable,
+}
+"""Subcommand -> imports what runs the test and what shows it; only the test that is asked for is imported."""

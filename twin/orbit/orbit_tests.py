@@ -1,0 +1,45 @@
+"""The tests in orbit by name, for the command and for scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from twin.run.command import Test
+
+
+def _angle() -> Test[Any]:
+    from twin.orbit.angle.angle_numbers import ANGLE
+    from twin.orbit.angle.angle_report import angle_report
+
+    return ANGLE, angle_report
+
+
+def _calibrate() -> Test[Any]:
+    from twin.orbit.calibration.calibration_numbers import CALIBRATION
+    from twin.orbit.calibration.calibration_report import calibration_report
+
+    return CALIBRATION, calibration_report
+
+
+def _monitor() -> Test[Any]:
+    from twin.orbit.monitoring.monitoring_numbers import MONITOR
+    from twin.orbit.monitoring.monitoring_report import monitor_report
+
+    return MONITOR, monitor_report
+
+
+def _simulate() -> Test[Any]:
+    from twin.orbit.images.simulate_numbers import SIMULATE
+    from twin.orbit.images.simulate_report import simulation_report
+
+    return SIMULATE, simulation_report
+
+
+ORBIT_TESTS: dict[str, Callable[[], Test[Any]]] = {
+    "angle": _angle,
+    "calibrate": _calibrate,
+    "monitor": _monitor,
+    "simulate": _simulate,
+}
+"""Subcommand -> imports what runs the test and what shows it; only the test that is asked for is imported."""
