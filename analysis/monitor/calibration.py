@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
@@ -44,11 +45,13 @@ class MonitorCalibration:
     cameras: name -> calibration, in the order of the spots: each camera has two spots, left before right.
     template: calibrated shapes of all spots, in that order.
     noise: of the area CCDs.
+    ground: of a pair whose altitude is known, else None.
     """
 
     cameras: Mapping[str, CameraCalibration]
     template: SpotTemplate
     noise: NoiseModel
+    ground: GroundGeometry | None = None
 
     @property
     def spots(self) -> int:

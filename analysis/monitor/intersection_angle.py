@@ -4,8 +4,8 @@ Fig. 4).
 Each camera hangs in the base frame at a look angle: a rotation about Y, positive toward +X (forward). Its line of
 sight turns in its own frame by the rotation vector (d_beta about X, d_alpha about Y, 0); d_gamma turns about the line
 of sight and leaves it. To first order only the rotation about the common axis Y counts:
-change = d_alpha_forward - d_alpha_backward, where "forward" is the camera of the larger look angle. The two cameras'
-errors are taken as independent.
+change = d_alpha_forward - d_alpha_backward, where "forward" is the camera of the larger look angle. Unless the
+covariance between the two cameras is given, their errors are taken as independent.
 """
 
 from __future__ import annotations
@@ -27,16 +27,34 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class IntersectionAngleChange:
-    """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) its standard deviation."""
+    """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) standard deviation of its error;
+    sigma_noise_rad: of that what the noise of the images does, None where that is all.
+    """
 
     change_rad: Array
     sigma_rad: Array
+    sigma_noise_rad: Array | None = None
+
+    @property
+    def noise_rad(self) -> Array:
+        """(...) standard deviation by the noise of the images alone, rad."""
+        return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
+
+    def at(self, states: slice) -> IntersectionAngleChange:
+        """Those of some states, along the first axis.
+
+        Args:
+            states: which.
+        """
+        noise = None if self.sigma_noise_rad is None else self.sigma_noise_rad[states]
+        return IntersectionAngleChange(self.change_rad[states], self.sigma_rad[states], noise)
 
     def to_dict(self) -> dict[str, Any]:
-        """change_arcsec and change_arcsec_sigma: floats, or nested lists for arrays."""
+        """change_arcsec, change_arcsec_sigma and change_arcsec_sigma_noise: floats, or nested lists for arrays."""
         return {
             "change_arcsec": (np.asarray(self.change_rad) / ARCSEC).tolist(),
             "change_arcsec_sigma": (np.asarray(self.sigma_rad) / ARCSEC).tolist(),
+            "change_arcsec_sigma_noise": (np.asarray(self.noise_rad) / ARCSEC).tolist(),
         }
 
 
@@ -50,11 +68,24 @@ def first_order(forward: CameraParameters, backward: CameraParameters) -> Inters
 
 
 def exact(
-    forward: CameraParameters, backward: CameraParameters, forward_look_rad: float, backward_look_rad: float
+    forward: CameraParameters,
+    backward: CameraParameters,
+    forward_look_rad: float,
+    backward_look_rad: float,
+    across: Array | None = None,
+    across_total: Array | None = None,
 ) -> IntersectionAngleChange:
     """Change of the angle between the two turned lines of sight in space, without approximation.
 
-    forward_look_rad, backward_look_rad: look angles, rad, within +-pi/2 and different. Raises ValueError otherwise.
+    Raises ValueError for look angles that are not within +-pi/2 and different.
+
+    Args:
+        forward: changes of the camera of the larger look angle.
+        backward: of the other.
+        forward_look_rad: its look angle, rad.
+        backward_look_rad: likewise.
+        across: (..., 4, 4) covariance of the forward with the backward parameters by noise, None for none.
+        across_total: likewise of the whole error.
     """
     for name, look in (("forward", forward_look_rad), ("backward", backward_look_rad)):
         if not (math.isfinite(look) and abs(look) < math.pi / 2):
@@ -69,10 +100,10 @@ def exact(
         u, v = (_line_of_sight(a, b, look) for (a, b), look in zip(values, looks, strict=True))
         return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), np.sum(u * v, axis=-1)))
 
-    variance: Any = 0.0
     step = 1e-5
-    for k, camera in enumerate((forward, backward)):
-        slopes = []
+    slopes: list[Array] = []
+    for k in range(2):
+        both = []
         for which in (0, 1):
             ends = []
             for sign in (1, -1):
@@ -81,10 +112,22 @@ def exact(
                 pair[which] = pair[which] + sign * step
                 moved[k] = (pair[0], pair[1])
                 ends.append(angle(moved))
-            slopes.append((ends[0] - ends[1]) / (2 * step))
-        slope = np.stack(np.broadcast_arrays(*slopes), axis=-1)
-        variance = variance + np.einsum("...i,...ij,...j->...", slope, camera.covariance[..., :2, :2], slope)
-    return IntersectionAngleChange(angle(given) - nominal, np.sqrt(variance))
+            both.append((ends[0] - ends[1]) / (2 * step))
+        slopes.append(np.stack(np.broadcast_arrays(*both), axis=-1))
+
+    def sigma(own: tuple[Array, Array], shared: Array | None) -> Array:
+        variance: Any = 0.0
+        for slope, covariance in zip(slopes, own, strict=True):
+            variance = variance + np.einsum("...i,...ij,...j->...", slope, covariance[..., :2, :2], slope)
+        if shared is not None:
+            variance = variance + 2 * np.einsum("...i,...ij,...j->...", slopes[0], shared[..., :2, :2], slopes[1])
+        return np.sqrt(variance)
+
+    change = angle(given) - nominal
+    noise = sigma((forward.covariance, backward.covariance), across)
+    if forward.total is None or backward.total is None:
+        return IntersectionAngleChange(change, noise)
+    return IntersectionAngleChange(change, sigma((forward.total, backward.total), across_total), noise)
 
 
 def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> Array:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC, UM_PER_M
 
-__all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "observability"]
+__all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "gain", "observability"]
 
 Array = NDArray[np.float64]
 _SHOWN = (
@@ -69,13 +69,38 @@ def fit(
         rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     """
     data, spread = np.asarray(shift, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-    spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
     if data.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
         raise ValueError(
             f"model fit: shift must be (..., 4), covariance (..., 4, 4), found {data.shape}, {spread.shape}"
         )
     if not (np.all(np.isfinite(data)) and np.all(np.isfinite(spread))):
         raise ValueError("model fit: shift and covariance must be finite")
+    weights = gain(spread, spot_jacobian, parameter_jacobian, motion_names, rank_tolerance)
+    values = np.einsum("...ij,...j->...i", weights, data)
+    result = weights @ spread @ np.swapaxes(weights, -1, -2)
+    return CameraParameters.from_vector(values, result)
+
+
+def gain(
+    covariance: ArrayLike,
+    spot_jacobian: ArrayLike,
+    parameter_jacobian: ArrayLike,
+    motion_names: Sequence[str] | None = None,
+    rank_tolerance: float = 1e-8,
+) -> Array:
+    """Parameters per pixel of shift, (..., 4, 4), of `fit`.
+
+    Raises RankError and ValueError as `fit`.
+
+    Args:
+        covariance: (..., 4, 4) px^2, positive definite, or all zero (no noise: equal weights).
+        spot_jacobian: (4, P) px per unit of motion.
+        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to 4.
+        motion_names: of the P motions, for messages.
+        rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
+    """
+    spread = np.asarray(covariance, dtype=np.float64)
+    spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
     _check_rank(spots, motion_names, rank_tolerance)
     noiseless = not np.any(spread)
     try:
@@ -87,10 +112,7 @@ def fit(
     # pinv by QR-like SVD of the column-scaled matrix: units of motion differ by many orders of magnitude
     length = np.linalg.norm(white, axis=-2, keepdims=True)
     inverse = np.linalg.pinv(white / length, rcond=rank_tolerance * 1e-3) / np.swapaxes(length, -1, -2)
-    gain = parameters @ inverse @ np.linalg.inv(root)
-    values = np.einsum("...ij,...j->...i", gain, data)
-    result = gain @ spread @ np.swapaxes(gain, -1, -2)
-    return CameraParameters.from_vector(values, result)
+    return np.asarray(parameters @ inverse @ np.linalg.inv(root))
 
 
 @dataclass(frozen=True, eq=False)

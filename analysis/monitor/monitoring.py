@@ -97,7 +97,9 @@ class CameraParameters:
 
     d_alpha_rad, d_beta_rad, d_gamma_rad: rotations of the camera about Y, X, Z. d_f_m: change of the principal
         distance.
-    covariance: (..., 4, 4) in order d_alpha, d_beta, d_gamma (rad), d_f (m).
+    covariance: (..., 4, 4) in order d_alpha, d_beta, d_gamma (rad), d_f (m): of the noise of the images.
+    total: likewise, of the noise and of what the estimator makes wrong of stated disturbances; None where none are
+        stated.
     """
 
     d_alpha_rad: Array
@@ -105,15 +107,17 @@ class CameraParameters:
     d_gamma_rad: Array
     d_f_m: Array
     covariance: Array
+    total: Array | None = None
 
     @classmethod
-    def from_vector(cls, values: ArrayLike, covariance: ArrayLike) -> CameraParameters:
-        """From (..., 4) values [d_alpha, d_beta, d_gamma, d_f] and their (..., 4, 4) covariance."""
+    def from_vector(cls, values: ArrayLike, covariance: ArrayLike, total: ArrayLike | None = None) -> CameraParameters:
+        """From (..., 4) values [d_alpha, d_beta, d_gamma, d_f] and their (..., 4, 4) covariances."""
         vector, spread = np.asarray(values, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
         if vector.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
             raise ValueError(f"camera parameters: need (..., 4) and (..., 4, 4), found {vector.shape}, {spread.shape}")
         spread = np.broadcast_to(spread, (*vector.shape, 4))
-        return cls(vector[..., 0], vector[..., 1], vector[..., 2], vector[..., 3], spread)
+        whole = None if total is None else np.broadcast_to(np.asarray(total, np.float64), spread.shape)
+        return cls(vector[..., 0], vector[..., 1], vector[..., 2], vector[..., 3], spread, whole)
 
     @property
     def vector(self) -> Array:
@@ -121,17 +125,39 @@ class CameraParameters:
         return np.stack([self.d_alpha_rad, self.d_beta_rad, self.d_gamma_rad, self.d_f_m], axis=-1)
 
     @property
+    def error_covariance(self) -> Array:
+        """(..., 4, 4): the total one; where no disturbances are stated, that of the noise."""
+        return self.covariance if self.total is None else self.total
+
+    @property
     def sigma(self) -> Array:
-        """(..., 4): standard deviations, in the order and units of `vector`."""
+        """(..., 4): standard deviations of the error, in the order and units of `vector`; see `error_covariance`."""
+        return np.sqrt(np.diagonal(self.error_covariance, axis1=-2, axis2=-1))
+
+    @property
+    def sigma_noise(self) -> Array:
+        """(..., 4): standard deviations by the noise of the images alone."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
+    def at(self, states: slice) -> CameraParameters:
+        """Those of some states, along the first axis.
+
+        Args:
+            states: which.
+        """
+        total = None if self.total is None else self.total[states]
+        return CameraParameters.from_vector(self.vector[states], self.covariance[states], total)
+
     def to_dict(self) -> dict[str, Any]:
-        """d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec, d_f_um and <key>_sigma: floats, or nested lists for arrays."""
-        values, sigma = self.vector, self.sigma
+        """d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec, d_f_um, <key>_sigma and <key>_sigma_noise: floats, or nested
+        lists for arrays.
+        """
+        values, sigma, noise = self.vector, self.sigma, self.sigma_noise
         out: dict[str, Any] = {}
         for k, (key, scale) in enumerate(zip(PARAMETERS, PER_SI, strict=True)):
             out[key] = (values[..., k] * scale).tolist()
             out[f"{key}_sigma"] = (sigma[..., k] * scale).tolist()
+            out[f"{key}_sigma_noise"] = (noise[..., k] * scale).tolist()
         return out
 
 

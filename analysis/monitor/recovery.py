@@ -2,109 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from analysis.monitor import intersection_angle, model_fit, monitoring
+from analysis.monitor import intersection_angle
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitor.disturbances import Consistency, Disturbances, consistency
+from analysis.monitor.estimators import COORDINATES, Shifts, applicable
+from analysis.monitor.ground_error import GroundError, GroundGeometry
 from analysis.monitor.intersection_angle import IntersectionAngleChange
-from analysis.monitor.monitoring import CameraParameters, MonitorGeometry, shift_covariance
+from analysis.monitor.monitoring import CameraParameters, shift_covariance
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import SpotPositions, difference_covariance
 
-__all__ = ["CENTROIDS", "ESTIMATORS", "Estimator", "Recovery", "angles", "estimates", "measure_spots", "recover"]
+__all__ = ["CENTROIDS", "Estimates", "Recovery", "estimates", "measure_spots", "recover"]
 
 Array = NDArray[np.float64]
 CENTROIDS = ("ml", "gaussian", "energy")
 
-Reading = Callable[[Array, Array, Array, CameraCalibration], CameraParameters]
-"""Spot positions before and after, (S, 2 sides, 2) px, covariance of after - before, (S, 4, 4) px^2 (zeros without
-noise), and what is calibrated of the camera -> the camera's changes, arrays (S,).
-"""
 
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What all estimators make of spot positions, for S states.
 
-@dataclass(frozen=True)
-class Estimator:
-    """How shifts of a camera's two spots become changes of the camera.
-
-    title: for readers, a word or two. note: for readers, what it is. coefficients: of a calibrated camera, the (4, 4)
-        matrix of its readings to first order as `monitoring.coefficients` gives it.
-    reading: what it says; None where the matrix is all of it.
+    parameters: camera -> estimator -> changes with arrays of shape (S,).
+    angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
+    ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
     """
 
-    title: str
-    note: str
-    coefficients: Callable[[CameraCalibration], Array]
-    reading: Reading | None = None
-
-    def parameters(self, before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
-        """The camera's changes, see `Reading`.
-
-        Args:
-            before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
-            after: of the states, likewise.
-            covariance: of after - before, (..., 4, 4), px^2.
-            camera: its calibration.
-        """
-        if self.reading is not None:
-            return self.reading(before, after, covariance, camera)
-        return CameraParameters.from_vector(*monitoring.linear(self.coefficients(camera), before, after, covariance))
-
-
-def _formula(
-    name: str,
-    title: str,
-    note: str,
-    formula: Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParameters] | None = None,
-) -> Estimator:
-    """A set of formulas of `monitoring`."""
-    reading: Reading | None = None
-    if formula is not None:
-        exact = formula
-
-        def reading(before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
-            return exact(before, after, covariance, camera.geometry)
-
-    return Estimator(title, note, lambda camera: monitoring.coefficients(name, camera.geometry), reading)
-
-
-def _model_coefficients(camera: CameraCalibration) -> Array:
-    gain: Array = camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian, rcond=1e-14)
-    return gain
-
-
-def _model(before: Array, after: Array, covariance: Array, camera: CameraCalibration) -> CameraParameters:
-    shift = (after - before).reshape(-1, 4)
-    return model_fit.fit(shift, covariance, camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
-
-
-ESTIMATORS: dict[str, Estimator] = {
-    "paper_single": _formula(
-        "paper_single",
-        "printed, single",
-        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed",
-        monitoring.paper_single,
-    ),
-    "paper_joint": _formula("paper_joint", "printed, joint", "joint changes as Wang et al. (2018) print them"),
-    "derived": _formula(
-        "derived",
-        "derived",
-        "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
-    ),
-    "model": Estimator(
-        "model",
-        "weighted least squares on all spot coordinates with the Jacobian of the traced instrument",
-        _model_coefficients,
-        _model,
-    ),
-}
-"""Name in the results -> estimator, in the order of tables. A new one is added here: it then stands in recovered.json,
-crosstalk.json, the tables and the figures.
-"""
+    parameters: Mapping[str, Mapping[str, CameraParameters]]
+    angle: Mapping[str, IntersectionAngleChange]
+    ground: Mapping[str, GroundError]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +47,7 @@ class Recovery:
     shift_covariance: (S, cameras, 4, 4) px^2 of after - before.
     parameters: camera -> estimator -> changes with arrays of shape (S,).
     angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
+    ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
     """
 
     before: Array
@@ -124,6 +57,46 @@ class Recovery:
     shift_covariance: Array
     parameters: Mapping[str, Mapping[str, CameraParameters]]
     angle: Mapping[str, IntersectionAngleChange]
+    ground: Mapping[str, GroundError] = field(default_factory=dict)
+
+    def at(self, states: slice) -> Recovery:
+        """Those of some states.
+
+        Args:
+            states: which.
+        """
+        return Recovery(
+            self.before[states],
+            self.after[states],
+            self.sigma_before[states],
+            self.sigma_after[states],
+            self.shift_covariance[states],
+            {name: {e: p.at(states) for e, p in every.items()} for name, every in self.parameters.items()},
+            {e: a.at(states) for e, a in self.angle.items()},
+            {e: g.at(states) for e, g in self.ground.items()},
+        )
+
+    @property
+    def shift(self) -> Array:
+        """(S, 4 x cameras) after - before in the order of the spots, px."""
+        return (self.after - self.before).reshape(len(self.after), -1)
+
+    @property
+    def joint_covariance(self) -> Array:
+        """(S, 4 x cameras, 4 x cameras) of ``shift``, px^2; spots are independent of each other."""
+        return joint(self.shift_covariance)
+
+    def consistency(
+        self, disturbances: Disturbances, state: int = 0, others: Mapping[str, Array] | None = None
+    ) -> Consistency:
+        """Do the shifts of one state agree with what is stated?
+
+        Args:
+            disturbances: stated.
+            state: its number.
+            others: see `analysis.monitor.disturbances.consistency`.
+        """
+        return consistency(self.shift[state], self.joint_covariance[state], disturbances, others)
 
 
 def measure_spots(
@@ -155,6 +128,7 @@ def recover(
     calibration: MonitorCalibration,
     centroid: str = "ml",
     threads: int = 1,
+    disturbances: Disturbances | None = None,
 ) -> Recovery:
     """Recover all parameters.
 
@@ -164,6 +138,8 @@ def recover(
         calibration: of the nominal instrument; C must be its number of spots.
         centroid: `ml`, `gaussian` or `energy`.
         threads: for the fits; results do not depend on it.
+        disturbances: what is stated to move; without it there is no `posterior`, and all sigmas are those of the noise
+            alone.
     """
     states, spots, frames = after.shape[0], after.shape[1], after.shape[2]
     if spots != calibration.spots or before.shape[-4] != spots:
@@ -171,40 +147,77 @@ def recover(
     first = measure_spots(_flat(mean_frames(before)), before.shape[-3], calibration, centroid, threads)
     second = measure_spots(_flat(mean_frames(after)), frames, calibration, centroid, threads)
     spread = difference_covariance(first, second, calibration.noise).reshape(states, len(calibration.cameras), 2, 2, 2)
-    joint = shift_covariance(spread[:, :, 0], spread[:, :, 1])
+    each = shift_covariance(spread[:, :, 0], spread[:, :, 1])
     start = np.broadcast_to(first.position.reshape(-1, spots, 2), (states, spots, 2))
     end = second.position.reshape(states, spots, 2)
-    parameters = estimates(start, end, joint, calibration.cameras)
+    found = estimates(start, end, each, calibration.cameras, disturbances, calibration.ground)
     return Recovery(
         before=start,
         after=end,
         sigma_before=np.broadcast_to(_sigma(first).reshape(-1, spots, 2), (states, spots, 2)),
         sigma_after=_sigma(second).reshape(states, spots, 2),
-        shift_covariance=joint,
-        parameters=parameters,
-        angle=angles(parameters, calibration.cameras),
+        shift_covariance=each,
+        parameters=found.parameters,
+        angle=found.angle,
+        ground=found.ground,
     )
 
 
 def estimates(
-    start: Array, end: Array, joint: Array, cameras: Mapping[str, CameraCalibration]
-) -> dict[str, dict[str, CameraParameters]]:
+    start: Array,
+    end: Array,
+    covariance: Array,
+    cameras: Mapping[str, CameraCalibration],
+    disturbances: Disturbances | None = None,
+    ground: GroundGeometry | None = None,
+) -> Estimates:
     """All estimators on spot positions.
-
-    Returns camera -> estimator -> changes with arrays of shape (S,).
 
     Args:
         start: (S, C, 2) spot positions (row, column) before, px, two of each camera in their order.
         end: those after, likewise.
-        joint: (S, cameras, 4, 4) covariance of after - before, px^2; all zero for positions without noise.
+        covariance: (S, cameras, 4, 4) covariance of after - before, px^2; all zero for positions without noise.
         cameras: what is calibrated of each.
+        disturbances: what is stated to move, None for nothing.
+        ground: of a pair whose altitude is known.
     """
-    parameters: dict[str, dict[str, CameraParameters]] = {}
-    for k, (name, camera) in enumerate(cameras.items()):
-        pair = slice(2 * k, 2 * k + 2)
-        seen = (start[:, pair], end[:, pair], joint[:, k], camera)
-        parameters[name] = {title: estimator.parameters(*seen) for title, estimator in ESTIMATORS.items()}
-    return parameters
+    shifts = Shifts(start, end, joint(covariance), cameras, disturbances)
+    parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
+    angle: dict[str, IntersectionAngleChange] = {}
+    errors: dict[str, GroundError] = {}
+    for title, estimator in applicable(disturbances).items():
+        gain, values = estimator.gain(shifts), estimator.read(shifts)
+        noise = gain @ shifts.covariance @ np.swapaxes(gain, -1, -2)
+        total = None if disturbances is None else noise + disturbances.misfit(gain)
+        own = [slice(COORDINATES * k, COORDINATES * (k + 1)) for k in range(len(cameras))]
+        for name, part in zip(cameras, own, strict=True):
+            whole = None if total is None else total[..., part, part]
+            parameters[name][title] = CameraParameters.from_vector(values[..., part], noise[..., part, part], whole)
+        if len(cameras) == 2:
+            one, two = _pair(cameras)
+            first, second = (own[list(cameras).index(name)] for name in (one, two))
+            across = noise[..., first, second], None if total is None else total[..., first, second]
+            looks = cameras[one].look_rad, cameras[two].look_rad
+            both = parameters[one][title], parameters[two][title]
+            angle[title] = intersection_angle.exact(*both, *looks, *across)
+            if ground is not None:
+                distances = [camera.geometry.focal_length_m for camera in cameras.values()]
+                f = (distances[0], distances[1])
+                errors[title] = ground.error(values, noise, noise if total is None else total, f)
+    return Estimates(parameters, angle, errors)
+
+
+def joint(covariance: Array) -> Array:
+    """(S, 4 K, 4 K) from the covariances (S, K, 4, 4) of K cameras' shifts, which are independent of each other.
+
+    Args:
+        covariance: px^2.
+    """
+    states, cameras = covariance.shape[:2]
+    out = np.zeros((states, cameras, COORDINATES, cameras, COORDINATES))
+    for k in range(cameras):
+        out[:, k, :, k, :] = covariance[:, k]
+    return out.reshape(states, cameras * COORDINATES, cameras * COORDINATES)
 
 
 def _flat(mean: Array) -> Array:
@@ -215,12 +228,7 @@ def _sigma(positions: SpotPositions) -> Array:
     return np.stack([positions.sigma_row, positions.sigma_column], axis=-1)
 
 
-def angles(
-    parameters: Mapping[str, Mapping[str, CameraParameters]], cameras: Mapping[str, CameraCalibration]
-) -> dict[str, IntersectionAngleChange]:
-    """Change of the angle between the two lines of sight, by every estimator; the forward camera is the reference."""
-    if len(parameters) != 2:
-        return {}
-    one, two = sorted(parameters, key=lambda name: -cameras[name].look_rad)
-    looks = cameras[one].look_rad, cameras[two].look_rad
-    return {name: intersection_angle.exact(parameters[one][name], parameters[two][name], *looks) for name in ESTIMATORS}
+def _pair(cameras: Mapping[str, CameraCalibration]) -> tuple[str, str]:
+    """The forward camera, the reference of the angle between two, and the other."""
+    one, two = sorted(cameras, key=lambda name: -cameras[name].look_rad)
+    return one, two

@@ -14,7 +14,8 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.specs.camera import CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
-from scenes.specs.job import NodeInfo, noll, perturbation_issues
+from scenes.specs.course import noll
+from scenes.specs.job import NodeInfo, perturbation_issues
 from scenes.yaml.errors import InputError
 
 

@@ -28,7 +28,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import THICKNESS, behind
 from scenes.specs.channel import BASE
 
-SPACING = 0.06
+SPACING = 0.25
 """Longest edge of the finite elements in a prism, metres. A linear field is met exactly by any mesh."""
 CELLS = 8
 """Finite elements across a mirror."""
@@ -171,7 +171,7 @@ class ThermalModel:
         fields = self.fields(temperatures)
         thermal: State = {}
         for path, field in fields.items():
-            if self._owner(path) in (None, path):
+            if self._owner(path) in (None, path) and field != Temperature():
                 thermal = compose(thermal, self._warmed(path, field, progress), self._bodies)
         return compose(thermal, motions or {}, self._bodies)
 

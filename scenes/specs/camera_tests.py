@@ -6,8 +6,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.collimator import Collimator
+from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
-from scenes.specs.job import FigureTerm, PerturbationSpec, Term, noll
+from scenes.specs.job import FigureTerm, PerturbationSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector3
 from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, Whole

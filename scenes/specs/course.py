@@ -1,15 +1,17 @@
 """A course: temperatures and motions that change with time, as a job's file gives them in a table."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
+from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.yaml.errors import KeyPath, Problem
+from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Name, Paths, Reference, Spec
 from scenes.yaml.units import (
@@ -28,6 +30,27 @@ TemperatureGradient = Annotated[tuple[float, float, float], Vector(Quantity(TEMP
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
 Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
 ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
+_TERM = re.compile(r"Z([1-9][0-9]{0,3})")
+
+
+def noll(term: str) -> int:
+    """The Noll index of a figure term: 5 for "Z5".
+
+    Raises:
+        Problem: not Z1 .. Z66.
+    """
+    match = _TERM.fullmatch(term)
+    if match is None or int(match[1]) > MAX_NOLL:
+        raise Problem("not a Zernike term", shown(term), f"Z1 .. Z{MAX_NOLL} (Noll's numbering)")
+    return int(match[1])
+
+
+def _is_term(term: str) -> str:
+    noll(term)
+    return term
+
+
+Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
 Moment = Annotated[float, Quantity(MOMENT, largest="100000 h")]
 
 NO_MOTION = (0.0, 0.0, 0.0)

@@ -9,6 +9,7 @@ from scenes.specs.autocollimator_test import AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
 from scenes.specs.detector import DetectorSpec
+from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
@@ -67,6 +68,12 @@ FILE_KINDS = (
     ),
     FileKind("camera_design", CameraDesignSpec, "an optimisation of a camera", "twin.design"),
     FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
+    FileKind(
+        "disturbances",
+        DisturbancesSpec,
+        "a list of disturbances",
+        place="a job's `disturbances: FILE`",
+    ),
     FileKind("error_budget", ErrorBudgetSpec, "an error budget", place=_VALIDATED),
     FileKind("principle_experiment", AutocollimatorTestSpec, "a test of two autocollimators", place=_VALIDATED),
     FileKind("focus_test", FocusTestSpec, "a focus test", "twin.lab focus"),

@@ -17,7 +17,7 @@ from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Spec, Text, Whole, name_in
-from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT, TIME
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT, TIME
 
 Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]
 
@@ -248,6 +248,9 @@ class InstrumentSpec(Spec):
         temperature: at which everything has its nominal shape, kelvin.
         materials: what the parts are made of.
         baffles: by name; none by default.
+        altitude: of its orbit, metres; for what changes of a pair's cameras do to points on the ground.
+        disturbances: what is expected to move, unless a job says otherwise: a file of scenes/library/disturbances or of
+            one's own.
     """
 
     name: Name
@@ -258,6 +261,8 @@ class InstrumentSpec(Spec):
     temperature: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="1000 K")] = 293.15
     materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec()
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
+    altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
+    disturbances: Reference | None = None
 
 
 Steadiness = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, above_zero=True, largest="100 K")]

@@ -1,14 +1,12 @@
 """A job: which instrument, what is perturbed, what changes with time, what is rendered and how."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
@@ -21,9 +19,11 @@ from scenes.specs.course import (
     Shift,
     TemperatureChange,
     TemperatureGradient,
+    Term,
 )
+from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
@@ -59,27 +59,6 @@ FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
 
 ACTIONS = ("rotate", "shift", "figure", "scale", "temperature")
 """What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
-_TERM = re.compile(r"Z([1-9][0-9]{0,3})")
-
-
-def noll(term: str) -> int:
-    """The Noll index of a figure term: 5 for "Z5".
-
-    Raises:
-        Problem: not Z1 .. Z66.
-    """
-    match = _TERM.fullmatch(term)
-    if match is None or int(match[1]) > MAX_NOLL:
-        raise Problem("not a Zernike term", shown(term), f"Z1 .. Z{MAX_NOLL} (Noll's numbering)")
-    return int(match[1])
-
-
-def _is_term(term: str) -> str:
-    noll(term)
-    return term
-
-
-Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
 
 
 class TemperatureSpec(Spec):
@@ -232,6 +211,8 @@ class JobSpec(Spec):
             file.
         perturb: node path -> perturbation; empty for the nominal state.
         course: temperatures and motions that change with time, None for a single state.
+        disturbances: what is expected to move, on which the sigmas rest: a file, or changes of single lines of it; the
+            instrument's own by default, `none` for the noise alone.
         render: what is rendered.
         analysis: how it is analysed.
     """
@@ -239,6 +220,7 @@ class JobSpec(Spec):
     instrument: Reference
     perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
+    disturbances: JobDisturbances | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
     analysis: Annotated[AnalysisSpec, NothingIsEmpty] = AnalysisSpec()
 

@@ -1,8 +1,7 @@
 """Specifications from files: from the library that comes with the twin, by name, or from a user's own files, by path.
 
-The library's folders are scenes/library/cameras, scenes/library/instruments, scenes/library/detectors,
-scenes/library/payloads, scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's name without
-.yaml is its name there.
+The library's folders are cameras, instruments, detectors, payloads, disturbances and budgets in scenes/library,
+scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's name without .yaml is its name there.
 """
 
 from pathlib import Path
@@ -13,6 +12,7 @@ from scenes.specs.camera import CameraDesignSpec, CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
 from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
+from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
@@ -32,7 +32,7 @@ SCENES = Path(__file__).resolve().parent.parent
 LIBRARY = SCENES / "library"
 EXAMPLES = SCENES / "examples"
 CAMERAS, INSTRUMENTS, DETECTORS = "cameras", "instruments", "detectors"
-LAB, BUDGETS, ORBIT, PAYLOADS = "lab", "budgets", "orbit", "payloads"
+LAB, BUDGETS, ORBIT, PAYLOADS, DISTURBANCES = "lab", "budgets", "orbit", "payloads", "disturbances"
 
 
 def _folder(name: str) -> Path:
@@ -85,6 +85,32 @@ def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = N
     paths_of_cameras(instrument)
     path_of_detector(instrument)
     return instrument
+
+
+def load_disturbances(name_or_path: str | Path, relative_to: str | Path | None = None) -> DisturbancesSpec:
+    """Read a disturbances file; arguments and errors as `load_instrument`."""
+    return _load(DisturbancesSpec, DISTURBANCES, name_or_path, relative_to)
+
+
+def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
+    """What is stated for a job: its own file or its instrument's, with the job's changes; None for nothing.
+
+    Raises:
+        InputError: there is no such file or it is not valid, or a change of what it does not have.
+    """
+    asked = job.disturbances
+    owner: Spec = job
+    reference = None if asked is None else asked.file
+    key: KeyPath = ("disturbances", "file")
+    if reference is None:
+        owner, reference, key = instrument, instrument.disturbances, ("disturbances",)
+    if reference is None or reference == NONE:
+        if asked is not None and (asked.causes or asked.without):
+            text = "there is no disturbances file that could be changed"
+            raise job.error(text, ("disturbances",), allowed="the name of one as file")
+        return None
+    stated = validate(DisturbancesSpec, read_yaml(_find(DISTURBANCES, reference, owner, key)))
+    return stated if asked is None else stated.changed(asked)
 
 
 def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:

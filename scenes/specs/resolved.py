@@ -8,9 +8,11 @@ from pydantic import Field
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
+from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, TargetsSpec
 from scenes.specs.load import (
+    find_disturbances,
     instrument_path,
     load_band_detectors,
     load_camera,
@@ -37,6 +39,7 @@ class ResolvedJob(Spec):
         cameras: what `instrument.cameras.<name>.camera` says -> prescription.
         detector: data sheet of the monitor's area CCDs.
         line_detectors: as cameras -> data sheet of the line CCD on which targets are imaged, None without targets.
+        disturbances: on which the sigmas rest, the job's changes made; None for the noise alone.
     """
 
     job: JobSpec
@@ -44,6 +47,7 @@ class ResolvedJob(Spec):
     cameras: Annotated[Paths[CameraSpec], Field(min_length=1)]
     detector: DetectorSpec
     line_detectors: Paths[DetectorSpec] | None = None
+    disturbances: DisturbancesSpec | None = None
 
     @property
     def frames(self) -> int:
@@ -94,6 +98,7 @@ def resolve_job(job: JobSpec) -> ResolvedJob:
         cameras=FrozenMap(cameras),
         detector=detector,
         line_detectors=line_detectors,
+        disturbances=find_disturbances(job, instrument),
     )
 
 
@@ -124,4 +129,9 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
             raise resolved.error(text, ("line_detectors",), allowed=allowed)
     source = resolved.source
     job = resolved.job.with_source(Source(source.file, source.lines, ("job",)))
-    return resolved.model_copy(update={"job": job})
+    changed: dict[str, Spec] = {"job": job}
+    if resolved.disturbances is not None:
+        changed["disturbances"] = resolved.disturbances.with_source(
+            Source(source.file, source.lines, ("disturbances",))
+        )
+    return resolved.model_copy(update=changed)

@@ -110,10 +110,16 @@ class Quantity:
 class Vector:
     """Annotation that makes a tuple field a list of quantities of one sort and fixed length, in YAML `[0 um, 0 um, 3
     um]` or, with one unit for all, `0 0 3 um`.
+
+    Attributes:
+        of: what each of them is.
+        length: how many there are.
+        alike: `3 um` is allowed, too, and means `3 3 3 um`.
     """
 
     of: Quantity
     length: int = 3
+    alike: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         item = self.of.__get_pydantic_core_schema__(float, handler)
@@ -124,18 +130,18 @@ class Vector:
         item = self.of.__get_pydantic_json_schema__(schema, handler)
         listed = {"type": "array", "items": item, "minItems": self.length, "maxItems": self.length}
         text = {"type": "string", "pattern": pattern(self.of.kind, self.length), "description": item["description"]}
-        return {"anyOf": [listed, text]}
+        return {"anyOf": [listed, text, *([item] if self.alike else [])]}
 
     def _check_length(self, value: object) -> object:
         if isinstance(value, str):
-            value = split_row(value, self.length) or value
+            value = split_row(value, self.length) or ([value] * self.length if self.alike else value)
         if isinstance(value, list | tuple) and len(value) == self.length:
             return value
         example = ", ".join([self.of.kind.example] * self.length)
         found = f"{len(value)} of them" if isinstance(value, list | tuple) else shown(value)
-        raise Problem(
-            f"not a list of {self.length} quantities", found, f"{self.length} times {self.of.kind.name}: [{example}]"
-        )
+        allowed = f"{self.length} times {self.of.kind.name}: [{example}]"
+        one = f"{self.of.kind.name} for all, {self.of.kind.example}, or " if self.alike else ""
+        raise Problem(f"not a list of {self.length} quantities", found, one + allowed)
 
 
 @dataclass(frozen=True)

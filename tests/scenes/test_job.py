@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from scenes.specs.job import NodeInfo, check_nodes, noll
+from scenes.specs.course import noll
+from scenes.specs.job import NodeInfo, check_nodes
 from scenes.specs.load import EXAMPLES, load_job
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml

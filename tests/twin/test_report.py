@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from scenes.specs.resolved import resolve
 from twin.main_job.crosstalk_content import is_wrong
 from twin.main_job.render_job import STAGES, render_job

@@ -12,8 +12,8 @@ import pytest
 import xarray as xr
 
 import twin
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PARAMETERS
-from analysis.monitor.recovery import ESTIMATORS
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, parse_yaml
 from twin.main_job.render_results import stated

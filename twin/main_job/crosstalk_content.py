@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import body_name
 from twin.main_job.report_labels import PARAMETERS

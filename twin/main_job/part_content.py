@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
-from analysis.monitor.recovery import ESTIMATORS
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from twin.main_job.render_results import RenderRun

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.render_files import write_data

@@ -128,7 +128,9 @@ def render_job(
     after = experiment.frames_after(photons, count, number, shown)
     stage.begin(6)
     try:
-        recovery = recover(before, after, calibration, resolved.job.analysis.centroid)
+        recovery = recover(
+            before, after, calibration, resolved.job.analysis.centroid, disturbances=experiment.disturbances
+        )
     except SpotError as error:
         channels = experiment.path.channels
         reasons = "; ".join(f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items())

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 from markupsafe import Markup
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job import crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.motion_map import motion_map_svg

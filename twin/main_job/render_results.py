@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency
+from analysis.monitor.estimators import Estimator, applicable
+from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import Recovery
 from analysis.units import ARCSEC
@@ -102,7 +106,30 @@ class RenderRun:
                 "nominal_deg": float(np.degrees(self.truth.angle)),
                 "change_arcsec": float(self.truth.angle_change[0] / ARCSEC),
             }
+        if self.experiment.ground is not None:
+            error = self.truth.ground_error(self.experiment.ground)[0]
+            out["ground"] = {f"{axis}_m": float(value) + 0.0 for axis, value in zip(AXES, error, strict=True)}
         return out
+
+    @property
+    def estimators(self) -> dict[str, Estimator]:
+        """Those that stand in the results, by their names there: all but those that need what is not stated."""
+        return applicable(self.experiment.disturbances)
+
+    @cached_property
+    def consistency(self) -> Consistency | None:
+        """Do the shifts agree with the stated disturbances? None where none are stated."""
+        stated = self.experiment.disturbances
+        if stated is None:
+            return None
+        others: dict[str, list[np.ndarray]] = {}
+        for k, table in enumerate(self.crosstalk.values()):
+            for motion, moved in zip(table.motions, table.spot_shift.T, strict=True):
+                column = np.zeros(len(stated.spots))
+                column[4 * k : 4 * k + 4] = moved
+                others.setdefault(motion.body, []).append(column)
+        tables = {body: np.stack(columns, axis=1) for body, columns in others.items()}
+        return self.recovery.consistency(stated, others=tables)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""
@@ -120,9 +147,29 @@ class RenderRun:
         out: dict[str, Any] = {"cameras": cameras, "spots": spots}
         if r.angle:
             out["intersection_angle"] = {e: _first(a.to_dict()) for e, a in r.angle.items()}
+        if r.ground:
+            out["ground"] = {e: _first(g.to_dict()) for e, g in r.ground.items()}
+        if self.consistency is not None:
+            out["disturbances"] = self._stated(self.consistency)
         out["centroid"] = self.resolved.job.analysis.centroid
         out["frames"] = self.frames
         return out
+
+    def _stated(self, found: Consistency) -> dict[str, Any]:
+        """What the total sigmas rest on, and whether the shifts agree with it."""
+        assert self.experiment.disturbances is not None
+        return {
+            "name": self.experiment.disturbances.name,
+            "chi_square": found.chi_square,
+            "degrees_of_freedom": found.degrees,
+            "limit": found.limit,
+            "false_alarm": FALSE_ALARM,
+            "chance": found.chance,
+            "agrees": found.agrees,
+            "suspects": [
+                {"body": one.body, "times_stated": one.times, "log_likelihood_gain": one.gain} for one in found.suspects
+            ],
+        }
 
 
 STATED = 6
@@ -137,14 +184,16 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
     What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
 
     Args:
-        readings: nested; the sigma of ``x`` is ``x_sigma`` or ``sigma_x`` beside it. Other numbers stay as they are.
+        readings: nested; the sigma of ``x`` is ``x_sigma_noise``, ``x_sigma`` or ``sigma_x`` beside it, the first that
+            is there. Other numbers stay as they are.
     """
     out: dict[str, Any] = {}
     for key, value in readings.items():
-        sigma = readings.get(f"{key}_sigma", readings.get(f"sigma_{key}"))
+        names = (f"{key}_sigma_noise", f"{key}_sigma", f"sigma_{key}")
+        sigma = next((readings[name] for name in names if name in readings), None)
         if isinstance(value, Mapping):
             out[key] = stated(value)
-        elif isinstance(value, float) and (key.endswith("_sigma") or key.startswith("sigma_")):
+        elif isinstance(value, float) and (key.endswith(("_sigma", "_sigma_noise")) or key.startswith("sigma_")):
             out[key] = float(f"{value:.{STATED_SIGMA - 1}e}")
         elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
             # adding 0.0 turns a negative zero into a plain one

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
-from analysis.monitor.recovery import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, PARAMETERS
 from twin.main_job.systematics import systematics

@@ -11,7 +11,7 @@ from matplotlib.colors import AsinhNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.run.artefact import FAR, tick_text
 from twin.run.svg import (

@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import results
 from twin.main_job.spot_plots import GRAY, airy_radius, core_window, cross, mean_images, stretch

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.estimators import ESTIMATORS
 from optics.geometry.tree import Motion
 from scenes.specs.channel import BASE, CENTRAL_PRISM
 from twin.main_job.render_results import RenderRun

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
-from analysis.monitor.recovery import ESTIMATORS
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.course import moment

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from analysis.monitor import model_fit
+from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.model_fit import ObservabilityReport
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import ESTIMATORS
+from analysis.monitor.recovery import joint
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family, other_motions
@@ -117,6 +118,24 @@ class CameraCrosstalk:
         return tuple(out)
 
 
+def estimator_gains(
+    experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """Estimator -> (4 x cameras, 4 x cameras) parameters (rad, m) per pixel of shift, to first order.
+
+    Args:
+        experiment: the instrument, with what its job states to move.
+        covariance: camera -> (4, 4) px^2 of the spot shifts, which weighs them; None for no noise.
+    """
+    names = list(experiment.instrument.cameras)
+    spread = np.zeros((1, len(names), 4, 4))
+    if covariance is not None:
+        spread[0] = [covariance[name] for name in names]
+    still = np.zeros((1, 2 * len(names), 2))
+    shifts = Shifts(still, still, joint(spread), experiment.cameras, experiment.disturbances)
+    return {name: one.gain(shifts)[0] for name, one in applicable(experiment.disturbances).items()}
+
+
 def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray]) -> dict[str, CameraCrosstalk]:
     """Work out the table for every camera.
 
@@ -129,16 +148,17 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
     every = [motion for motions in sets.values() for motion in motions]
     all_spots = spot_jacobian(experiment.path, every)
     all_truth = truth_jacobian(instrument, experiment.backend, every)
+    gains = estimator_gains(experiment, covariance)
     out = {}
     for k, (name, motions) in enumerate(sets.items()):
         own = slice(len(motions) * k, len(motions) * (k + 1))
         spots = all_spots[2 * k : 2 * k + 2, :, own].reshape(4, -1)
         truth = all_truth[name][:, own]
         geometry = experiment.geometry(name)
-        camera = experiment.calibration.cameras[name]
-        gains = {e: estimator.coefficients(camera) for e, estimator in ESTIMATORS.items()}
         size = np.array([motion.unit_size for motion in motions])
-        readings = {e: (PER_SI[:, None] * (gains[e] @ spots)) * size for e in ESTIMATORS}
+        moved = all_spots[:, :, own].reshape(-1, len(motions))
+        rows = slice(4 * k, 4 * k + 4)
+        readings = {e: (PER_SI[:, None] * (gain[rows] @ moved)) * size for e, gain in gains.items()}
         true = PER_SI[:, None] * truth * size
         f = geometry.focal_length_m
         ideal = PER_SI * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]

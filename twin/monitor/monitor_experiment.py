@@ -12,6 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_template import SpotTemplate
@@ -19,14 +21,17 @@ from optics.geometry.pose import triple
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
+from scenes.models.disturbances import StatedMotions, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
-from scenes.specs.job import JobSpec, noll
+from scenes.specs.course import noll
+from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus
 from twin.monitor.motions import line_family
+from twin.monitor.stated_disturbances import disturbances_of
 from twin.monitor.truth import Truth, trace_truth, truth_jacobian
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
@@ -45,6 +50,7 @@ class MonitorExperiment:
 
     def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
         self.backend = backend
+        self.resolved = resolved
         self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
@@ -132,7 +138,40 @@ class MonitorExperiment:
         photons = self.wide_photons
         with one_blas_thread():  # several threads of a small decomposition wait for each other
             template = SpotTemplate.stack([self._template(image) for image in photons])
-        return MonitorCalibration(self.cameras, template, self.detector.noise_model(self.exposure))
+        return MonitorCalibration(self.cameras, template, self.detector.noise_model(self.exposure), self.ground)
+
+    @cached_property
+    def ground(self) -> GroundGeometry | None:
+        """How a pair of known altitude sees the ground; None for other instruments, and where its rays do not meet."""
+        spec, names = self.instrument.spec, list(self.instrument.cameras)
+        if spec.altitude is None or len(names) != 2:
+            return None
+        looks = [spec.cameras[name].look for name in names]
+        field = []
+        for name in names:
+            line = self.instrument.cameras[name].spec.line
+            field.append(0.5 * line.pixels * line.pitch / self.nominal_truth.principal_distance[name])
+        try:
+            return GroundGeometry(spec.altitude, (names[0], names[1]), (looks[0], looks[1]), (field[0], field[1]))
+        except ValueError as error:
+            text = f"points on the ground cannot be located by these cameras ({error})"
+            raise spec.error(text, ("altitude",), allowed="cameras that look at the Earth from two sides") from error
+
+    @cached_property
+    def stated(self) -> StatedMotions | None:
+        """What the job states to move, component by component; None for nothing.
+
+        Raises:
+            InputError: a body that the instrument does not have, or that cannot move so.
+        """
+        return stated_motions(self.resolved, self.instrument)
+
+    @cached_property
+    def disturbances(self) -> Disturbances | None:
+        """The same with what it does to spots and cameras, for the analysis. Raises InputError as `stated`."""
+        if self.stated is None:
+            return None
+        return disturbances_of(self.stated, self.path, self.thermal, self.instrument, self.backend)
 
     def geometry(self, camera: str) -> MonitorGeometry:
         """Calibrated numbers for the formulas: principal distance, plate scale across the line, distortion, L, pixel.
@@ -193,7 +232,13 @@ class MonitorExperiment:
         return out
 
     def measure(
-        self, states: Sequence[State], frames: int, seed: int, centroid: str = "ml", chunk: int = 40
+        self,
+        states: Sequence[State],
+        frames: int,
+        seed: int,
+        centroid: str = "ml",
+        chunk: int = 40,
+        disturbances: Disturbances | None = None,
     ) -> Iterator[tuple[slice, Recovery]]:
         """Render, expose and recover many states against one nominal measurement, piece by piece to bound memory.
 
@@ -204,7 +249,7 @@ class MonitorExperiment:
         for piece, photons in self.path.iterate_photons(states, chunk=chunk):
             after = self.frames_after(photons, frames, seed, piece.start)
             with one_blas_thread():
-                recovered = recover(before, after, self.calibration, centroid, cores())
+                recovered = recover(before, after, self.calibration, centroid, cores(), disturbances)
             yield piece, recovered
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:

@@ -12,8 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import coefficients
-from analysis.monitor.recovery import ESTIMATORS, Recovery, measure_spots, recover
+from analysis.monitor.recovery import Recovery, measure_spots, recover
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.backend import Backend

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
-from analysis.monitor.recovery import ESTIMATORS, Recovery, recover
+from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_positions import SpotError
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
@@ -177,7 +177,14 @@ def run_series(
         try:
             with one_blas_thread():
                 recoveries.append(
-                    recover(before, after, experiment.calibration, job.analysis.centroid, threads=cores())
+                    recover(
+                        before,
+                        after,
+                        experiment.calibration,
+                        job.analysis.centroid,
+                        cores(),
+                        experiment.disturbances,
+                    )
                 )
         except SpotError as error:
             k, spot = divmod(error.indices[0], len(channels))
@@ -204,7 +211,8 @@ def run_series(
         angle=truths[0].angle,
         angle_change=np.concatenate([t.angle_change for t in truths]),
         parameters={
-            name: {e: _joined([r.parameters[name][e] for r in recoveries]) for e in ESTIMATORS} for name in names
+            name: {e: _joined([r.parameters[name][e] for r in recoveries]) for e in recoveries[0].parameters[name]}
+            for name in names
         },
         recovered_angle={e: _joined_angle([r.angle[e] for r in recoveries]) for e in recoveries[0].angle},
         photons=photons,
@@ -252,14 +260,19 @@ def _lost(
 
 
 def _joined(parts: Sequence[CameraParameters]) -> CameraParameters:
+    total = [p.total for p in parts if p.total is not None]
     return CameraParameters.from_vector(
-        np.concatenate([p.vector for p in parts]), np.concatenate([p.covariance for p in parts])
+        np.concatenate([p.vector for p in parts]),
+        np.concatenate([p.covariance for p in parts]),
+        np.concatenate(total) if total else None,
     )
 
 
 def _joined_angle(parts: Sequence[IntersectionAngleChange]) -> IntersectionAngleChange:
     return IntersectionAngleChange(
-        np.concatenate([p.change_rad for p in parts]), np.concatenate([p.sigma_rad for p in parts])
+        np.concatenate([p.change_rad for p in parts]),
+        np.concatenate([p.sigma_rad for p in parts]),
+        np.concatenate([p.noise_rad for p in parts]),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.monitor.ground_error import GroundGeometry
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
@@ -30,12 +31,23 @@ class Truth:
         principal_distance: camera -> nominal principal distance, metres.
         angle: angle between the two lines of sight in the nominal state, radians (NaN unless there are two cameras).
         angle_change: its change, (S,), radians.
+        lines: lines of sight in the base frame, unit vectors (cameras, 1 + S, 3); entry 0 is the nominal one.
     """
 
     cameras: dict[str, LineChange]
     principal_distance: dict[str, float]
     angle: float
     angle_change: np.ndarray
+    lines: np.ndarray
+
+    def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
+        """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.
+
+        Args:
+            geometry: of the pair over the ground.
+        """
+        lines = np.moveaxis(self.lines, 0, 1)
+        return geometry.found(lines[1:], lines[:1])
 
 
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
@@ -101,7 +113,7 @@ def truth_of_sight(instrument: Instrument, sight: np.ndarray, axes: Mapping[str,
         angle = np.arctan2(np.linalg.norm(np.cross(lines[0], lines[1]), axis=-1), np.sum(lines[0] * lines[1], axis=-1))
     else:
         angle = np.full(sight.shape[1], np.nan)
-    return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0])
+    return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0], lines)
 
 
 DIFFERENCE = 1e-6

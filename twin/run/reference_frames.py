@@ -16,8 +16,9 @@ __all__ = ["FRAMES", "described", "frames_text", "schema"]
 
 _VERSION = 2
 """Of the files' keys; 1 had no statement of frames."""
-_LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3})
-"""Kind of file -> version, where keys went since then: what a paper prints and whether it holds."""
+_LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3, "recovered": 3, "course": 3})
+"""Kind of file -> version, where keys went or changed their meaning since then: what a paper prints and whether it
+holds; sigmas, which were those of the noise alone."""
 _CAMERA = (
     "d_alpha, d_beta and d_gamma turn the camera about Y, X and Z of its own nominal axes (Z the line of sight toward "
     "the scene, Y along the line CCD, X = Y x Z), right-handed; changes are perturbed minus nominal"
@@ -30,7 +31,8 @@ _GEODETIC = "geodetic on the WGS84 ellipsoid: latitude, longitude positive to th
 _SECONDS = "seconds from the epoch in UTC that stands beside them"
 _BODY = "X along the flight direction, Z toward the scene, Y = Z x X; true attitude = measured attitude times the bias"
 _FOCAL = "camera axes, x along the track, y along the line; the image is the real one, +y sees the scene at -Y"
-_CHANGES = {"cameras": _CAMERA, "intersection_angle": _ANGLE}
+_GROUND = "along the track, across it to the right, and up; found with the nominal cameras minus true"
+_CHANGES = {"cameras": _CAMERA, "intersection_angle": _ANGLE, "ground": _GROUND}
 _LOOK = (
     "look: between the lines' central rays, unsigned; along the track: its part about the lines' mean direction, "
     "positive where the first line looks ahead; planes: dihedral angle of the lines' planes"

@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import CENTROIDS, ESTIMATORS, recover
+from analysis.monitor.recovery import CENTROIDS, recover
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend, load_backend
 from scenes.specs.job import JobSpec, NodeInfo, check_nodes
@@ -25,6 +25,7 @@ from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.main_job.render_job import render_job
+from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import truth_jacobian
@@ -197,14 +198,11 @@ class InstrumentTwin:
         size = np.array([motion.unit_size for motion in chosen])
         spots = spot_jacobian(experiment.path, chosen)
         truth = truth_jacobian(experiment.instrument, self._bench.backend, chosen)
+        gains = estimator_gains(experiment)
+        moved = spots.reshape(-1, len(chosen))
         readings = [
-            [
-                PER_SI[:, None]
-                * (estimator.coefficients(experiment.cameras[name]) @ spots[2 * k : 2 * k + 2].reshape(4, -1))
-                * size
-                for estimator in ESTIMATORS.values()
-            ]
-            for k, name in enumerate(names)
+            [PER_SI[:, None] * (gain[4 * k : 4 * k + 4] @ moved) * size for gain in gains.values()]
+            for k in range(len(names))
         ]
         true = np.stack([PER_SI[:, None] * truth[name] * size for name in names])
         return xr.Dataset(
@@ -220,7 +218,7 @@ class InstrumentTwin:
                 "axis": ["row", "column"],
                 "camera": names,
                 "parameter": list(PARAMETERS),
-                "estimator": list(ESTIMATORS),
+                "estimator": list(gains),
             },
             attrs={"reference_frames": frames_text("crosstalk")},
         )

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from optics.geometry.tree import ORIGIN
-from scenes.specs.job import NodeInfo, noll
+from scenes.specs.course import noll
+from scenes.specs.job import NodeInfo
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from twin.monitor.motions import ElementaryMotion
 

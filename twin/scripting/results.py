@@ -13,8 +13,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import ESTIMATORS, Recovery
+from analysis.monitor.recovery import Recovery
 from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
 from twin.main_job.render_files import irradiance

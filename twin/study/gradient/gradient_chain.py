@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.recovery import Recovery, angles, estimates
+from analysis.monitor.recovery import Recovery, estimates
 from optics.geometry.tree import COMPLEX_STEP, FIGURE, Motion, State
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
@@ -114,9 +114,9 @@ class Chain:
         start, end = self.nominal[0], spots[None]
         cameras = self.experiment.cameras
         joint = np.zeros((1, len(cameras), 4, 4))
-        parameters = estimates(start, end, joint, cameras)
+        found = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
         none = np.zeros_like(end)
-        recovery = Recovery(start, end, none, none, joint, parameters, angles(parameters, cameras))
+        recovery = Recovery(start, end, none, none, joint, found.parameters, found.angle, found.ground)
         truth = truth_of_sight(self.experiment.instrument, np.stack([self.nominal[1][0], sight], axis=1), self._axes)
         exposures = self.resolved.frames, self.resolved.job.render.seed
         return monitor_results(self.resolved, self.experiment, state, *exposures, truth, recovery)

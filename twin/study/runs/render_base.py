@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from analysis.monitor.intersection_angle import IntersectionAngleChange
-from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
@@ -138,7 +136,9 @@ def run_together(
         try:
             with one_blas_thread():
                 start = first if shared else _of(first, good)
-                recovery = recover(start, _of(after, good), experiment.calibration, _centroid(runs[0]), threads=1)
+                stated = experiment.disturbances
+                frames = _of(after, good)
+                recovery = recover(start, frames, experiment.calibration, _centroid(runs[0]), 1, stated)
         except SpotError as error:
             lost = _lost(error, experiment, good)
             for i, reason in lost.items():
@@ -146,7 +146,7 @@ def run_together(
             good = [i for i in good if i not in lost]
             continue
         for j, i in enumerate(good):
-            run, one = runs[left[i]], (_truth_of(truth, i), _recovery_of(recovery, j))
+            run, one = runs[left[i]], (_truth_of(truth, i), recovery.at(slice(j, j + 1)))
             out[left[i]] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *one)
         break
     return [outcome for outcome in out if outcome is not None]
@@ -201,28 +201,6 @@ def _truth_of(truth: Truth, i: int) -> Truth:
         for name, change in truth.cameras.items()
     }
     return replace(truth, cameras=cameras, angle_change=truth.angle_change[one])
-
-
-def _recovery_of(recovery: Recovery, i: int) -> Recovery:
-    """What the images of one of the states say."""
-    one = slice(i, i + 1)
-    return Recovery(
-        before=recovery.before[one],
-        after=recovery.after[one],
-        sigma_before=recovery.sigma_before[one],
-        sigma_after=recovery.sigma_after[one],
-        shift_covariance=recovery.shift_covariance[one],
-        parameters={
-            name: {
-                estimator: CameraParameters(
-                    p.d_alpha_rad[one], p.d_beta_rad[one], p.d_gamma_rad[one], p.d_f_m[one], p.covariance[one]
-                )
-                for estimator, p in estimators.items()
-            }
-            for name, estimators in recovery.parameters.items()
-        },
-        angle={e: IntersectionAngleChange(a.change_rad[one], a.sigma_rad[one]) for e, a in recovery.angle.items()},
-    )
 
 
 BLOCK = 25
@@ -314,7 +292,8 @@ class RenderBase:
 
     def _experiment(self, resolved: ResolvedJob, backend: Backend) -> tuple[str, MonitorExperiment]:
         """The instrument with its calibration, and what tells it from others."""
-        parts = (resolved.instrument, *resolved.cameras.values(), resolved.detector)
+        parts = [resolved.instrument, *resolved.cameras.values(), resolved.detector]
+        parts += [] if resolved.disturbances is None else [resolved.disturbances]
         name = json.dumps([backend.name, *(part.plain() for part in parts)])
         if name not in self._experiments:
             self._experiments[name] = MonitorExperiment(resolved, backend)

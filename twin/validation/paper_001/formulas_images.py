@@ -146,12 +146,15 @@ class MonitorImages:
 
     def parameters(self) -> Mapping[str, Mapping[str, CameraParameters]]:
         """Camera -> estimator -> what it reads from the spots, (S,)."""
-        cameras = self.experiment.calibration.cameras
-        return recovery.estimates(self.before, self.after, self.covariance, cameras)
+        return self._estimates().parameters
 
     def angles(self) -> Mapping[str, IntersectionAngleChange]:
         """Estimator -> change of the intersection angle, (S,)."""
-        return recovery.angles(self.parameters(), self.experiment.calibration.cameras)
+        return self._estimates().angle
+
+    def _estimates(self) -> recovery.Estimates:
+        cameras = self.experiment.calibration.cameras
+        return recovery.estimates(self.before, self.after, self.covariance, cameras)
 
     def reading(self, camera: str, motion: str, estimator: str, parameter: str) -> tuple[float, float]:
         """What a formula reads of one state, and its sigma, SI."""

@@ -1,0 +1,227 @@
+"""What is stated to move between two measurements, as the analysis needs it: what one standard deviation of each motion
+does to the spots and to the cameras, and how motions go together.
+
+Spots and parameters are linear in the M motions, s = A x and p = B x with x ~ N(0, C); a column of A and B is of one
+standard deviation, so that C is a correlation matrix. The prior of p is B C B', that of s is A C A' + R, R the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+__all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "consistency"]
+
+Array = NDArray[np.float64]
+FALSE_ALARM = 1e-3
+"""Chance that shifts within what is stated are called a contradiction."""
+_INFLATIONS = np.logspace(0.0, 8.0, 161)
+"""By how much the variance of a body is tried to be larger than stated."""
+
+
+@dataclass(frozen=True)
+class TimeLaw:
+    """Correlation of a disturbance between two times.
+
+    Attributes:
+        white: independent at different times; the others are then None.
+        drift_s: time in which it forgets where it was, seconds, None for never.
+        period_s: it comes back with, seconds, None for none.
+    """
+
+    white: bool = False
+    drift_s: float | None = None
+    period_s: float | None = None
+
+    def correlation(self, gap: Array) -> Array:
+        """Over gaps of time, any shape, seconds; values of the same shape."""
+        away = np.abs(np.asarray(gap, np.float64))
+        if self.white:
+            return np.asarray(away == 0.0, np.float64)
+        out = np.ones_like(away)
+        if self.drift_s is not None:
+            out = out * np.exp(-away / self.drift_s)
+        if self.period_s is not None:
+            out = out * np.cos(2.0 * math.pi * away / self.period_s)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbances:
+    """Stated disturbances of K cameras with D spot coordinates together.
+
+    Attributes:
+        name: of the statement.
+        labels: (M,) names of the motions: ``base/forward/M2 shift z``.
+        bodies: (M,) whose they are.
+        causes: (M,) to which of the stated causes they belong.
+        sigmas: (M,) standard deviations in units for people; units: (M,) these units.
+        spots: (D, M) px for one standard deviation, spots in the order of the calibration, each row then column.
+        parameters: (4 K, M) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, likewise.
+        correlation: (M, M), positive semidefinite.
+        laws: (M,) in time.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    bodies: tuple[str, ...]
+    causes: tuple[str, ...]
+    sigmas: Array
+    units: tuple[str, ...]
+    spots: Array
+    parameters: Array
+    correlation: Array
+    laws: tuple[TimeLaw, ...]
+
+    def __post_init__(self) -> None:
+        """Check shapes. Raises ValueError."""
+        count = len(self.labels)
+        shapes = {
+            "spots": (self.spots.shape[0], count),
+            "parameters": (self.parameters.shape[0], count),
+            "correlation": (count, count),
+            "sigmas": (count,),
+        }
+        for name, shape in shapes.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise ValueError(f"disturbances: {name} must be {shape} for {count} motions, found {found}")
+        if not all(len(getattr(self, name)) == count for name in ("bodies", "causes", "units", "laws")):
+            raise ValueError(f"disturbances: {count} motions need as many bodies, causes, units and laws")
+
+    @cached_property
+    def root(self) -> Array:
+        """(M, M) with root root' = correlation: what independent numbers of unit variance make of the motions."""
+        if np.array_equal(self.correlation, np.eye(len(self.correlation))):
+            return self.correlation
+        values, vectors = np.linalg.eigh(self.correlation)
+        return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+
+    @cached_property
+    def spot_covariance(self) -> Array:
+        """(D, D) px^2 of the shifts without noise."""
+        root = self.spots @ self.root
+        return np.asarray(root @ root.T)
+
+    @cached_property
+    def parameter_covariance(self) -> Array:
+        """(4 K, 4 K) rad^2, rad m, m^2, before any measurement."""
+        root = self.parameters @ self.root
+        return np.asarray(root @ root.T)
+
+    def scaled(self, factors: Sequence[float] | Array) -> Disturbances:
+        """The same with each motion's standard deviation times a factor, (M,).
+
+        Args:
+            factors: one for each motion; 0 takes it out.
+        """
+        f = np.asarray(factors, np.float64)
+        return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
+
+    def error_root(self, gain: Array) -> Array:
+        """What is left of the motions in an estimate: (gain A - B) root, (..., 4 K, M).
+
+        Args:
+            gain: parameters per pixel of an estimator, (..., 4 K, D).
+        """
+        return np.asarray((gain @ self.spots - self.parameters) @ self.root)
+
+    def misfit(self, gain: Array) -> Array:
+        """(..., 4 K, 4 K) covariance of what an estimator makes wrong of the motions themselves.
+
+        Args:
+            gain: parameters per pixel of an estimator, (..., 4 K, D).
+        """
+        left = self.error_root(gain)
+        return np.asarray(left @ np.swapaxes(left, -1, -2))
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A body whose motion would explain shifts that contradict the statement.
+
+    Attributes:
+        body: its path.
+        times: how many times its stated standard deviations would have to be larger.
+        gain: of the log likelihood by that.
+    """
+
+    body: str
+    times: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Do the measured shifts agree with disturbances and noise?
+
+    Attributes:
+        chi_square: s' (A C A' + R)^-1 s.
+        degrees: of freedom, the number of spot coordinates.
+        limit: of ``chi_square``, exceeded with a chance of ``FALSE_ALARM`` by shifts that are as stated.
+        suspects: bodies that would explain a contradiction, the best first; empty where there is none.
+    """
+
+    chi_square: float
+    degrees: int
+    limit: float
+    suspects: tuple[Suspect, ...] = ()
+
+    @property
+    def agrees(self) -> bool:
+        """Below the limit."""
+        return self.chi_square <= self.limit
+
+    @property
+    def chance(self) -> float:
+        """Probability of so large a chi-square by shifts that are as stated."""
+        return float(chi2.sf(self.chi_square, self.degrees))
+
+    @staticmethod
+    def power(times: float, degrees: int) -> float:
+        """Chance to find disturbances that are all so many times larger than stated, where noise is small.
+
+        Args:
+            times: larger standard deviations.
+            degrees: number of spot coordinates.
+        """
+        return float(chi2.sf(chi2.isf(FALSE_ALARM, degrees) / times**2, degrees))
+
+
+def consistency(
+    shift: Array, noise: Array, stated: Disturbances, others: Mapping[str, Array] | None = None
+) -> Consistency:
+    """Predictive chi-square of one measurement.
+
+    Args:
+        shift: (D,) measured, px.
+        noise: (D, D) its covariance, px^2.
+        stated: what was to be expected.
+        others: bodies of which nothing is stated -> what motions of theirs do to the spots, (D, k) px, to be suspected
+            too.
+    """
+    spread = stated.spot_covariance + noise
+    root = np.linalg.cholesky(spread)
+    white = np.linalg.solve(root, shift)
+    square, count = float(white @ white), len(shift)
+    limit = float(chi2.isf(FALSE_ALARM, count))
+    if square <= limit:
+        return Consistency(square, count, limit)
+    candidates = {body: stated.spots[:, [b == body for b in stated.bodies]] for body in dict.fromkeys(stated.bodies)}
+    candidates |= {body: np.asarray(table) for body, table in (others or {}).items() if body not in candidates}
+    found = []
+    for body, table in candidates.items():
+        u, s, _ = np.linalg.svd(np.linalg.solve(root, table), full_matrices=False)
+        # log likelihood of white under I + x U S^2 U' against that under I
+        added = _INFLATIONS[:, None] * s**2
+        gain = 0.5 * np.sum((u.T @ white) ** 2 * added / (1.0 + added) - np.log1p(added), axis=1)
+        best = int(np.argmax(gain))
+        found.append(Suspect(body, float(np.sqrt(1.0 + _INFLATIONS[best])), float(gain[best])))
+    found.sort(key=lambda one: -one.gain)
+    return Consistency(square, count, limit, tuple(one for one in found if one.gain > 0.0))

@@ -1,0 +1,204 @@
+"""Estimators of the cameras' changes from the shifts of their monitors' spots, under one interface.
+
+Each is linear to first order: parameters = gain x shifts. With the gain, the noise of the shifts and what is stated to
+move (``analysis.monitor.disturbances``) the covariance of its error follows in the same way for all of them:
+
+    noise: gain R gain',   misfit: (gain A - B) C (gain A - B)',   total: their sum.
+
+Order of spots: one camera after the other, left before right, of each row and column. Order of parameters: d_alpha,
+d_beta, d_gamma (rad), d_f (m) of one camera after the other.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.monitor import model_fit, monitoring
+from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+
+__all__ = ["ESTIMATORS", "Estimator", "Formula", "LeastSquares", "Posterior", "Shifts", "applicable"]
+
+Array = NDArray[np.float64]
+COORDINATES = 4
+"""Spot coordinates of one camera, and its parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shifts:
+    """What an estimator is given: S states of K cameras.
+
+    Attributes:
+        before, after: (S, 2 K, 2) spot positions (row, column), px.
+        covariance: (S, 4 K, 4 K) px^2 of after - before; zeros without noise.
+        cameras: what is calibrated of each.
+        disturbances: what is stated to move, None for nothing.
+    """
+
+    before: Array
+    after: Array
+    covariance: Array
+    cameras: Mapping[str, CameraCalibration]
+    disturbances: Disturbances | None = None
+
+    @property
+    def vector(self) -> Array:
+        """(S, 4 K) after - before, px."""
+        return (self.after - self.before).reshape(len(self.after), -1)
+
+
+class Estimator(ABC):
+    """How shifts of all spots become changes of all cameras.
+
+    Attributes:
+        title: for readers, a word or two.
+        note: for readers, what it is.
+        stated: whether it needs stated disturbances; without any it does not stand in the results.
+    """
+
+    title: str
+    note: str
+    stated: bool = False
+
+    @abstractmethod
+    def gain(self, shifts: Shifts) -> Array:
+        """Parameters per pixel of shift, (S, 4 K, 4 K).
+
+        Args:
+            shifts: what was measured.
+        """
+
+    def read(self, shifts: Shifts) -> Array:
+        """The parameters, (S, 4 K): gain x shifts, unless an estimator has something better.
+
+        Args:
+            shifts: what was measured.
+        """
+        return np.einsum("spd,sd->sp", self.gain(shifts), shifts.vector)
+
+
+class OfEachCamera(Estimator):
+    """An estimator that takes each camera's spots for themselves."""
+
+    @abstractmethod
+    def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
+        """(4, 4) or (S, 4, 4) parameters of one camera per pixel.
+
+        Args:
+            camera: its calibration.
+            covariance: (S, 4, 4) of its shifts, px^2.
+        """
+
+    def gain(self, shifts: Shifts) -> Array:
+        """Block by block, camera by camera."""
+        out = np.zeros_like(shifts.covariance)
+        for k, camera in enumerate(shifts.cameras.values()):
+            own = slice(COORDINATES * k, COORDINATES * (k + 1))
+            out[:, own, own] = self.camera_gain(camera, shifts.covariance[:, own, own])
+        return out
+
+
+Exact = Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParameters]
+
+
+@dataclass(frozen=True)
+class Formula(OfEachCamera):
+    """A set of formulas of `analysis.monitor.monitoring`.
+
+    Attributes:
+        name: there.
+        title, note: for readers.
+        exact: the formulas as they are, where they are not linear.
+    """
+
+    name: str
+    title: str
+    note: str
+    exact: Exact | None = None
+
+    def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
+        """The formulas' coefficients."""
+        return monitoring.coefficients(self.name, camera.geometry)
+
+    def read(self, shifts: Shifts) -> Array:
+        """By the exact formulas where there are such."""
+        if self.exact is None:
+            return super().read(shifts)
+        parts = []
+        for k, camera in enumerate(shifts.cameras.values()):
+            pair, own = slice(2 * k, 2 * k + 2), slice(COORDINATES * k, COORDINATES * (k + 1))
+            seen = (shifts.before[:, pair], shifts.after[:, pair], shifts.covariance[:, own, own])
+            parts.append(self.exact(*seen, camera.geometry).vector)
+        return np.concatenate(parts, axis=-1)
+
+
+@dataclass(frozen=True)
+class LeastSquares(OfEachCamera):
+    """Gauss-Markov estimate of the motions of paper 001's own family, by `analysis.monitor.model_fit`."""
+
+    title: str = "model"
+    note: str = "weighted least squares on all spot coordinates with the Jacobian of the traced instrument"
+
+    def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
+        """Of the weighted fit."""
+        return model_fit.gain(covariance, camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
+
+
+@dataclass(frozen=True)
+class Posterior(Estimator):
+    """Minimum-variance linear estimate (best linear unbiased prediction): of all linear functions of all spots the one
+    with the least mean square error under the stated disturbances and the noise.
+
+        p = B C A' (A C A' + R)^-1 s
+
+    For normal disturbances it is the mean of the posterior distribution, and its total covariance that distribution's
+    (Robinson, Statistical Science 6, 15-32, 1991; Kay, Fundamentals of Statistical Signal Processing, 1993, ch. 12).
+    """
+
+    title: str = "posterior"
+    note: str = "best linear unbiased prediction from all spots under the stated disturbances"
+    stated: bool = True
+
+    def gain(self, shifts: Shifts) -> Array:
+        """Needs disturbances. Raises ValueError without."""
+        stated = shifts.disturbances
+        if stated is None:
+            raise ValueError("posterior: needs stated disturbances")
+        across = stated.parameters @ stated.correlation @ stated.spots.T
+        spread = stated.spot_covariance + shifts.covariance
+        if np.any(shifts.covariance):
+            return np.swapaxes(np.linalg.solve(spread, across.T), -1, -2)
+        # without noise, what moves no spot has no say; spots move by pixels for one standard deviation
+        return np.asarray(across @ np.linalg.pinv(spread, rcond=1e-13, hermitian=True))
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    "paper_single": Formula(
+        "paper_single",
+        "printed, single",
+        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed",
+        monitoring.paper_single,
+    ),
+    "paper_joint": Formula("paper_joint", "printed, joint", "joint changes as Wang et al. (2018) print them"),
+    "derived": Formula(
+        "derived",
+        "derived",
+        "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
+    ),
+    "model": LeastSquares(),
+    "posterior": Posterior(),
+}
+"""Name in the results -> estimator, in the order of tables. A new one is added here: it then stands in recovered.json,
+crosstalk.json, the tables and the figures.
+"""
+
+
+def applicable(disturbances: Disturbances | None) -> dict[str, Estimator]:
+    """The estimators that can be used with what is stated."""
+    return {name: one for name, one in ESTIMATORS.items() if disturbances is not None or not one.stated}

@@ -1,0 +1,367 @@
+"""Stated disturbances on the bodies of an instrument: their components one by one, how these go together, and states
+drawn from them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optics.geometry.pose import triple
+from optics.geometry.tree import ORIGIN, Motion, State, compose
+from optics.thermal.heat import Temperature
+from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import ThermalModel
+from scenes.specs.course import noll
+from scenes.specs.disturbances import CauseSpec, DisturbancesSpec, TimeLawSpec
+from scenes.specs.job import NodeInfo
+from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
+from scenes.yaml.units import ANGLE, parse_quantity
+
+AXES = "xyz"
+_INDEFINITE = -1e-9
+"""Eigenvalue of a correlation matrix from which on downward it is no rounding."""
+UNITS: Mapping[str, tuple[str, float]] = {
+    "shift": ("um", 1e-6),
+    "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)),
+    "scale": ("ppm", 1e-6),
+    "figure": ("nm", 1e-9),
+    "temperature": ("K", 1.0),
+    "gradient": ("mK/m", 1e-3),
+    "index_gradient": ("ppm/m", 1e-6),
+}
+"""Kind of component -> the unit in which people read it, and that unit in SI."""
+HEAT = ("temperature", "gradient")
+"""Kinds that act through the thermal model."""
+_NEEDS = {"gradient": "temperature"}
+"""What a node must allow, where that is not called as the kind is."""
+
+IssueAt = Callable[..., Issue]
+
+
+@dataclass(frozen=True)
+class Component:
+    """One component of the motion or of the temperature of one body.
+
+    Attributes:
+        cause: name of its cause.
+        body: path.
+        kind: one of UNITS.
+        axis: 0, 1, 2 of the body's own frame; the Noll index of a figure term; 0 where there is one only.
+        pivot: of turns and growth.
+        sigma: standard deviation, SI.
+    """
+
+    cause: str
+    body: str
+    kind: str
+    axis: int
+    pivot: str
+    sigma: float
+
+    @property
+    def name(self) -> str:
+        """As ``correlations`` name it: ``base/forward/M2 shift z``."""
+        return f"{self.body} {self.what}"
+
+    @property
+    def what(self) -> str:
+        """Without the body: ``shift z``."""
+        if self.kind in ("scale", "temperature"):
+            return self.kind
+        return f"{self.kind} {f'Z{self.axis}' if self.kind == 'figure' else AXES[self.axis]}"
+
+    @property
+    def unit(self) -> str:
+        """For people."""
+        return UNITS[self.kind][0]
+
+    @property
+    def unit_size(self) -> float:
+        """The same in SI."""
+        return UNITS[self.kind][1]
+
+
+@dataclass(frozen=True, eq=False)
+class StatedMotions:
+    """What is stated of an instrument's M components.
+
+    Attributes:
+        name: of the disturbances file.
+        components: cause by cause, body by body.
+        correlation: (M, M), positive semidefinite; zero between causes.
+        laws: of each component in time.
+    """
+
+    name: str
+    components: tuple[Component, ...]
+    correlation: np.ndarray
+    laws: tuple[TimeLawSpec, ...]
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(M,) SI."""
+        return np.array([c.sigma for c in self.components])
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(M, M) SI."""
+        sigma = self.sigma
+        return np.asarray(sigma[:, None] * self.correlation * sigma)
+
+    def of_causes(self, names: Sequence[str]) -> StatedMotions:
+        """Some causes alone."""
+        own = [k for k, c in enumerate(self.components) if c.cause in names]
+        return StatedMotions(
+            self.name,
+            tuple(self.components[k] for k in own),
+            self.correlation[np.ix_(own, own)],
+            tuple(self.laws[k] for k in own),
+        )
+
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Random amounts, (count, M), SI; one state after the other, in it one component after the other.
+
+        Args:
+            rng: their source.
+            count: how many states.
+        """
+        unit = rng.standard_normal((count, len(self.components)))
+        if not np.array_equal(self.correlation, np.eye(len(self.components))):
+            values, vectors = np.linalg.eigh(self.correlation)
+            # the symmetric root leaves components without correlations as they are
+            root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T
+            unit = unit @ root
+        return np.asarray(unit * self.sigma)
+
+
+def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotions | None:
+    """What a job states of its instrument; None for nothing.
+
+    Raises:
+        InputError: a body that the instrument does not have, or that does not move so; correlations that cannot be.
+            One issue for each fault.
+    """
+    spec = resolved.disturbances
+    if spec is None:
+        return None
+    return motions_of_spec(spec, instrument, lambda cause, key: _issue_at(resolved, cause, key))
+
+
+def motions_of_spec(
+    spec: DisturbancesSpec, instrument: Instrument, at: Callable[[str, KeyPath], IssueAt] | None = None
+) -> StatedMotions:
+    """What a disturbances file says of an instrument.
+
+    Args:
+        spec: the file.
+        instrument: on whose bodies.
+        at: (cause, key in it) -> what makes an issue there; by default of the file itself.
+
+    Raises:
+        InputError: as ``stated_motions``.
+    """
+    where = at if at is not None else lambda cause, key: _issue_of(spec, ("causes", cause, *key))
+    glass = {solid.path for solid in instrument.solids if solid.transparent}
+    components: list[Component] = []
+    laws: list[TimeLawSpec] = []
+    blocks: list[np.ndarray] = []
+    issues: list[Issue] = []
+    for name, cause in spec.causes.items():
+        own: list[Component] = []
+        for k, pattern in enumerate(cause.bodies):
+            found = [path for path in instrument.nodes if _matches(pattern, path)]
+            if not found:
+                meant = nearest(pattern, instrument.nodes)
+                text = f"no body of {instrument.spec.name} is called so"
+                allowed = names_text(sorted(instrument.nodes))
+                issues.append(where(name, ("bodies", k))(text, found=pattern, allowed=allowed, suggestion=meant))
+            for path in found:
+                if any(c.body == path for c in own):
+                    continue
+                faults, some = _of_body(spec, name, cause, path, instrument, path in glass, where)
+                issues += faults
+                own += some
+        matrix, faults = _correlation(name, cause, own, where)
+        issues += faults
+        components += own
+        laws += [cause.time] * len(own)
+        blocks.append(matrix)
+    if issues:
+        raise InputError(*issues)
+    correlation, start = np.zeros((len(components), len(components))), 0
+    for block in blocks:
+        correlation[start : start + len(block), start : start + len(block)] = block
+        start += len(block)
+    return StatedMotions(spec.name, tuple(components), correlation, tuple(laws))
+
+
+def state_of(
+    amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
+) -> State:
+    """The state in which components have given amounts.
+
+    Args:
+        amounts: (M,), SI.
+        components: M of them.
+        thermal: of the instrument.
+        motions: what else happens; it acts on top of the same body's motion.
+    """
+    heat: dict[str, Temperature] = {}
+    moves: State = {}
+    bodies = {body.path: body for body in thermal.instrument.assembly.tree.bodies}
+    for (_, body, pivot), group in _groups(components):
+        values = {(components[k].kind, components[k].axis): float(amounts[k]) for k in group}
+        field = _field(values)
+        if field is not None:
+            heat[body] = heat.get(body, Temperature()) + field
+        motion = _motion(values, pivot)
+        if motion is not None:
+            moves = compose(moves, {body: motion}, bodies)
+    state = thermal.state(heat, moves) if heat else moves
+    return compose(state, motions, bodies) if motions else state
+
+
+def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for k, c in enumerate(components):
+        groups.setdefault((c.cause, c.body, c.pivot), []).append(k)
+    yield from groups.items()
+
+
+def _field(values: Mapping[tuple[str, int], float]) -> Temperature | None:
+    if not any(kind in HEAT for kind, _ in values):
+        return None
+    gradient = triple(values.get(("gradient", a), 0.0) for a in range(3))
+    return Temperature(values.get(("temperature", 0), 0.0), gradient)
+
+
+def _motion(values: Mapping[tuple[str, int], float], pivot: str) -> Motion | None:
+    if all(kind in HEAT for kind, _ in values):
+        return None
+
+    def three(kind: str) -> tuple[float, float, float]:
+        return triple(values.get((kind, a), 0.0) for a in range(3))
+
+    return Motion(
+        rotate=three("rotate"),
+        shift=three("shift"),
+        pivot=pivot,
+        scale=values.get(("scale", 0), 0.0),
+        figure={axis: value for (kind, axis), value in values.items() if kind == "figure"},
+        index_gradient=three("index_gradient"),
+    )
+
+
+def _matches(pattern: str, path: str) -> bool:
+    """Whether a path is of a pattern in which ``*`` and ``?`` stand for anything but ``/``."""
+    text = "".join({"*": "[^/]*", "?": "[^/]"}.get(c, re.escape(c)) for c in pattern)
+    return re.fullmatch(text, path) is not None
+
+
+def _issue_of(spec: DisturbancesSpec, key: KeyPath) -> IssueAt:
+    return lambda problem, **more: spec.issue(problem, key, **more)
+
+
+def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath) -> IssueAt:
+    """An issue at the line that said it: the job's where it changes the file."""
+    changes = resolved.job.disturbances
+    own = changes.causes.get(cause) if changes is not None else None
+    if own is not None and (not key or key[0] in own.given):
+        return lambda problem, **more: resolved.job.issue(problem, ("disturbances", "causes", cause, *key), **more)
+    assert resolved.disturbances is not None
+    return _issue_of(resolved.disturbances, ("causes", cause, *key))
+
+
+def _of_body(
+    spec: DisturbancesSpec,
+    name: str,
+    cause: CauseSpec,
+    path: str,
+    instrument: Instrument,
+    transparent: bool,
+    where: Callable[[str, KeyPath], IssueAt],
+) -> tuple[list[Issue], list[Component]]:
+    """The components that a cause gives to one body, those of zero sigma left out; and what is wrong with them."""
+    info, issues = instrument.nodes[path], []
+    pivot = cause.pivot or ("centre" if "centre" in info.pivots else ORIGIN)
+    if pivot != ORIGIN and pivot not in info.pivots:
+        known = tuple(dict.fromkeys((ORIGIN, *info.pivots)))
+        meant = nearest(pivot, known)
+        issue = where(name, ("pivot",))
+        issues.append(issue(f"{path} has no such pivot", found=pivot, allowed=names_text(known), suggestion=meant))
+    out = []
+    for key, kind, axis, sigma in _sigmas(cause):
+        needs = _NEEDS.get(kind, kind)
+        if not (transparent if kind == "index_gradient" else needs in info.allows):
+            rigid = names_text(sorted(_possible(info, transparent)))
+            issues.append(where(name, key)(f"{path} does not allow {needs}", found=path, allowed=rigid))
+            break
+        if sigma > 0.0:
+            out.append(Component(name, path, kind, axis, pivot, sigma / spec.sigmas))
+    return issues, out
+
+
+def _possible(info: NodeInfo, transparent: bool) -> set[str]:
+    return {*info.allows, *(("index_gradient",) if transparent else ())}
+
+
+def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
+    """Key, kind, axis and value of every number of a cause."""
+    for kind in ("shift", "rotate", "index_gradient"):
+        for axis, value in enumerate(getattr(cause, kind) or ()):
+            yield (kind,), kind, axis, value
+    if cause.scale is not None:
+        yield ("scale",), "scale", 0, cause.scale
+    for term, value in (cause.figure or {}).items():
+        yield ("figure", term), "figure", noll(term), value
+    if cause.temperature is not None:
+        yield ("temperature", "change"), "temperature", 0, cause.temperature.change
+        for axis, value in enumerate(cause.temperature.gradient):
+            yield ("temperature", "gradient"), "gradient", axis, value
+
+
+def _correlation(
+    name: str, cause: CauseSpec, own: Sequence[Component], where: Callable[[str, KeyPath], IssueAt]
+) -> tuple[np.ndarray, list[Issue]]:
+    """Correlation matrix of a cause's components, and what is wrong with it."""
+    matrix, issues = np.eye(len(own)), []
+    if cause.together is not None:
+        for i, one in enumerate(own):
+            for j in range(i):
+                if (own[j].kind, own[j].axis) == (one.kind, one.axis):
+                    matrix[i, j] = matrix[j, i] = cause.together
+        if _least(matrix) < _INDEFINITE:
+            count = len({c.body for c in own})
+            allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
+            text = "bodies cannot all move against one another so much"
+            issues.append(where(name, ("together",))(text, found=f"{cause.together:g}", allowed=allowed))
+    known = {c.name: k for k, c in enumerate(own)}
+    for n, group in enumerate(cause.correlations):
+        key: KeyPath = ("correlations", n)
+        unknown = [k for k, text in enumerate(group.between) if text not in known]
+        for k in unknown:
+            text, meant = group.between[k], nearest(group.between[k], known)
+            issue = where(name, (*key, "between", k))
+            issues.append(
+                issue(f"no component of {name}", found=text, allowed=names_text(sorted(known)), suggestion=meant)
+            )
+        if unknown:
+            continue
+        at = [known[text] for text in group.between]
+        matrix[np.ix_(at, at)] = np.array(group.table)
+        if _least(matrix) < _INDEFINITE:
+            found: Any = f"an eigenvalue of {_least(matrix):.3g}"
+            text = "these correlations cannot be, alone or with those before them: the matrix is not positive definite"
+            issues.append(where(name, key)(text, found=found, allowed="correlations of real quantities: smaller ones"))
+            break
+    return matrix, issues
+
+
+def _least(matrix: np.ndarray) -> float:
+    return float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 0.0

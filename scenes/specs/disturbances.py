@@ -1,0 +1,290 @@
+"""Disturbances: what is expected to move and to warm up between two measurements of the monitor, and by how much.
+
+The estimator `posterior` and the total sigmas of all others rest on this statement. It is a job's or an instrument's
+`disturbances: NAME`, a file of scenes/library/disturbances or of one's own.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.course import Term, moment
+from scenes.yaml.errors import Problem
+from scenes.yaml.quantity import Quantity, Vector
+from scenes.yaml.spec import Name, Named, Number, OneOf, Reference, Spec, Text
+from scenes.yaml.units import (
+    ANGLE,
+    LENGTH,
+    MOMENT,
+    PER_LENGTH,
+    SCALE,
+    TEMPERATURE_DIFFERENCE,
+    TEMPERATURE_GRADIENT,
+    Kind,
+)
+
+NONE = "none"
+"""`disturbances: none`: nothing is stated, and sigmas are those of the noise alone."""
+
+
+def _spread(kind: Kind, largest: str) -> Quantity:
+    """A standard deviation."""
+    return Quantity(kind, smallest=f"0 {kind.units[0]}", largest=largest)
+
+
+ShiftSigma = Annotated[tuple[float, float, float], Vector(_spread(LENGTH, "10 mm"), alike=True)]
+RotateSigma = Annotated[tuple[float, float, float], Vector(_spread(ANGLE, "1 deg"), alike=True)]
+GradientSigma = Annotated[tuple[float, float, float], Vector(_spread(TEMPERATURE_GRADIENT, "1000 K/m"), alike=True)]
+IndexSigma = Annotated[tuple[float, float, float], Vector(_spread(PER_LENGTH, "1e-2 1/m"), alike=True)]
+ScaleSigma = Annotated[float, _spread(SCALE, "1 percent")]
+FigureSigma = Annotated[float, _spread(LENGTH, "100 um")]
+ChangeSigma = Annotated[float, _spread(TEMPERATURE_DIFFERENCE, "100 K")]
+Span = Annotated[float, Quantity(MOMENT, above_zero=True, largest="1000000 h")]
+Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
+
+
+class TemperatureSigmaSpec(Spec):
+    """Standard deviations of a body's temperature field; what it does to light is worked out by the thermal model.
+
+    Attributes:
+        change: of its temperature at its origin, kelvin.
+        gradient: of each component of its gradient in the body's own frame, K/m.
+    """
+
+    change: ChangeSigma = 0.0
+    gradient: GradientSigma = (0.0, 0.0, 0.0)
+
+
+class TimeLawSpec(Spec):
+    """How a disturbance goes on from one time to another; its correlation between times t and t' is
+
+        white: 1 at the same time, 0 at any other; constant: 1.
+        drift D: exp(-|t - t'| / D).  period T: cos(2 pi (t - t') / T).  Both: their product.
+
+    Attributes:
+        kind: `white` or `constant`, in place of the others.
+        drift: time in which it forgets where it was, seconds.
+        period: it comes back with, seconds.
+    """
+
+    kind: Annotated[str, OneOf(lambda: ("white", "constant"))] | None = None
+    drift: Span | None = None
+    period: Span | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "TimeLawSpec":
+        given = [self.drift is not None, self.period is not None]
+        if (self.kind is not None) == any(given):
+            raise Problem(
+                "no law of time", self.text, "white, constant, {drift: 6 h}, {period: 95 min}, or the last two"
+            )
+        return self
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        parts = [self.kind or ""]
+        parts += [f"drift {moment(self.drift)}"] if self.drift is not None else []
+        parts += [f"period {moment(self.period)}"] if self.period is not None else []
+        return ", ".join(filter(None, parts)) or "nothing"
+
+
+def _law(value: Any) -> Any:
+    return {"kind": value} if isinstance(value, str) else value
+
+
+def _some_paths(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+BodyPatterns = Annotated[
+    tuple[Annotated[str, Field(strict=True, min_length=1, max_length=200)], ...],
+    BeforeValidator(_some_paths),
+    Field(min_length=1),
+]
+FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
+TimeLaw = Annotated[TimeLawSpec, BeforeValidator(_law)]
+MOVES = ("shift", "rotate", "scale", "figure", "temperature", "index_gradient")
+"""Keys of a cause that hold standard deviations."""
+
+
+class CorrelationSpec(Spec):
+    """Components of one cause that move together.
+
+    Attributes:
+        between: their names: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE
+            temperature`, `NODE gradient x`, `NODE index_gradient x`.
+        correlation: of any two of them.
+        matrix: their correlation matrix, in place of one number.
+    """
+
+    between: Annotated[tuple[Annotated[str, Field(strict=True)], ...], Field(min_length=2)]
+    correlation: Correlation | None = None
+    matrix: tuple[tuple[Correlation, ...], ...] | None = None
+
+    @model_validator(mode="after")
+    def _is_a_matrix(self) -> "CorrelationSpec":
+        if (self.correlation is None) == (self.matrix is None):
+            raise Problem("how much do they move together?", "correlation and matrix", "one of correlation and matrix")
+        if len(set(self.between)) != len(self.between):
+            raise Problem("a component is named twice", ", ".join(self.between), "each once", within=("between",))
+        rows, count = self.matrix, len(self.between)
+        if rows is None:
+            return self
+        if len(rows) != count or any(len(row) != count for row in rows):
+            found = f"{len(rows)} rows of {', '.join(str(len(row)) for row in rows)}"
+            raise Problem("not a matrix of this size", found, f"{count} rows of {count} numbers", within=("matrix",))
+        for i, row in enumerate(rows):
+            if row[i] != 1.0:
+                raise Problem(
+                    "a correlation matrix has ones on its diagonal", f"{row[i]:g}", "1", within=("matrix", i, i)
+                )
+            for j in range(i):
+                if row[j] != rows[j][i]:
+                    found = f"{row[j]:g} and {rows[j][i]:g}"
+                    raise Problem("a correlation matrix is symmetric", found, "equal", within=("matrix", i, j))
+        return self
+
+    @property
+    def table(self) -> tuple[tuple[float, ...], ...]:
+        """The matrix."""
+        if self.matrix is not None:
+            return self.matrix
+        count, value = len(self.between), self.correlation
+        assert value is not None
+        return tuple(tuple(1.0 if i == j else value for j in range(count)) for i in range(count))
+
+
+class CauseSpec(Spec):
+    """One cause of change: its bodies and the standard deviation of each component of each of their motions. Components
+    are independent of each other unless it says otherwise.
+
+    Attributes:
+        bodies: node paths; `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors).
+        shift: of the bodies in their own frames, metres.
+        rotate: about the pivot, radians.
+        scale: relative growth of a camera and all in it.
+        figure: Zernike term (Noll) -> of the surface error, metres.
+        temperature: of the bodies' temperature fields.
+        index_gradient: of the refractive index in a prism, 1/m, other than by heat.
+        pivot: of turns and growth; by default the body's centre if it has one, else its origin.
+        together: correlation of the same component of any two of the bodies.
+        correlations: of single components.
+        time: how it goes on in a series of measurements.
+        reason: where the numbers come from.
+    """
+
+    bodies: BodyPatterns
+    shift: ShiftSigma | None = None
+    rotate: RotateSigma | None = None
+    scale: ScaleSigma | None = None
+    figure: FigureSigmas | None = None
+    temperature: TemperatureSigmaSpec | None = None
+    index_gradient: IndexSigma | None = None
+    pivot: Name | None = None
+    together: Correlation | None = None
+    correlations: tuple[CorrelationSpec, ...] = ()
+    time: TimeLaw = TimeLawSpec(kind="white")
+    reason: Annotated[Text, Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _moves_something(self) -> "CauseSpec":
+        if all(getattr(self, name) is None for name in MOVES):
+            raise Problem("a cause without any standard deviation", "none", f"at least one of {', '.join(MOVES)}")
+        return self
+
+
+class CauseChangeSpec(Spec):
+    """What a job says of a cause in place of the disturbances file, key by key; a cause that the file does not have
+    needs all that a cause needs.
+
+    Attributes:
+        bodies, shift, rotate, scale, figure, temperature, index_gradient, pivot, together, correlations, time, reason:
+            as of a cause.
+    """
+
+    bodies: BodyPatterns | None = None
+    shift: ShiftSigma | None = None
+    rotate: RotateSigma | None = None
+    scale: ScaleSigma | None = None
+    figure: FigureSigmas | None = None
+    temperature: TemperatureSigmaSpec | None = None
+    index_gradient: IndexSigma | None = None
+    pivot: Name | None = None
+    together: Correlation | None = None
+    correlations: tuple[CorrelationSpec, ...] | None = None
+    time: TimeLaw | None = None
+    reason: Annotated[Text, Field(min_length=1)] | None = None
+
+    @property
+    def given(self) -> Mapping[str, Any]:
+        """What it says."""
+        return {name: getattr(self, name) for name in self.model_fields_set if getattr(self, name) is not None}
+
+
+class DisturbancesSpec(Spec):
+    """What is expected to change between the nominal measurement and a later one.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        sigmas: how many standard deviations every number of the file is; 3 for a list of 3-sigma values.
+        causes: by name.
+    """
+
+    name: Name
+    description: Text = ""
+    sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
+    causes: Annotated[Named[CauseSpec], Field(min_length=1)]
+
+    def changed(self, changes: "JobDisturbancesSpec") -> "DisturbancesSpec":
+        """The same with what a job says instead.
+
+        Raises:
+            InputError: it leaves out a cause that is not there, or adds one that is not complete.
+        """
+        causes = dict(self.causes)
+        for k, name in enumerate(changes.without):
+            if name not in causes:
+                allowed = ", ".join(self.causes)
+                raise changes.error(f"no such cause in {self.name}", ("without", k), found=name, allowed=allowed)
+            del causes[name]
+        for name, change in changes.causes.items():
+            if name in causes:
+                causes[name] = causes[name].model_copy(update=dict(change.given))
+                continue
+            missing = [key for key in ("bodies", "reason") if key not in change.given]
+            if missing or not any(key in change.given for key in MOVES):
+                allowed = f"a change of {', '.join(self.causes)}; or bodies, a reason and one of {', '.join(MOVES)}"
+                raise changes.error(f"no cause of this name in {self.name}", ("causes", name), allowed=allowed)
+            rest = {"time": TimeLawSpec(kind="white"), "correlations": ()}
+            causes[name] = CauseSpec.model_construct(**{**rest, **change.given})
+        if not causes:
+            raise changes.error("no cause is left", ("without",), allowed="disturbances: none")
+        same = self.model_copy(update={"causes": FrozenMap(causes)})
+        return same
+
+
+class JobDisturbancesSpec(Spec):
+    """Which disturbances a job's sigmas rest on.
+
+    Attributes:
+        file: name of a file in scenes/library/disturbances, or path of one's own; the instrument's by default; `none`
+            for none at all.
+        causes: what is to be said instead of, or besides, the causes of the file.
+        without: causes of the file that are left out.
+    """
+
+    file: Reference | None = None
+    causes: Named[CauseChangeSpec] = Field(default_factory=FrozenMap)
+    without: tuple[Name, ...] = ()
+
+
+def _named(value: Any) -> Any:
+    """`disturbances: orbit` names a file."""
+    return {"file": value} if isinstance(value, str) else value
+
+
+JobDisturbances = Annotated[JobDisturbancesSpec, BeforeValidator(_named)]
