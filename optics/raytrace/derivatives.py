@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.system import SystemBatch
-from optics.raytrace.trace import Traced, make_rays, rows, trace
+from optics.raytrace.trace import SECTION, Rays, Traced, make_rays, rows, trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,26 +58,42 @@ def jvp(
     """
     import drjit as dr
 
+    uploaded = systems.upload(backend)
     rays = make_rays(backend, position, direction)
-    for variable, step in ((rays.position, position_step), (rays.direction, direction_step)):
-        dr.enable_grad(variable)
-        dr.set_grad(variable, backend.vector(np.broadcast_to(step, direction.shape).reshape(-1, 3)))
-    traced = trace(backend, systems, rays, keep=keep, evaluate=False)
-    local = traced.local
-    # interior gradients are kept: a hit on the way is an input of the rays at the end
-    dr.forward_to(local.position, local.direction, local.path, list(traced.hits.values()), flags=dr.ADFlag.ClearEdges)
-
-    vectors = (local.position, local.direction, *traced.hits.values())
-    slopes, path = [dr.grad(vector) for vector in vectors], dr.grad(local.path)
-    # one launch for all: each array evaluated by itself would trace everything again in a kernel of its own
-    dr.eval(slopes, path, vectors, local.path, local.valid)
-    at_position, at_direction, *at_hits = (rows(slope, traced.count) for slope in slopes)
+    steps = [
+        backend.vector(np.broadcast_to(s, direction.shape).reshape(-1, 3)) for s in (position_step, direction_step)
+    ]
+    along: Any = None
+    hits: dict[int, Any] = {}
+    slopes: dict[int, Any] = {}
+    for first in range(0, len(uploaded.structure), SECTION):
+        last = min(first + SECTION, len(uploaded.structure))
+        dr.enable_grad(rays.position, rays.direction)
+        dr.set_grad(rays.position, steps[0])
+        dr.set_grad(rays.direction, steps[1])
+        if along is not None:
+            dr.enable_grad(rays.path)
+            dr.set_grad(rays.path, along)
+        own = [i - first for i in keep if first <= i < last]
+        traced = trace(backend, uploaded.section(first, last), rays, keep=own, evaluate=False)
+        local = traced.local
+        met = list(traced.hits.values())
+        # interior gradients are kept: a hit on the way is an input of the rays at the end
+        dr.forward_to(local.position, local.direction, local.path, met, flags=dr.ADFlag.ClearEdges)
+        steps, along = [dr.grad(local.position), dr.grad(local.direction)], dr.grad(local.path)
+        at = [dr.grad(vector) for vector in met]
+        # one launch for all: each array evaluated by itself would trace everything again in a kernel of its own
+        dr.eval(steps, along, at, local.position, local.direction, local.path, local.valid, met)
+        hits.update({first + i: dr.detach(vector) for i, vector in traced.hits.items()})
+        slopes.update({first + i: slope for i, slope in zip(traced.hits, at, strict=True)})
+        ends = (dr.detach(array) for array in (local.position, local.direction, local.path))
+        rays = Rays(*ends, local.valid, systems.count)
     return RayTangents(
-        at_position,
-        at_direction,
-        path.numpy().reshape(traced.count, -1),
-        dict(zip(traced.hits, at_hits, strict=True)),
-        traced,
+        rows(steps[0], systems.count),
+        rows(steps[1], systems.count),
+        along.numpy().reshape(systems.count, -1),
+        {i: rows(slope, systems.count) for i, slope in slopes.items()},
+        Traced(rays, None, hits, systems.count),
     )
 
 

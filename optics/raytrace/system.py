@@ -7,7 +7,7 @@ order) can be batched together: the two cameras of an instrument, left and right
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -168,6 +168,13 @@ class UploadedSystems:
     grids: tuple[Any, ...]
     count: int
     differentiable: bool
+
+    def section(self, first: int, last: int) -> UploadedSystems:
+        """Elements ``first`` to ``last - 1`` alone, for rays in the frame of the element before them; ``world`` remains
+        the last element's of all.
+        """
+        part = slice(first, last)
+        return replace(self, structure=self.structure[part], values=self.values[part], grids=self.grids[part])
 
 
 def assemble(

@@ -30,6 +30,10 @@ invalid."""
 FURTHER_STEPS = 2
 """As many more for a surface with further terms of its sag, which may depart by millimetres."""
 
+SECTION = 6
+"""Elements that one kernel traces, and differentiates: the time to compile it grows faster than its length, and
+sequences that begin alike share the kernels of their beginning. Between them rays pass through memory."""
+
 CONVERGED = 1e-12
 """Largest distance to the surface of a valid hit, metres."""
 
@@ -171,6 +175,8 @@ def trace(
             valid = valid & ok
         if i in keep:
             hits[i] = p
+        if not differentiable and i % SECTION == SECTION - 1 and i + 1 < len(uploaded.structure):
+            dr.eval(p, d, path, valid)
     d = d + dr.zeros(backend.Float, dr.width(p))  # nothing may have turned a shared direction
     local = Rays(p, d, path, valid, uploaded.count)
     outside = None

@@ -1,8 +1,10 @@
 """Derivatives from a body's motion to the pixels, by AD through tree, trace and diffraction, against differences."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
+from optics.raytrace import derivatives, trace
 from scenes.specs.channel import BASE
 from twin.monitor.monitor_derivative import photon_derivative, spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
@@ -54,3 +56,29 @@ def test_centroid_of_the_image_moves_as_the_rays_do(path):
     for m in range(len(MOTIONS)):
         scale = np.abs(rays[m]).max()
         assert np.abs(moved[m] - rays[m]).max() < 0.03 * scale + 1e-9
+
+
+def test_a_trace_in_sections_is_the_same(path, monkeypatch):
+    """Where one kernel ends and the next begins changes no ray, and derivatives by rounding only."""
+    whole, some = {}, MOTIONS[:6]
+    for section in (1000, 6, 5):
+        for module in (trace, derivatives):
+            monkeypatch.setattr(module, "SECTION", section)
+        rays = path.coarse.rays([motion.state(STEP[motion.kind]) for motion in some])
+        whole[section] = (rays.position, rays.direction, rays.path), spot_jacobian(path, some)
+    for section in (6, 5):
+        for one, other in zip(whole[section][0], whole[1000][0], strict=True):
+            np.testing.assert_array_equal(one, other)
+        one, other = whole[section][1], whole[1000][1]
+        # 25 surfaces, each of which rounds
+        assert np.abs(one - other).max() < 1e-13 * np.abs(other).max()
+
+
+def test_derivatives_by_any_motions_take_the_same_kernels(path):
+    """With figures or without: to compile another set of kernels takes seconds."""
+    spot_jacobian(path, line_family("backward"))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history()
+        spot_jacobian(path, (ElementaryMotion(f"{BASE}/backward/M2", "figure", 8), *line_family("forward")))
+        compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
+    assert compiled == []

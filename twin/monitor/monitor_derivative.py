@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from optics.geometry.tree import COMPLEX_STEP, PlacedBodies
+from optics.geometry.tree import AT_REST, COMPLEX_STEP, PlacedBodies, State
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import transverse_axes
@@ -14,7 +15,7 @@ from optics.raytrace.derivatives import RayTangents, jvp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.waves.diffraction import PupilTangent, image_derivative
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.motions import ElementaryMotion, pivot_states
+from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, pivot_states
 
 
 def size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
@@ -31,7 +32,7 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tupl
 
     The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
     """
-    states, steps = pivot_states(motions), [motion.step for motion in motions]
+    states, steps = _of_one_structure(path, pivot_states(motions)), [motion.step for motion in motions]
     placed = path.instrument.assembly.place(states, steps)
     source = np.concatenate([placed.translation[:, placed.index[c.reticle_body]].imag for c in path.channels])
     nominal, m = path.nominal, len(motions)
@@ -52,6 +53,20 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tupl
     q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.target - drift)
     sizes = size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
+
+
+def _of_one_structure(path: MonitorPath, states: list[State]) -> list[State]:
+    """The same states, of which the first names the highest figure term of every mirror, as none: so the derivatives by
+    any motions take one and the same kernel, which is by far the longest to compile.
+    """
+    if not states:
+        return states
+    first, term = dict(states[0]), max(FIGURE_TERMS)
+    for element in path.instrument.assembly.elements.values():
+        if not element.surface.is_plane:
+            motion = first.get(element.body, AT_REST)
+            first[element.body] = replace(motion, figure={term: 0.0, **motion.figure})
+    return [first, *states[1:]]
 
 
 def hit_slopes(
