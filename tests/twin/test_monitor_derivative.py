@@ -74,11 +74,15 @@ def test_a_trace_in_sections_is_the_same(path, monkeypatch):
         assert np.abs(one - other).max() < 1e-13 * np.abs(other).max()
 
 
-def test_derivatives_by_any_motions_take_the_same_kernels(path):
-    """With figures or without: to compile another set of kernels takes seconds."""
-    spot_jacobian(path, line_family("backward"))
+def kernels(path, motions):
+    """Hashes of the kernels that the derivatives by these motions run."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
-        spot_jacobian(path, (ElementaryMotion(f"{BASE}/backward/M2", "figure", 8), *line_family("forward")))
-        compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
-    assert compiled == []
+        spot_jacobian(path, motions)
+        return {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
+
+
+def test_derivatives_by_any_motions_take_the_same_kernels(path):
+    """With figures or without: to compile another set of kernels takes seconds."""
+    plain, figured = line_family("backward"), (ElementaryMotion(f"{BASE}/backward/M2", "figure", 8),)
+    assert kernels(path, plain) == kernels(path, (*figured, *plain)) != set()
