@@ -160,14 +160,19 @@ class RenderRun:
         assert self.experiment.disturbances is not None
         return {
             "name": self.experiment.disturbances.name,
-            "chi_square": found.chi_square,
+            "chi_square": _to_digits(found.chi_square),
             "degrees_of_freedom": found.degrees,
-            "limit": found.limit,
+            "limit": _to_digits(found.limit),
             "false_alarm": FALSE_ALARM,
-            "chance": found.chance,
+            "chance": _to_digits(found.chance),
             "agrees": found.agrees,
             "suspects": [
-                {"body": one.body, "times_stated": one.times, "log_likelihood_gain": one.gain} for one in found.suspects
+                {
+                    "body": one.body,
+                    "times_stated": _to_digits(one.times),
+                    "log_likelihood_gain": _to_digits(one.gain),
+                }
+                for one in found.suspects
             ],
         }
 
@@ -175,7 +180,13 @@ class RenderRun:
 STATED = 6
 """Decimals of a reading's sigma to which files state the reading."""
 STATED_SIGMA = 8
-"""Significant digits of a sigma."""
+"""Significant digits of a sigma, and of a chi-square."""
+_SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
+"""Endings of the keys of sigmas."""
+
+
+def _to_digits(value: float) -> float:
+    return float(f"{value:.{STATED_SIGMA - 1}e}")
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
@@ -193,8 +204,8 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
         sigma = next((readings[name] for name in names if name in readings), None)
         if isinstance(value, Mapping):
             out[key] = stated(value)
-        elif isinstance(value, float) and (key.endswith(("_sigma", "_sigma_noise")) or key.startswith("sigma_")):
-            out[key] = float(f"{value:.{STATED_SIGMA - 1}e}")
+        elif isinstance(value, float) and (key.endswith(_SIGMAS) or key.startswith("sigma_")):
+            out[key] = _to_digits(value)
         elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
             # adding 0.0 turns a negative zero into a plain one
             out[key] = round(value, STATED - math.floor(math.log10(sigma))) + 0.0
