@@ -86,8 +86,8 @@ def jvp(
         dr.eval(steps, along, at, local.position, local.direction, local.path, local.valid, met)
         hits.update({first + i: dr.detach(vector) for i, vector in traced.hits.items()})
         slopes.update({first + i: slope for i, slope in zip(traced.hits, at, strict=True)})
-        ends = (dr.detach(array) for array in (local.position, local.direction, local.path))
-        rays = Rays(*ends, local.valid, systems.count)
+        place, heading, path = (dr.detach(array) for array in (local.position, local.direction, local.path))
+        rays = Rays(place, heading, path, local.valid, systems.count)
     return RayTangents(
         rows(steps[0], systems.count),
         rows(steps[1], systems.count),
