@@ -57,7 +57,21 @@ def test_sigma_and_units():
     assert out == {
         "change_arcsec": pytest.approx(2.0),
         "change_arcsec_sigma": pytest.approx(0.03 * np.sqrt(2)),
+        "change_arcsec_sigma_noise": pytest.approx(0.03 * np.sqrt(2)),
     }
+
+
+def test_errors_that_both_cameras_share():
+    """A common error about Y leaves the angle alone, the opposite one counts twice; noise and total apart."""
+    spread = SIGMA @ SIGMA
+    one, two = (CameraParameters.from_vector(np.zeros(4), spread, 4 * spread) for _ in range(2))
+    plain = exact(one, two, FORWARD, BACKWARD)
+    assert plain.sigma_rad == pytest.approx(2 * plain.noise_rad)
+    alike = exact(one, two, FORWARD, BACKWARD, spread, 4 * spread)
+    opposite = exact(one, two, FORWARD, BACKWARD, -spread, -4 * spread)
+    # differences of the finite steps' rounding
+    assert alike.sigma_rad < 1e-4 * plain.sigma_rad
+    assert opposite.sigma_rad == pytest.approx(np.sqrt(2) * plain.sigma_rad, rel=1e-6)
 
 
 def test_sigma_of_the_exact_form_by_draws():

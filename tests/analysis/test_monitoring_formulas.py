@@ -136,7 +136,12 @@ def test_to_dict_units_and_shapes():
     assert out["d_alpha_arcsec_sigma"] == pytest.approx(1)
     assert out["d_f_um_sigma"] == pytest.approx(1)
     assert isinstance(out["d_f_um"], float)
-    assert len(out) == 8
+    assert out["d_f_um_sigma_noise"] == out["d_f_um_sigma"]
+    assert len(out) == 12
+    # what is stated to move counts in the total alone
+    spread = np.diag([ARCSEC, 1, 1, 1e-6]) ** 2
+    stated = CameraParameters.from_vector(np.zeros(4), spread, 9 * spread).to_dict()
+    assert stated["d_f_um_sigma"] == pytest.approx(3) == 3 * stated["d_f_um_sigma_noise"]
     many = CameraParameters.from_vector(np.zeros((3, 4)), ZERO).to_dict()
     assert many["d_f_um"] == [0.0, 0.0, 0.0]
 
