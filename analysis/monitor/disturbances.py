@@ -124,6 +124,15 @@ class Disturbances:
         f = np.asarray(factors, np.float64)
         return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
 
+    def since(self, gap: float) -> Disturbances:
+        """The same for changes over a span of time in place of changes from what the instrument is meant to be.
+
+        Args:
+            gap: between the two times, seconds.
+        """
+        kept = np.array([float(law.correlation(np.array(gap))) for law in self.laws])
+        return self.scaled(np.sqrt(2.0 * (1.0 - kept)))
+
     def error_root(self, gain: Array) -> Array:
         """What is left of the motions in an estimate: (gain A - B) root, (..., 4 K, M).
 

@@ -17,9 +17,9 @@ from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import CameraParameters, shift_covariance
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
-from analysis.spots.spot_positions import SpotPositions, difference_covariance
+from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
-__all__ = ["CENTROIDS", "Estimates", "Recovery", "estimates", "measure_spots", "recover"]
+__all__ = ["CENTROIDS", "Estimates", "Recovery", "estimates", "estimates_of", "measure_spots", "recover"]
 
 Array = NDArray[np.float64]
 CENTROIDS = ("ml", "gaussian", "energy")
@@ -48,6 +48,7 @@ class Recovery:
     parameters: camera -> estimator -> changes with arrays of shape (S,).
     angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
     ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
+    parts: noise of the positions before (C spots) and after (S C), for series of measurements; None unless kept.
     """
 
     before: Array
@@ -58,9 +59,10 @@ class Recovery:
     parameters: Mapping[str, Mapping[str, CameraParameters]]
     angle: Mapping[str, IntersectionAngleChange]
     ground: Mapping[str, GroundError] = field(default_factory=dict)
+    parts: tuple[NoiseParts, NoiseParts] | None = None
 
     def at(self, states: slice) -> Recovery:
-        """Those of some states.
+        """Those of some states, without ``parts``.
 
         Args:
             states: which.
@@ -129,6 +131,7 @@ def recover(
     centroid: str = "ml",
     threads: int = 1,
     disturbances: Disturbances | None = None,
+    keep_parts: bool = False,
 ) -> Recovery:
     """Recover all parameters.
 
@@ -140,6 +143,7 @@ def recover(
         threads: for the fits; results do not depend on it.
         disturbances: what is stated to move; without it there is no `posterior`, and all sigmas are those of the noise
             alone.
+        keep_parts: of the noise, which are large.
     """
     states, spots, frames = after.shape[0], after.shape[1], after.shape[2]
     if spots != calibration.spots or before.shape[-4] != spots:
@@ -160,6 +164,7 @@ def recover(
         parameters=found.parameters,
         angle=found.angle,
         ground=found.ground,
+        parts=(noise_parts(first, calibration.noise), noise_parts(second, calibration.noise)) if keep_parts else None,
     )
 
 
@@ -182,14 +187,32 @@ def estimates(
         ground: of a pair whose altitude is known.
     """
     shifts = Shifts(start, end, joint(covariance), cameras, disturbances)
-    parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
-    angle: dict[str, IntersectionAngleChange] = {}
-    errors: dict[str, GroundError] = {}
+    found: dict[str, tuple[Array, Array, Array | None]] = {}
     for title, estimator in applicable(disturbances).items():
         gain, values = estimator.gain(shifts), estimator.read(shifts)
         noise = gain @ shifts.covariance @ np.swapaxes(gain, -1, -2)
-        total = None if disturbances is None else noise + disturbances.misfit(gain)
-        own = [slice(COORDINATES * k, COORDINATES * (k + 1)) for k in range(len(cameras))]
+        found[title] = values, noise, None if disturbances is None else noise + disturbances.misfit(gain)
+    return estimates_of(found, cameras, ground)
+
+
+def estimates_of(
+    found: Mapping[str, tuple[Array, Array, Array | None]],
+    cameras: Mapping[str, CameraCalibration],
+    ground: GroundGeometry | None = None,
+) -> Estimates:
+    """What follows from changes of all cameras together: those of each, of their angle, on the ground.
+
+    Args:
+        found: estimator -> (S, 4 K) changes, and (S, 4 K, 4 K) covariances by noise and of the whole error; None for
+            the last where nothing is stated to move.
+        cameras: what is calibrated of each.
+        ground: of a pair whose altitude is known.
+    """
+    parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
+    angle: dict[str, IntersectionAngleChange] = {}
+    errors: dict[str, GroundError] = {}
+    own = [slice(COORDINATES * k, COORDINATES * (k + 1)) for k in range(len(cameras))]
+    for title, (values, noise, total) in found.items():
         for name, part in zip(cameras, own, strict=True):
             whole = None if total is None else total[..., part, part]
             parameters[name][title] = CameraParameters.from_vector(values[..., part], noise[..., part, part], whole)

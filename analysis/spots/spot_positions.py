@@ -8,7 +8,8 @@ PRNU and DSNU of the same pixels are the same draw in both, so the covariance of
     dsnu)^2)
 
 with s the light signal. A spot that stays on its pixels loses the pattern from its difference; one that moves by more
-than its own size keeps it twice. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+than its own size keeps it twice. Over a series of images after one "before" the differences at two times are correlated
+by the temporal noise of "before" and by the pattern of the pixels that the spot shares at these times. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["SpotError", "SpotPositions", "difference_covariance"]
+__all__ = ["NoiseParts", "SeriesNoise", "SpotError", "SpotPositions", "difference_covariance", "noise_parts"]
 
 Array = NDArray[np.float64]
 
@@ -117,3 +118,92 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
         cross = (g_after[part] * light_after[part]) @ lit_before + g_after[part] @ dark_before
         total[part] -= cross + cross.transpose(0, 2, 1)
     return total
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseParts:
+    """What makes positions of B spots wrong, apart by what is new in every image and what is not.
+
+    Attributes:
+        temporal: (B, 2, 2) px^2.
+        pattern: (B, 2, Q) px by one standard deviation of each pixel's response and dark signal: products of two
+            images' are the covariance of their positions by the pattern. Single precision, for there are many.
+    """
+
+    temporal: Array
+    pattern: NDArray[np.float32]
+
+
+def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
+    """Of measured positions. Raises ValueError when their maps were not kept.
+
+    Args:
+        positions: measured with maps.
+        noise: of the detector.
+    """
+    if positions.gain_maps is None or positions.light_dn is None:
+        raise ValueError("noise parts: positions need their gain maps; measure with keep_maps=True")
+    count = positions.row.size
+    gain = positions.gain_maps.reshape(count, 2, -1)
+    size = gain.shape[-1]
+    pattern = np.empty((count, 2, 2 * size), np.float32)
+    np.multiply(gain, noise.prnu * positions.light_dn.reshape(count, 1, -1), out=pattern[..., :size], casting="same_kind")
+    np.multiply(gain, np.sqrt(noise.dsnu_variance_dn2), out=pattern[..., size:], casting="same_kind")
+    return NoiseParts(positions.temporal_covariance, pattern)
+
+
+class SeriesNoise:
+    """Covariance of the differences to one "before" over a series of images of C spots, which are added one after the
+    other.
+
+    Args:
+        before: C spots.
+        reach: how many images apart two differences may be for their covariance to be kept, which bounds memory.
+    """
+
+    def __init__(self, before: NoiseParts, reach: int) -> None:
+        self._before, self._reach = before, reach
+        self._maps: list[NDArray[np.float32]] = []
+        self._rows: list[Array] = []
+
+    @property
+    def images(self) -> int:
+        """How many have been added."""
+        return len(self._rows)
+
+    def add(self, after: NoiseParts) -> None:
+        """Append images. Raises ValueError for another number of spots.
+
+        Args:
+            after: of S times C spots, image by image.
+        """
+        count = len(self._before.temporal)
+        if len(after.temporal) % count:
+            raise ValueError(f"series noise: {len(after.temporal)} positions of {count} spots")
+        for start in range(0, len(after.temporal), count):
+            own = after.pattern[start : start + count] - self._before.pattern
+            self._maps = [*self._maps, own][-1 - self._reach :]
+            row = np.stack([own @ earlier.transpose(0, 2, 1) for earlier in self._maps]).astype(np.float64)
+            row += self._before.temporal
+            row[-1] += after.temporal[start : start + count]
+            self._rows.append(row)
+
+    def covariance(self, images: NDArray[np.int_]) -> Array:
+        """(n 2 C, n 2 C) px^2 of some images' differences, image by image, spot by spot, row before column.
+
+        Args:
+            images: (n,) their numbers, each once. Raises ValueError for images farther apart than the reach.
+        """
+        if np.ptp(images) > self._reach:
+            raise ValueError(f"series noise: images {np.ptp(images)} apart, {self._reach} are kept")
+        count, n = len(self._before.temporal), len(images)
+        out = np.zeros((n, count, 2, n, count, 2))
+        for i, late in enumerate(images):
+            for j, early in enumerate(images[: i + 1]):
+                a, b = max(late, early), min(late, early)
+                block = self._rows[a][b - a - 1]
+                block = block if late >= early else block.transpose(0, 2, 1)
+                for spot in range(count):
+                    out[i, spot, :, j, spot] = block[spot]
+                    out[j, spot, :, i, spot] = block[spot].T
+        return out.reshape(n * count * 2, -1)

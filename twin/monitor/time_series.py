@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency
+from analysis.monitor.ground_error import AXES, GroundError
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
-from analysis.monitor.recovery import Recovery, recover
-from analysis.spots.spot_positions import SpotError
+from analysis.monitor.recovery import Estimates, Recovery, estimates_of, recover
+from analysis.monitor.series_smoother import smooth, window_of
+from analysis.spots.spot_positions import SeriesNoise, SpotError
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from optics.numerics.threads import cores, one_blas_thread
@@ -35,6 +38,39 @@ LARGEST_SERIES = 200_000_000
 
 
 @dataclass(frozen=True, eq=False)
+class SmoothedCourse:
+    """What all measurements of a course say together, by the laws in time of what is stated to move.
+
+    Attributes:
+        name: of the stated disturbances.
+        changes: at all times of the course, by the estimators `filtered`, from the measurements up to each time, and
+            `smoothed`, from all.
+        innovations: (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
+        consistency: chi-square of the whole series.
+    """
+
+    name: str
+    changes: Estimates
+    innovations: np.ndarray
+    each: int
+    consistency: Consistency
+
+    def to_dict(self) -> dict[str, Any]:
+        """Do the measurements agree with what is stated?"""
+        found = self.consistency
+        return {
+            "name": self.name,
+            "chi_square": found.chi_square,
+            "degrees_of_freedom": found.degrees,
+            "limit": found.limit,
+            "false_alarm": FALSE_ALARM,
+            "chance": found.chance,
+            "agrees": found.agrees,
+            "innovations": {"chi_square": self.innovations.tolist(), "degrees_of_freedom": self.each},
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class TimeSeries:
     """What a course of T times gave.
 
@@ -47,6 +83,10 @@ class TimeSeries:
         angle: of the nominal state, radians, NaN unless there are two cameras; angle_change: (T,), radians.
         parameters: camera -> estimator -> changes, arrays (T,), against one nominal measurement.
         recovered_angle: estimator -> change of the intersection angle, arrays (T,); empty unless there are two cameras.
+        true_ground: (T, 3) errors along the track, across it and up of points located by the nominal cameras, metres;
+            None unless the altitude of a pair is known.
+        recovered_ground: estimator -> the same as they are read, arrays (T,); empty likewise.
+        smoothed: all measurements together; None where nothing is stated to move.
         photons: expected photons per pixel and frame, float32 (T, C, rows, columns).
         shown_photons: those of the time that is shown, as they were exposed, (C, rows, columns).
         frames: the first frame of each time, uint16 (T, C, rows, columns).
@@ -62,6 +102,9 @@ class TimeSeries:
     angle_change: np.ndarray
     parameters: Mapping[str, Mapping[str, CameraParameters]]
     recovered_angle: Mapping[str, IntersectionAngleChange]
+    true_ground: np.ndarray | None
+    recovered_ground: Mapping[str, GroundError]
+    smoothed: SmoothedCourse | None
     photons: np.ndarray
     shown_photons: np.ndarray
     frames: np.ndarray
@@ -70,12 +113,16 @@ class TimeSeries:
     def to_dict(self) -> dict[str, Any]:
         """Contents of course.json: as truth.json and recovered.json, with a list over the times for each number."""
         cameras: dict[str, Any] = {}
+        changes = Estimates({name: {} for name in self.parameters}, {}, {})
+        if self.smoothed is not None:
+            changes = self.smoothed.changes
         for name, estimators in self.parameters.items():
             # adding 0.0 turns a negative zero into a plain one
             values = {
                 k: (v + 0.0).tolist() for k, v in zip(PARAMETERS, self.truth[name] * PER_SI[:, None], strict=True)
             }
-            cameras[name] = {"true": values, **{e: p.to_dict() for e, p in estimators.items()}}
+            every = {**estimators, **changes.parameters[name]}
+            cameras[name] = {"true": values, **{e: p.to_dict() for e, p in every.items()}}
         out: dict[str, Any] = {
             "times_s": self.times.tolist(),
             "detail": self.shown,
@@ -99,8 +146,15 @@ class TimeSeries:
             out["intersection_angle"] = {
                 "nominal_deg": float(np.degrees(self.angle)),
                 "true": {"change_arcsec": (self.angle_change / ARCSEC + 0.0).tolist()},
-                **{e: a.to_dict() for e, a in self.recovered_angle.items()},
+                **{e: a.to_dict() for e, a in {**self.recovered_angle, **changes.angle}.items()},
             }
+        if self.true_ground is not None:
+            out["ground"] = {
+                "true": {f"{axis}_m": (v + 0.0).tolist() for axis, v in zip(AXES, self.true_ground.T, strict=True)},
+                **{e: g.to_dict() for e, g in {**self.recovered_ground, **changes.ground}.items()},
+            }
+        if self.smoothed is not None:
+            out["disturbances"] = self.smoothed.to_dict()
         return out
 
 
@@ -166,6 +220,7 @@ def run_series(
     shown_photons = np.empty(photons.shape[1:])
     truths: list[Truth] = []
     recoveries: list[Recovery] = []
+    together = _Together(experiment, course.times)
     for piece in _pieces(len(states), max(1, min(CHUNK, LARGEST_FRAMES // (each * frames)))):
         some = states[piece]
         try:
@@ -184,12 +239,14 @@ def run_series(
                         job.analysis.centroid,
                         cores(),
                         experiment.disturbances,
+                        keep_parts=experiment.disturbances is not None,
                     )
                 )
         except SpotError as error:
             k, spot = divmod(error.indices[0], len(channels))
             reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
             raise too_large(job, piece.start + k, reason) from error
+        recoveries[-1] = together.add(recoveries[-1])
         photons[piece], first[piece] = expected, after[:, :, 0]
         if piece.start <= course.shown < piece.stop:
             shown_photons[:] = expected[course.shown - piece.start]
@@ -215,6 +272,11 @@ def run_series(
             for name in names
         },
         recovered_angle={e: _joined_angle([r.angle[e] for r in recoveries]) for e in recoveries[0].angle},
+        true_ground=None
+        if experiment.ground is None
+        else np.concatenate([t.ground_error(experiment.ground) for t in truths]),
+        recovered_ground={e: _joined_ground([r.ground[e] for r in recoveries]) for e in recoveries[0].ground},
+        smoothed=together.smoothed(),
         photons=photons,
         shown_photons=shown_photons,
         frames=first,
@@ -274,6 +336,43 @@ def _joined_angle(parts: Sequence[IntersectionAngleChange]) -> IntersectionAngle
         np.concatenate([p.sigma_rad for p in parts]),
         np.concatenate([p.noise_rad for p in parts]),
     )
+
+
+def _joined_ground(parts: Sequence[GroundError]) -> GroundError:
+    return GroundError(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(GroundError)))
+
+
+class _Together:
+    """Collects shifts and noise of all measurements."""
+
+    def __init__(self, experiment: MonitorExperiment, times: Sequence[float]) -> None:
+        self.experiment, self.times = experiment, np.array(times)
+        self.shifts: list[np.ndarray] = []
+        self.noise: SeriesNoise | None = None
+
+    def add(self, found: Recovery) -> Recovery:
+        """Take what is needed of some states, and give it back without the maps."""
+        if found.parts is None:
+            return found
+        before, after = found.parts
+        if self.noise is None:
+            self.noise = SeriesNoise(before, window_of(found.shift.shape[1]))
+        self.noise.add(after)
+        self.shifts.append(found.shift)
+        return found.at(slice(None))
+
+    def smoothed(self) -> SmoothedCourse | None:
+        """Of all that was added; None where nothing is stated to move."""
+        stated, noise = self.experiment.disturbances, self.noise
+        if stated is None or noise is None:
+            return None
+        with one_blas_thread():
+            found = smooth(stated, self.times, np.concatenate(self.shifts), noise, self.times)
+        changes = {"filtered": found.filtered, "smoothed": found.smoothed}
+        every = {name: (one.values, one.noise, one.total) for name, one in changes.items()}
+        estimates = estimates_of(every, self.experiment.cameras, self.experiment.ground)
+        each = found.consistency.degrees // len(self.times)
+        return SmoothedCourse(stated.name, estimates, found.innovations, each, found.consistency)
 
 
 MIN_LIGHT = 0.5

@@ -1,0 +1,252 @@
+"""Changes of the cameras over a series of measurements, at the times of the measurements and between them.
+
+What is stated to move is a normal process: the motions of one law go on with the correlation rho(t - t') of that law,
+so that shifts s and parameters p at two times have the covariances
+
+    cov(s, s') = sum rho A C A',   cov(p, s') = sum rho B C A',   cov(p, p') = sum rho B C B',
+
+sums over the laws. Changes are counted from the calibration, where nothing had moved, or from a reference time of the
+same process; rho(t - t') is then rho(t - t') - rho(t - t0) - rho(t' - t0) + 1. With the noise N of all shifts together
+the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other: u = L^-1 s are
+the innovations of a Kalman filter, each from what the shifts before it do not say. The estimate from the first n shifts
+is then the sum of the first n products
+
+    p(t) = sum_n (L^-1 cov(s, p(t)))_n u_n,
+
+filtered where the sum ends with the last shift up to t, smoothed where it takes all: the values and covariances of the
+Kalman filter and of the Rauch-Tung-Striebel smoother, without their state space, and for noise that is not white in
+time, too (Kailath, Sayed, Hassibi, Linear Estimation, 2000, ch. 4; Rasmussen, Williams, Gaussian Processes for Machine
+Learning, 2006, ch. 2). The sum of squares of u is the chi-square of the series.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
+
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
+
+__all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int_]
+LARGEST = 2400
+"""Shifts in one factorisation, 46 MB: 300 times of two cameras. A longer series is worked on in pieces of a third of
+that, each from the measurements of its own and of as many before and after it, so that its sigmas are those of the
+measurements used."""
+_AT_ONCE = 64
+"""Times whose covariances with all shifts are held at once."""
+
+
+class ShiftNoise(Protocol):
+    """Noise of a series of shifts."""
+
+    def covariance(self, images: Numbers) -> Array:
+        """(n D, n D) px^2 of the shifts of some measurements, one measurement after the other.
+
+        Args:
+            images: (n,) their numbers in the order of the shifts.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesChanges:
+    """Changes of K cameras at T times.
+
+    Attributes:
+        values: (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
+        noise: (T, 4 K, 4 K) covariance of their errors by the noise of the shifts.
+        total: likewise of the whole error.
+    """
+
+    values: Array
+    noise: Array
+    total: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedSeries:
+    """Changes of all cameras over a series.
+
+    Attributes:
+        filtered: from the measurements up to each time.
+        smoothed: from all measurements.
+        innovations: (M,) chi-square of each measurement, in the order given, against what those before it say, each of
+            D degrees of freedom.
+        consistency: chi-square of the whole series.
+    """
+
+    filtered: SeriesChanges
+    smoothed: SeriesChanges
+    innovations: Array
+    consistency: Consistency
+
+
+def window_of(values: int) -> int:
+    """Measurements that are worked on at once.
+
+    Args:
+        values: shifts in each, D.
+    """
+    return max(3, LARGEST // values)
+
+
+def smooth(
+    stated: Disturbances,
+    measured: ArrayLike,
+    shifts: Array,
+    noise: ShiftNoise,
+    times: ArrayLike,
+    reference: float | None = None,
+) -> SmoothedSeries:
+    """Filtered and smoothed changes.
+
+    Args:
+        stated: what moves, and how it goes on in time.
+        measured: (M,) when the monitor measured, seconds, in any order.
+        shifts: (M, D) what it measured, after - before, px.
+        noise: of these shifts.
+        times: (T,) for which changes are wanted, seconds, in any order.
+        reference: from which time of the process changes are counted, seconds; None for the calibration.
+
+    Raises:
+        ValueError: motions of different laws are correlated, or the shifts have no noise and say the same twice.
+    """
+    model = _Process(stated, reference)
+    when, wanted = np.asarray(measured, np.float64), np.asarray(times, np.float64)
+    order = np.argsort(when, kind="stable")
+    when = when[order]
+    width, count = 4 * (len(stated.parameters) // 4), len(wanted)
+    found = {
+        which: SeriesChanges(np.empty((count, width)), np.empty((count, width, width)), np.empty((count, width, width)))
+        for which in ("filtered", "smoothed")
+    }
+    squares = np.empty(len(when))
+    for piece, window in _pieces(len(when), window_of(shifts.shape[1])):
+        own = order[window]
+        part = _Factor(model, when[window], shifts[own], noise.covariance(own))
+        inside = slice(piece.start - window.start, piece.stop - window.start)
+        squares[own[inside]] = part.squares[inside]
+        # from the first time of the piece to that of the next; those before all measurements to the first piece
+        first = -np.inf if piece.start == 0 else when[piece.start]
+        last = np.inf if piece.stop == len(when) else when[piece.stop]
+        mine = np.flatnonzero((wanted >= first) & (wanted < last))
+        for k in range(0, len(mine), _AT_ONCE):
+            part.estimate(wanted, mine[k : k + _AT_ONCE], found["filtered"], found["smoothed"])
+    degrees = shifts.size
+    whole = Consistency(float(squares.sum()), degrees, float(chi2.isf(FALSE_ALARM, degrees)))
+    return SmoothedSeries(found["filtered"], found["smoothed"], squares, whole)
+
+
+def _pieces(count: int, window: int) -> Iterator[tuple[slice, slice]]:
+    """Pieces of a series, and the measurements that each is worked out from."""
+    if count <= window:
+        yield slice(0, count), slice(0, count)
+        return
+    step = window // 3
+    for start in range(0, count, step):
+        stop = min(start + step, count)
+        yield slice(start, stop), slice(max(0, start - step), min(count, stop + step))
+
+
+class _Process:
+    """Covariances over time of shifts and parameters."""
+
+    def __init__(self, stated: Disturbances, reference: float | None) -> None:
+        self.reference = reference
+        self.parts: list[tuple[TimeLaw, Array, Array, Array]] = []
+        laws = list(dict.fromkeys(stated.laws))
+        for law in laws:
+            own = np.array([one == law for one in stated.laws])
+            if np.any(stated.correlation[np.ix_(own, ~own)]):
+                raise ValueError("smoother: motions with different laws in time cannot be correlated")
+            spots, parameters = stated.spots[:, own], stated.parameters[:, own]
+            correlation = stated.correlation[np.ix_(own, own)]
+            across = parameters @ correlation
+            self.parts.append((law, spots @ correlation @ spots.T, across @ spots.T, across @ parameters.T))
+
+    def _correlation(self, law: TimeLaw, one: Array, two: Array) -> Array:
+        """(n, m) of a law between two sets of times."""
+        out = law.correlation(one[:, None] - two)
+        if self.reference is None:
+            return out
+        since, until = (law.correlation(times - self.reference) for times in (one, two))
+        return np.asarray(out - since[:, None] - until + 1.0)
+
+    def shifts(self, times: Array) -> Array:
+        """(n D, n D) px^2."""
+        return _together([(self._correlation(law, times, times), spots) for law, spots, _, _ in self.parts])
+
+    def across(self, times: Array, wanted: Array) -> Array:
+        """(n D, m 4 K) shifts against parameters."""
+        return _together([(self._correlation(law, times, wanted), cross.T) for law, _, cross, _ in self.parts])
+
+    def parameters(self, wanted: Array) -> Array:
+        """(m, 4 K, 4 K) of the parameters at each time."""
+        out = 0.0
+        for law, _, _, own in self.parts:
+            apart = np.zeros_like(wanted)
+            kept = np.ones_like(wanted)
+            if self.reference is not None:
+                apart = law.correlation(wanted - self.reference)
+                kept = 2.0 * (1.0 - apart)
+            out = out + kept[:, None, None] * own
+        return np.asarray(out)
+
+
+def _together(parts: list[tuple[Array, Array]]) -> Array:
+    """Sum of Kronecker products."""
+    return np.asarray(sum(np.kron(time, own) for time, own in parts))
+
+
+class _Factor:
+    """Measurements of one window, whitened in the order of time."""
+
+    def __init__(self, process: _Process, when: Array, shifts: Array, noise: Array) -> None:
+        self.process, self.when, self.each = process, when, shifts.shape[1]
+        try:
+            self.root = np.linalg.cholesky(process.shifts(when) + noise)
+        except np.linalg.LinAlgError as error:
+            raise ValueError("smoother: shifts that say the same twice need noise") from error
+        self.white = solve_triangular(self.root, shifts.ravel(), lower=True)
+        left = solve_triangular(self.root, noise, lower=True)
+        self.noise = solve_triangular(self.root, left.T, lower=True)
+        self.squares = np.sum(self.white.reshape(shifts.shape) ** 2, axis=1)
+
+    def estimate(self, times: Array, at: Numbers, filtered: SeriesChanges, smoothed: SeriesChanges) -> None:
+        """Fill in the changes at some of the times.
+
+        Args:
+            times: all.
+            at: which of them.
+            filtered, smoothed: to be filled.
+        """
+        wanted = times[at]
+        prior = self.process.parameters(wanted)
+        weights = solve_triangular(self.root, self.process.across(self.when, wanted), lower=True)
+        weights = weights.reshape(len(weights), len(wanted), -1)
+        known = self.each * np.searchsorted(self.when, wanted, side="right")
+        for k, number in enumerate(at):
+            for last, out in ((known[k], filtered), (len(weights), smoothed)):
+                own = weights[:last, k]
+                out.values[number] = own.T @ self.white[:last]
+                out.noise[number] = own.T @ self.noise[:last, :last] @ own
+                out.total[number] = _positive(prior[k], own.T @ own)
+
+
+def _positive(prior: Array, gained: Array) -> Array:
+    """prior - gained, without the negative variances that rounding leaves where nothing remains."""
+    size = np.sqrt(np.diag(prior))
+    scale = np.where(size > 0.0, size, 1.0)
+    left = (prior - gained) / scale[:, None] / scale
+    values, vectors = np.linalg.eigh(0.5 * (left + left.T))
+    if values[0] >= 0.0:
+        return np.asarray(0.5 * (left + left.T) * scale[:, None] * scale)
+    return np.asarray((vectors * np.clip(values, 0.0, None)) @ vectors.T * scale[:, None] * scale)
