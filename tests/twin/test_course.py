@@ -105,7 +105,7 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
     truth = trace_truth(experiment.instrument, experiment.backend, states)
     photons = experiment.path.expected_photons(states)
     after = experiment.frames_after(photons, 2, 7)
-    ((_, recovery),) = experiment.measure(states, 2, 7)
+    ((_, recovery),) = experiment.measure(states, 2, 7, disturbances=experiment.disturbances)
     with xr.open_dataset(folder / "course.nc", engine="h5netcdf", decode_timedelta=False) as data:
         assert data.photons.dims == ("time", "channel", "row", "column")
         assert list(data.time.values) == [0.0, 720.0, 1800.0]
@@ -124,6 +124,33 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
                 np.testing.assert_array_equal(found["cameras"][name][estimator][key], value)
     for estimator, angle in recovery.angle.items():
         assert found["intersection_angle"][estimator] == angle.to_dict()
+    for estimator, ground in recovery.ground.items():
+        assert found["ground"][estimator] == ground.to_dict()
+    true = np.array([found["ground"]["true"][f"{axis}_m"] for axis in ("along", "across", "height")]).T
+    np.testing.assert_allclose(true, truth.ground_error(experiment.ground), atol=1e-9)
+
+
+def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
+    """The first time knows its own measurement alone, which is the posterior; the last knows all, filtered or smoothed.
+    The prisms' half kelvin of this job is seven times what `orbit` states; chi-square says so."""
+    groups = [*found["cameras"].values(), found["intersection_angle"], found["ground"]]
+    for group in groups:
+        for key, first in group["filtered"].items():
+            # the pattern's covariance is kept in single precision
+            assert first[0] == pytest.approx(group["posterior"][key][0], rel=1e-5, abs=1e-9)
+            if not key.startswith("left"):
+                assert group["smoothed"][key][-1] == pytest.approx(first[-1], rel=1e-9)
+        for key, late in group["smoothed"].items():
+            if key.endswith("_sigma"):
+                assert np.all(np.array(late) <= np.array(group["filtered"][key]) * (1.0 + 1e-9))
+                assert np.all(np.array(late) >= np.array(group["smoothed"][f"{key}_noise"]))
+    told = found["disturbances"]
+    assert told["name"] == "orbit"
+    assert told["degrees_of_freedom"] == 3 * 8
+    assert sum(told["innovations"]["chi_square"]) == pytest.approx(told["chi_square"])
+    assert not told["agrees"]
+    assert told["chi_square"] > told["limit"]
+
 
 
 def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
@@ -189,12 +216,13 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
     assert [page["time_s"] for page in said] == [0.0, 720.0, 1800.0]
     assert {page["camera"] for page in said} == {"forward, left area CCD"}
     about = {"schema", "reference_frames"}
-    assert set(found) == about | {"times_s", "detail", "temperatures", "cameras", "intersection_angle"}
+    contents = {"times_s", "detail", "temperatures", "cameras", "intersection_angle", "ground", "disturbances"}
+    assert set(found) == about | contents
     assert (found["times_s"], found["detail"]) == ([0.0, 720.0, 1800.0], 1)
     assert found["temperatures"][LEFT]["change_K"] == pytest.approx([0.5, 0.6, 0.7])
     assert found["temperatures"][LEFT]["gradient_K_per_m"][2] == pytest.approx([0.0, 0.02, 0.0])
-    estimators = {"true", "paper_single", "paper_joint", "derived", "model"}
-    for camera in (*found["cameras"].values(), found["intersection_angle"]):
+    estimators = {"true", "paper_single", "paper_joint", "derived", "model", "posterior", "filtered", "smoothed"}
+    for camera in (*found["cameras"].values(), found["intersection_angle"], found["ground"]):
         assert estimators <= set(camera)
     printed = json.loads((folder.parent / "printed.json").read_text())
     assert printed["course"] == found

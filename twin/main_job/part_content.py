@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
@@ -48,6 +49,7 @@ def series_content(run: RenderRun) -> dict[str, Any] | None:
         "shown": moment(float(series.times[series.shown])),
         "tables": tables,
         "worst": _worst(series),
+        "smoothed": _smoothed(series),
         "files": [f"images/{c.camera}_{c.side}_course.tiff" for c in run.experiment.path.channels],
     }
 
@@ -77,6 +79,27 @@ def _row(
 def _range(low: str, high: str) -> str:
     low, high = low.strip(MINUS) if not low.strip(f"{MINUS}0.") else low, high
     return low if low == high else f"{low} … {high}"
+
+
+def _smoothed(series: TimeSeries) -> dict[str, str] | None:
+    """What the smoothed changes rest on, and whether the measurements agree with it; None where nothing is stated."""
+    together = series.smoothed
+    if together is None:
+        return None
+    found = together.consistency
+    what = f"Chi-square of all {len(series.times)} measurements is {found.chi_square:.4g}"
+    text = f"{what}, as stated: {found.degrees} are expected, {found.limit:.4g} are the limit (chance {FALSE_ALARM:g})."
+    if found.chance > 1.0 - FALSE_ALARM:
+        text = f"{what} where {found.degrees} are expected: less moves than is stated, and the sigmas are too large."
+    if not found.agrees:
+        worst = int(np.argmax(together.innovations))
+        text = (
+            f"{what} where {found.degrees} are expected and {found.limit:.4g} are the limit (chance {FALSE_ALARM:g}): "
+            "the measurements contradict what was stated, and the sigmas cannot be relied on. The first to look at is "
+            f"the one at {moment(float(series.times[worst]))}, which those before it leave "
+            f"{together.innovations[worst]:.3g} of."
+        )
+    return {"name": together.name, "text": text}
 
 
 def _worst(series: TimeSeries) -> dict[str, str]:

@@ -16,7 +16,7 @@ from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.motion_map import motion_map_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.report_tables import report_tables, setup_tables
-from twin.main_job.series_plots import parameters_svg, temperatures_svg
+from twin.main_job.series_plots import parameters_svg, smoothed_svg, temperatures_svg
 from twin.main_job.spot_plots import residuals_svg, spots_svg
 from twin.main_job.target_plots import curves_svg, images_svg, pupils_svg
 from twin.main_job.verdict import judge
@@ -81,6 +81,8 @@ def render_report(
     if run.series is not None:
         figures["temperatures"] = Markup(temperatures_svg(run.series))
         figures["course"] = Markup(parameters_svg(run.series, titles))
+        if run.series.smoothed is not None:
+            figures["smoothed"] = Markup(smoothed_svg(run.series))
     if run.targets is not None:
         cameras = run.targets.cameras
         figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}

@@ -36,10 +36,15 @@ UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.
 """From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
 
 
+def time_unit(series: TimeSeries) -> tuple[float, str]:
+    """A unit that suits a course's length, in seconds, and its name."""
+    span = float(series.times[-1] - series.times[0])
+    return next((size, unit) for least, size, unit in UNITS if span >= least)
+
+
 def time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
     """Times of a course in a unit that suits its length, and the axis label."""
-    span = float(series.times[-1] - series.times[0])
-    size, unit = next((size, unit) for least, size, unit in UNITS if span >= least)
+    size, unit = time_unit(series)
     return series.times / size, f"time [{unit}]"
 
 
@@ -122,6 +127,66 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
             axes.set_ylabel("Δθ [arcsec]")
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(label)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        figure.align_ylabels()
+        return to_svg(figure)
+
+
+def smoothed_svg(series: TimeSeries) -> str:
+    """Errors of the smoothed changes with their total sigma, at the times of the course and between them: the band
+    closes at each measurement and opens between two. Errors are known at the times of the course.
+
+    Args:
+        series: with smoothed changes.
+    """
+    together = series.smoothed
+    assert together is not None
+    with look("smoothed"):
+        size, unit_name = time_unit(series)
+        label = f"time [{unit_name}]"
+        cameras, every = list(series.parameters), np.append(series.times, together.times)
+        order = np.argsort(every)
+        grounded = series.true_ground is not None
+        rows = len(PARAMETERS) + bool(series.recovered_angle)
+        figure = new_figure(0.7 + 1.3 * rows)
+        grid = figure.add_gridspec(rows, 2 * len(cameras))
+
+        def panel(axes: Axes, name: str, at: np.ndarray, between: np.ndarray, error: np.ndarray, row: int) -> None:
+            sigma = np.append(at, between)[order]
+            time = every[order] / size
+            _frame(axes, series, series.times / size)
+            axes.fill_between(time, -2.0 * sigma, 2.0 * sigma, color=SKY, alpha=0.25, lw=0, label="2σ, smoothed")
+            axes.fill_between(time, -sigma, sigma, color=SKY, alpha=0.45, lw=0, label="σ, smoothed")
+            axes.plot(series.times / size, error, "o", color=INK, ms=3.0, label="smoothed − true")
+            axes.set_ylabel(name)
+            axes.tick_params(labelbottom=row == rows - 1)
+            if row == rows - 1:
+                axes.set_xlabel(label)
+
+        for column, name in enumerate(cameras):
+            at, between = (one.parameters[name]["smoothed"] for one in (together.changes, together.between))
+            for row, parameter in enumerate(PARAMETERS):
+                axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
+                unit = PER_SI[row]
+                error = unit * (at.vector[:, row] - series.truth[name][row])
+                text = f"{parameter.symbol} [{parameter.unit}]" if column == 0 else ""
+                panel(axes, text, unit * at.sigma[:, row], unit * between.sigma[:, row], error, row)
+                if row == 0:
+                    axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
+        if series.recovered_angle:
+            at_angle, between_angle = (one.angle["smoothed"] for one in (together.changes, together.between))
+            half = len(cameras) if grounded else 2 * len(cameras)
+            axes = figure.add_subplot(grid[-1, :half])
+            error = (at_angle.change_rad - series.angle_change) / ARCSEC
+            panel(axes, "Δθ [arcsec]", at_angle.sigma_rad / ARCSEC, between_angle.sigma_rad / ARCSEC, error, rows - 1)
+            axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
+        if series.true_ground is not None:
+            at_ground, between_ground = (one.ground["smoothed"] for one in (together.changes, together.between))
+            axes = figure.add_subplot(grid[-1, len(cameras) :])
+            error = at_ground.error_m[:, 2] - series.true_ground[:, 2]
+            panel(axes, "[m]", at_ground.sigma_m[:, 2], between_ground.sigma_m[:, 2], error, rows - 1)
+            axes.set_title("Height on the ground", loc="left", fontweight="bold")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
         figure.align_ylabels()

@@ -33,6 +33,8 @@ CHUNK = 25
 """States rendered at once, to bound memory; fewer when their frames are large."""
 LARGEST_FRAMES = 200_000_000
 """Pixels of all frames that are exposed at once."""
+MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
+"""Times between two of a course, and in all, at which it is smoothed, too."""
 LARGEST_SERIES = 200_000_000
 """Pixels of one image per time and channel, which are kept: about 1.2 GB."""
 
@@ -45,15 +47,31 @@ class SmoothedCourse:
         name: of the stated disturbances.
         changes: at all times of the course, by the estimators `filtered`, from the measurements up to each time, and
             `smoothed`, from all.
+        times: (F,) between those of the course, seconds; between: the changes there, likewise.
         innovations: (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
         consistency: chi-square of the whole series.
     """
 
     name: str
     changes: Estimates
+    times: np.ndarray
+    between: Estimates
     innovations: np.ndarray
     each: int
     consistency: Consistency
+
+    def between_dict(self) -> dict[str, Any]:
+        """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""
+        changes = self.between
+        out: dict[str, Any] = {
+            "times_s": self.times.tolist(),
+            "cameras": {name: {e: p.to_dict() for e, p in every.items()} for name, every in changes.parameters.items()},
+        }
+        if changes.angle:
+            out["intersection_angle"] = {e: a.to_dict() for e, a in changes.angle.items()}
+        if changes.ground:
+            out["ground"] = {e: g.to_dict() for e, g in changes.ground.items()}
+        return out
 
     def to_dict(self) -> dict[str, Any]:
         """Do the measurements agree with what is stated?"""
@@ -155,6 +173,8 @@ class TimeSeries:
             }
         if self.smoothed is not None:
             out["disturbances"] = self.smoothed.to_dict()
+            if len(self.smoothed.times):
+                out["between"] = self.smoothed.between_dict()
         return out
 
 
@@ -366,13 +386,21 @@ class _Together:
         stated, noise = self.experiment.disturbances, self.noise
         if stated is None or noise is None:
             return None
+        steps = min(MOST_BETWEEN, LARGEST_BETWEEN // (len(self.times) - 1)) + 1
+        shares = np.arange(1, steps) / steps
+        between = (self.times[:-1, None] + shares * np.diff(self.times)[:, None]).ravel()
         with one_blas_thread():
-            found = smooth(stated, self.times, np.concatenate(self.shifts), noise, self.times)
-        changes = {"filtered": found.filtered, "smoothed": found.smoothed}
-        every = {name: (one.values, one.noise, one.total) for name, one in changes.items()}
-        estimates = estimates_of(every, self.experiment.cameras, self.experiment.ground)
-        each = found.consistency.degrees // len(self.times)
-        return SmoothedCourse(stated.name, estimates, found.innovations, each, found.consistency)
+            found = smooth(stated, self.times, np.concatenate(self.shifts), noise, np.append(self.times, between))
+
+        def part(which: slice) -> Estimates:
+            every = {"filtered": found.filtered, "smoothed": found.smoothed}
+            own = {name: (one.values[which], one.noise[which], one.total[which]) for name, one in every.items()}
+            return estimates_of(own, self.experiment.cameras, self.experiment.ground)
+
+        count = len(self.times)
+        each = found.consistency.degrees // count
+        at, rest = part(slice(count)), part(slice(count, None))
+        return SmoothedCourse(stated.name, at, between, rest, found.innovations, each, found.consistency)
 
 
 MIN_LIGHT = 0.5
