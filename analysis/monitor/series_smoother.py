@@ -226,7 +226,8 @@ class _Factor:
         Args:
             times: all.
             at: which of them.
-            filtered, smoothed: to be filled.
+            filtered: to be filled.
+            smoothed: likewise.
         """
         wanted = times[at]
         prior = self.process.parameters(wanted)
@@ -242,7 +243,7 @@ class _Factor:
 
 
 def _positive(prior: Array, gained: Array) -> Array:
-    """prior - gained, without the negative variances that rounding leaves where nothing remains."""
+    """Prior - gained, without the negative variances that rounding leaves where nothing remains."""
     size = np.sqrt(np.diag(prior))
     scale = np.where(size > 0.0, size, 1.0)
     left = (prior - gained) / scale[:, None] / scale

@@ -9,7 +9,9 @@ PRNU and DSNU of the same pixels are the same draw in both, so the covariance of
 
 with s the light signal. A spot that stays on its pixels loses the pattern from its difference; one that moves by more
 than its own size keeps it twice. Over a series of images after one "before" the differences at two times are correlated
-by the temporal noise of "before" and by the pattern of the pixels that the spot shares at these times. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+by the temporal noise of "before" and by the pattern of the pixels that the spot shares at these times.
+
+Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -147,7 +149,8 @@ def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
     gain = positions.gain_maps.reshape(count, 2, -1)
     size = gain.shape[-1]
     pattern = np.empty((count, 2, 2 * size), np.float32)
-    np.multiply(gain, noise.prnu * positions.light_dn.reshape(count, 1, -1), out=pattern[..., :size], casting="same_kind")
+    response = noise.prnu * positions.light_dn.reshape(count, 1, -1)
+    np.multiply(gain, response, out=pattern[..., :size], casting="same_kind")
     np.multiply(gain, np.sqrt(noise.dsnu_variance_dn2), out=pattern[..., size:], casting="same_kind")
     return NoiseParts(positions.temporal_covariance, pattern)
 

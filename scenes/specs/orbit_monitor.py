@@ -11,6 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment
+from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.job import (
     AnalysisSpec,
     JobSpec,
@@ -144,8 +145,11 @@ class OrbitMonitorSpec(Spec):
         course: evenly spaced times from the orbit's epoch, with temperatures.
         motion: node -> how it moves.
         reference: one of the times, at which the cameras were calibrated and the monitor's reference images were taken.
+        disturbances: what is expected to move, and how it goes on in time, as in a job: the monitor's values and their
+            sigmas rest on it. The instrument's by default.
         interval: from one measurement of the monitor to the next, a multiple of the course's step; between them what it
-            says is interpolated linearly, before the first and after the last it is held.
+            says is interpolated linearly, before the first and after the last it is held. Where disturbances are
+            stated, all measurements are smoothed together, too.
         intervals: that are compared; by default all that divide the course.
         apply: which of the monitor's values correct the cameras.
         frames: of one measurement; as many as the instrument's monitor takes by default.
@@ -168,6 +172,7 @@ class OrbitMonitorSpec(Spec):
     course: CourseSpec
     motion: Paths[MotionSpec] = Field(default_factory=FrozenMap)
     reference: Moment
+    disturbances: JobDisturbances | None = None
     interval: Interval
     intervals: tuple[Interval, ...] | None = None
     apply: Annotated[tuple[Parameter, ...], AfterValidator(_once)] = PARAMETERS
@@ -259,7 +264,12 @@ class OrbitMonitorSpec(Spec):
             images=("spots",), targets=None, stray=None, frames=self.frames, seed=self.seed
         )
         job = JobSpec.model_construct(
-            instrument=self.instrument, perturb=self.perturb, course=self.course, render=frames, analysis=self.analysis
+            instrument=self.instrument,
+            perturb=self.perturb,
+            course=self.course,
+            disturbances=self.disturbances,
+            render=frames,
+            analysis=self.analysis,
         )
         moved = job.with_source(self.source)
         assert isinstance(moved, JobSpec)

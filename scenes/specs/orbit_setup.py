@@ -9,6 +9,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
+from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.load import (
     find_orbit_camera,
@@ -181,11 +182,13 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
         instrument: cameras and monitors on their base.
         cameras: what the instrument's cameras are called -> prescription.
         detector: data sheet of the monitor's area CCDs.
+        disturbances: what is stated to move, None for nothing.
     """
 
     instrument: InstrumentSpec
     cameras: Paths[CameraSpec]
     detector: DetectorSpec
+    disturbances: DisturbancesSpec | None = None
 
     @property
     def resolved(self) -> ResolvedJob:
@@ -196,6 +199,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
             cameras=self.cameras,
             detector=self.detector,
             line_detectors=None,
+            disturbances=self.disturbances,
         )
 
     @property
@@ -216,7 +220,11 @@ def resolve_monitor(path: str | Path) -> MonitorSetup:
         test = load_orbit_test(OrbitMonitorSpec, path)
         job = resolve_job(test.job)
         setup = MonitorSetup.model_construct(
-            test=test, instrument=job.instrument, cameras=FrozenMap(job.cameras), detector=job.detector
+            test=test,
+            instrument=job.instrument,
+            cameras=FrozenMap(job.cameras),
+            detector=job.detector,
+            disturbances=job.disturbances,
         )
     _require_pair(setup.test, setup.instrument, setup.cameras)
     return setup

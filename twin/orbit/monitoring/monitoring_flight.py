@@ -12,21 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.monitor.model_fit import fit
-from analysis.monitor.monitoring import CameraParameters, shift_covariance
-from analysis.monitor.recovery import measure_spots, recover
 from analysis.orbit.monitored_camera import CalibratedLine, Sightings
-from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.threads import cores, one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.thermal.heat import Temperature
 from scenes.models.thermal_model import TemperatureError
-from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.specs.channel import BASE
 from scenes.specs.course import moment
 from twin.monitor.monitor_experiment import MonitorExperiment, motions_of
 from twin.monitor.truth import trace_truth
@@ -36,17 +31,12 @@ from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_ca
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.monitoring.monitor_series import TOO_FAR, MonitorSeries, Readings, SmoothedReadings
 from twin.run.procedure import Advance, BenchError
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_monitor import OrbitMonitorSpec
     from scenes.specs.orbit_setup import MonitorSetup
-
-
-CHUNK = 25
-"""States rendered at once, to bound memory."""
-TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
-Series = dict[str, CameraParameters]
 
 
 def states_of(
@@ -88,119 +78,6 @@ def states_of(
                 moves[path] = Motion(rotate, shift, motion.pivot)
         out.append(compose(state, moves, bodies))
     return out
-
-
-class MonitorSeries:
-    """A monitor with its reference images.
-
-    Args:
-        experiment: the instrument with its calibration on the ground.
-        spec: the test.
-        reference: state at the reference time.
-    """
-
-    def __init__(self, experiment: MonitorExperiment, spec: OrbitMonitorSpec, reference: State) -> None:
-        self.experiment, self.spec = experiment, spec
-        self.frames: int = spec.frames or experiment.instrument.spec.monitor.frames
-        self.reference = experiment.path.expected_photons([reference])
-        self._clean_reference = self._spots(experiment.expected_frames(self.reference), None)
-
-    def measured(self, states: Sequence[State], seed: int) -> tuple[Series, Series]:
-        """Camera -> changes (S,) since the reference, from exposed frames and from expected images without noise.
-
-        Raises:
-            BenchError: a spot cannot be measured.
-            AimError, BeamMissedError: light is lost.
-        """
-        experiment = self.experiment
-        # a stream of its own: states are numbered from 0
-        before = experiment.frames_after(self.reference, self.frames, seed, len(states))[0]
-        noisy: list[Series] = []
-        clean: list[Series] = []
-        for piece, photons in experiment.path.iterate_photons(states, chunk=CHUNK):
-            after = experiment.frames_after(photons, self.frames, seed, piece.start)
-            noisy.append(self._recovered(before, after, piece.start))
-            clean.append(self._without_noise(photons, piece.start))
-        return _joined(noisy), _joined(clean)
-
-    def clean(self, states: Sequence[State]) -> Series:
-        """Camera -> changes (S,) since the reference, from expected images without noise. Raises as `measured`."""
-        pieces = self.experiment.path.iterate_photons(states, chunk=CHUNK)
-        return _joined([self._without_noise(photons, piece.start) for piece, photons in pieces])
-
-    def of_prisms(self) -> Series:
-        """Without noise, what temperatures say that the file gives to the monitor's prisms themselves, at all times."""
-        job = self.spec.job
-        states = []
-        for k in range(len(self.spec.course.times)):
-            own = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
-            states.append(self.experiment.thermal.state(own, {}))
-        at, every = self.spec.referred, self.clean(states)
-        return {n: CameraParameters.from_vector(p.vector - p.vector[at], p.covariance) for n, p in every.items()}
-
-    def repeated(self, state: State, count: int, seed: int, number: int) -> Series:
-        """Camera -> changes (count,): reference and state measured anew each time, with another detector's pattern.
-
-        ``number`` is that of the state's time, for messages.
-        """
-        experiment = self.experiment
-        photons = experiment.path.expected_photons([state])
-        pieces = []
-        for k in range(count):
-            before = experiment.frames_after(self.reference, self.frames, seed + k, 1)[0]
-            after = experiment.frames_after(photons, self.frames, seed + k)
-            pieces.append(self._recovered(before, after, number))
-        return _joined(pieces)
-
-    def _recovered(self, before: np.ndarray, after: np.ndarray, first: int) -> Series:
-        experiment = self.experiment
-        try:
-            with one_blas_thread():
-                found = recover(before, after, experiment.calibration, self.spec.analysis.centroid, cores())
-        except SpotError as error:
-            raise self._lost(error, first) from error
-        return {name: estimators["model"] for name, estimators in found.parameters.items()}
-
-    def _without_noise(self, photons: np.ndarray, first: int) -> Series:
-        calibration, noise = self.experiment.calibration, self.experiment.calibration.noise
-        after = self._spots(self.experiment.expected_frames(photons), first)
-        before, spots = self._clean_reference, calibration.spots
-        spread = difference_covariance(before, after, noise).reshape(len(photons), -1, 2, 2, 2)
-        joint = shift_covariance(spread[:, :, 0], spread[:, :, 1])
-        shift = after.position.reshape(len(photons), spots, 2) - before.position.reshape(1, spots, 2)
-        out = {}
-        for k, (name, camera) in enumerate(calibration.cameras.items()):
-            moved = shift[:, 2 * k : 2 * k + 2].reshape(-1, 4)
-            jacobians = (camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
-            out[name] = fit(moved, joint[:, k], *jacobians)
-        return out
-
-    def _spots(self, frames: np.ndarray, first: int | None) -> SpotPositions:
-        calibration = self.experiment.calibration
-        flat = frames.reshape(-1, *frames.shape[-2:])
-        try:
-            with one_blas_thread():
-                return measure_spots(flat, self.frames, calibration, self.spec.analysis.centroid, cores())
-        except SpotError as error:
-            raise self._lost(error, self.spec.referred if first is None else first) from error
-
-    def _lost(self, error: SpotError, first: int) -> BenchError:
-        state, spot = divmod(error.indices[0], self.experiment.calibration.spots)
-        number = min(first + state, len(self.spec.course.times) - 1)
-        channel = self.experiment.path.channels[spot].key
-        reason = error.reasons[error.indices[0]]
-        time = moment(self.spec.course.times[number])
-        return BenchError(f"the spot {channel} cannot be measured at {time} ({reason})", ("course",), TOO_FAR)
-
-
-def _joined(parts: Sequence[Series]) -> Series:
-    return {
-        name: CameraParameters.from_vector(
-            np.concatenate([np.atleast_2d(p[name].vector) for p in parts]),
-            np.concatenate([p[name].covariance.reshape(-1, 4, 4) for p in parts]),
-        )
-        for name in parts[0]
-    }
 
 
 HALF_SPAN = 60.0
@@ -258,11 +135,14 @@ class MonitorFlight:
         lines: of each time: camera -> its line as it truly is.
         calibrated: camera -> its line at the reference, which the ground knows.
         causes: what each temperature and motion of the file does alone at time `worst`, without noise.
-        monitored: camera -> what the monitor says of its changes since the reference.
-        clean: camera -> (T, 4) the same from expected images without noise.
+        estimator: by which the monitor's shifts are read.
+        monitored: what the monitor says of the cameras' changes since the reference.
+        smoothed: seconds -> what all its measurements at this interval say together; empty where nothing is stated to
+            move.
+        clean: camera -> (T, 4) as monitored, from expected images without noise.
         prisms: camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
         views: of each time.
-        repeated: camera -> what the monitor says at time `worst`, measured again and again.
+        repeated: what the monitor says at time `worst`, measured again and again.
         worst: number of the time with the largest change of the angle.
         turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
     """
@@ -275,11 +155,13 @@ class MonitorFlight:
     angle: np.ndarray
     lines: tuple[Mapping[str, LineCamera], ...]
     calibrated: Mapping[str, CalibratedLine]
-    monitored: Mapping[str, CameraParameters]
+    estimator: str
+    monitored: Readings
+    smoothed: Mapping[float, SmoothedReadings]
     clean: Mapping[str, np.ndarray]
     prisms: Mapping[str, np.ndarray]
     views: tuple[View, ...]
-    repeated: Mapping[str, CameraParameters]
+    repeated: Readings
     worst: int
     causes: tuple[Cause, ...]
     turned: Mapping[str, LineCamera]
@@ -320,14 +202,16 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
         # before the images, which take longer
         views = look_down(spec, pair, lines, ground_seed, advance)
-        monitor = MonitorSeries(experiment, spec, reference)
+        monitor = MonitorSeries(experiment, spec, reference, pair)
         noisy, clean = monitor.measured(states, number)
+        used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
+        gains = monitor.gains(used, range(len(states)))
         advance("monitor", 3, parts)
         prisms = monitor.of_prisms()
         advance("monitor", 4, parts)
         repeated = monitor.repeated(states[worst], spec.repeats, number + 1, worst)
         advance("monitor", 5, parts)
-        causes = _causes(experiment, spec, monitor, worst, pair)
+        causes = _causes(experiment, spec, monitor, worst, gains[worst])
         advance("monitor", 6, parts)
     except (AimError, BeamMissedError) as error:
         raise BenchError(f"the instrument cannot be rendered: {error}", ("course",), TOO_FAR) from error
@@ -335,7 +219,9 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
     for name in pair:
         line, axes = lines[spec.referred][name], instrument.camera_axes(name)
         calibrated[name] = CalibratedLine(line.pixels, line.directions, line.origins, axes, distance[name])
-    quiet = not (spec.errors.switched_on and spec.errors.monitor)
+    smoothed = {}
+    if experiment.disturbances is not None:
+        smoothed = {interval: monitor.smoothed(used, interval) for interval in {spec.interval, *spec.compared}}
     return MonitorFlight(
         spec,
         pair,
@@ -345,11 +231,13 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         angle,
         lines,
         FrozenMap(calibrated),
-        FrozenMap({name: (clean if quiet else noisy)[name] for name in pair}),
-        FrozenMap({name: clean[name].vector for name in pair}),
-        FrozenMap({name: prisms[name].vector for name in pair}),
+        monitor.estimator,
+        monitor.readings(used, range(len(states))),
+        FrozenMap(smoothed),
+        FrozenMap(monitor.by_camera(gains, clean.shifts)),
+        FrozenMap(monitor.by_camera(gains, prisms)),
         views,
-        FrozenMap({name: repeated[name] for name in pair}),
+        monitor.readings(repeated, [worst] * spec.repeats),
         worst,
         causes,
         FrozenMap(turned),
@@ -373,17 +261,19 @@ def _changes(
 
 
 def _causes(
-    experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, pair: tuple[str, str]
+    experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
 ) -> tuple[Cause, ...]:
-    """What each temperature of the course and each motion does from the reference to time number ``worst``."""
+    """What each temperature of the course and each motion does from the reference to time number ``worst``, at which
+    the estimator has this gain (8, 2 C).
+    """
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
     states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
     truth, _ = _changes(experiment, states, 0)
-    estimates = monitor.clean(states)
+    estimates = monitor.by_camera(gain, monitor.clean(states))
     out = []
     for k, (what, path) in enumerate(named):
-        true = {n: truth[n][2 * k + 1] - truth[n][2 * k] for n in pair}
-        error = {n: estimates[n].vector[2 * k + 1] - estimates[n].vector[2 * k] - true[n] for n in pair}
+        true = {n: truth[n][2 * k + 1] - truth[n][2 * k] for n in monitor.pair}
+        error = {n: estimates[n][2 * k + 1] - estimates[n][2 * k] - true[n] for n in monitor.pair}
         out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
     return tuple(out)
 

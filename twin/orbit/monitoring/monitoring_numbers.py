@@ -79,6 +79,7 @@ class AngleNumbers:
     true_change_arcsec: Array
     monitored_change_arcsec: Array
     monitored_change_sigma_arcsec: Array
+    monitored_change_sigma_noise_arcsec: Array
     true_change_span_arcsec: float
 
     @classmethod
@@ -90,6 +91,7 @@ class AngleNumbers:
             true_change_arcsec=unsigned(change),
             monitored_change_arcsec=unsigned(run.angle / ARCSEC),
             monitored_change_sigma_arcsec=unsigned(run.angle_sigma / ARCSEC),
+            monitored_change_sigma_noise_arcsec=unsigned(run.angle_noise / ARCSEC),
             true_change_span_arcsec=float(np.ptp(change)),
         )
 
@@ -174,9 +176,12 @@ class SlopeNumbers:
 
 @dataclass(frozen=True)
 class PropagationNumbers:
-    """Sigma of the mean height by the monitor's covariance over the times, and against repeats at one time."""
+    """Sigma of the mean height over the times, by the monitor's noise and of its whole error (none where nothing is
+    stated to move), and that of the noise against repeats at one time.
+    """
 
     height_sigma_m: Array
+    height_total_sigma_m: Array | None
     time_s: float
     repeats: int
     sigma_m: float
@@ -192,6 +197,7 @@ class PropagationNumbers:
         scatter, (low, high) = run.scatter, run.scatter.limits
         return cls(
             height_sigma_m=unsigned(run.sigma),
+            height_total_sigma_m=None if run.sigma_total is None else unsigned(run.sigma_total),
             time_s=float(run.flight.times[run.flight.worst]),
             repeats=len(scatter.heights),
             sigma_m=scatter.sigma,
@@ -200,6 +206,76 @@ class PropagationNumbers:
             lower_limit=low,
             upper_limit=high,
             agrees=scatter.agrees,
+        )
+
+
+@dataclass(frozen=True)
+class SmoothedNumbers:
+    """Heights by values smoothed from the measurements at one interval: RMS errors of all and of the cameras alone, how
+    many times smaller than with interpolation, and the sigma that the smoother states, RMS over the times. Then the
+    largest error over its sigma with its limit, and the chi-square of the measured shifts with its own.
+    """
+
+    interval_s: float
+    measurements: int
+    height_rms_m: float
+    height_camera_rms_m: float
+    height_sigma_rms_m: float
+    better_than_interpolation: float
+    largest_ratio: float
+    ratio_limit: float
+    agrees: bool
+    chi_square: float
+    degrees_of_freedom: int
+    chi_square_limit: float
+    shifts_agree: bool
+
+    @classmethod
+    def of(cls, run: MonitorRun, interval: float) -> Self:
+        """Of one interval."""
+        one = run.smoothing[interval]
+        return cls(
+            interval_s=interval,
+            measurements=len(run.flight.spec.measured(interval)),
+            height_rms_m=one.case.height_rms,
+            height_camera_rms_m=one.case.camera_height_rms,
+            height_sigma_rms_m=rms(one.sigma),
+            better_than_interpolation=one.factor,
+            largest_ratio=one.furthest,
+            ratio_limit=one.limit,
+            agrees=one.agrees,
+            chi_square=one.consistency.chi_square,
+            degrees_of_freedom=one.consistency.degrees,
+            chi_square_limit=one.consistency.limit,
+            shifts_agree=one.consistency.agrees,
+        )
+
+
+@dataclass(frozen=True)
+class SmoothingNumbers:
+    """What all measurements say together: changes at the file's interval with their sigmas, errors of the height over
+    the times with the sigma that is stated, and the comparison over the intervals.
+    """
+
+    disturbances: str
+    cameras: Mapping[str, Any]
+    height_error_m: Array
+    height_sigma_m: Array
+    intervals: Sequence[SmoothedNumbers]
+
+    @classmethod
+    def of(cls, run: MonitorRun) -> Self | None:
+        """Of a run; None where nothing is stated to move."""
+        flight, stated = run.flight, run.setup.disturbances
+        if stated is None:
+            return None
+        chosen, readings = run.smoothing[flight.spec.interval], flight.smoothed[flight.spec.interval].readings
+        return cls(
+            disturbances=stated.name,
+            cameras={name: readings[name].to_dict() for name in flight.pair},
+            height_error_m=unsigned(chosen.error),
+            height_sigma_m=unsigned(chosen.sigma),
+            intervals=[SmoothedNumbers.of(run, interval) for interval in run.smoothing],
         )
 
 
@@ -253,6 +329,8 @@ class MonitorNumbers:
     conversion: ConversionNumbers
     sensitivity: Mapping[str, SlopeNumbers]
     propagation: PropagationNumbers
+    estimator: str
+    smoothing: SmoothingNumbers | None
     parts: Mapping[str, PartNumbers]
     causes: Sequence[CauseNumbers]
     correction_residual_arcsec: float
@@ -288,6 +366,8 @@ class MonitorNumbers:
             ),
             sensitivity={name: SlopeNumbers.of(run, name) for name in flight.pair},
             propagation=PropagationNumbers.of(run),
+            estimator=flight.estimator,
+            smoothing=SmoothingNumbers.of(run),
             parts={name: PartNumbers(rms(part), unsigned(part)) for name, part in run.parts.items()},
             causes=[CauseNumbers.of(run, cause) for cause in flight.causes],
             correction_residual_arcsec=run.residual / ARCSEC,

@@ -12,16 +12,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
+from analysis.monitor.disturbances import Consistency
 from analysis.monitor.intersection_angle import exact
-from analysis.monitor.monitoring import CameraParameters
 from analysis.orbit.forward_intersection import check_errors
 from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, between, intersect_pair
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit_monitor import PARAMETERS
 from twin.orbit.flight.line_camera import look_angle
+from twin.orbit.monitoring.monitor_series import Readings
 from twin.orbit.monitoring.monitoring_flight import MonitorFlight, fly_monitored, in_analysis
 from twin.run.procedure import Advance, BenchError, silent
 
@@ -29,9 +30,10 @@ if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.orbit_setup import MonitorSetup
 
-CASES = ("none", "monitored", "interval", "parameters", "true")
-"""As calibrated; corrected at every time; corrected by values interpolated over the file's interval; by the true four
-parameters; the true lines. The last two are bounds that no measurement gives."""
+CASES = ("none", "monitored", "interval", "smoothed", "parameters", "true")
+"""As calibrated; corrected at every time; corrected by values interpolated over the file's interval; by values smoothed
+from the same measurements, where disturbances are stated; by the true four parameters; the true lines. The last two are
+bounds that no measurement gives."""
 FALSE_ALARM = 1e-4
 """Chance that right sigmas are called wrong, both sides together."""
 _STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
@@ -139,6 +141,51 @@ class Scatter:
 
 
 @dataclass(frozen=True, eq=False)
+class Smoothing:
+    """Heights by values smoothed from the measurements at one interval.
+
+    Attributes:
+        case: errors.
+        interpolated: errors with values interpolated between the same measurements.
+        error: (T,) mean height error by what the smoothed values are wrong, to first order, metres.
+        sigma: (T,) of the same as the smoother states it, metres; 0 at the reference.
+        consistency: chi-square of the measured shifts under the stated disturbances.
+    """
+
+    case: CaseErrors
+    interpolated: CaseErrors
+    error: np.ndarray
+    sigma: np.ndarray
+    consistency: Consistency
+
+    @property
+    def factor(self) -> float:
+        """By which the height error of the cameras is smaller than with interpolation."""
+        return self.interpolated.camera_height_rms / self.case.camera_height_rms
+
+    @property
+    def ratios(self) -> np.ndarray:
+        """Errors over their sigma, of the times at which there is one."""
+        known = self.sigma > 0.0
+        return np.asarray(self.error[known] / self.sigma[known])
+
+    @property
+    def furthest(self) -> float:
+        """Largest of all ratios."""
+        return float(np.max(np.abs(self.ratios), initial=0.0))
+
+    @property
+    def limit(self) -> float:
+        """Of it: exceeded with a chance of `FALSE_ALARM` at most, however the times' errors go together (Bonferroni)."""
+        return float(norm.isf(0.5 * FALSE_ALARM / max(len(self.ratios), 1)))
+
+    @property
+    def agrees(self) -> bool:
+        """No error lies beyond the limit."""
+        return self.furthest <= self.limit
+
+
+@dataclass(frozen=True, eq=False)
 class MonitorRun:
     """A finished test.
 
@@ -148,9 +195,12 @@ class MonitorRun:
         flight: truth and measurements.
         cases: of `CASES` -> errors.
         intervals: seconds -> errors with values interpolated over it.
-        angle: (T,) change of the intersection angle by the monitor, radians; angle_sigma likewise.
+        angle: (T,) change of the intersection angle by the monitor, radians; angle_sigma: of its error, angle_noise: of
+            that what the noise does.
         slopes: camera -> (T, 4) change of the mean height with the parameters that the analysis assumes, m/rad, m/m.
-        sigma: (T,) of the mean height by propagation of the monitor's covariance, metres.
+        sigma: (T,) of the mean height by the noise of the monitor, propagated, metres.
+        sigma_total: (T,) likewise of the whole error; None where nothing is stated to move.
+        smoothing: seconds -> heights smoothed from measurements at this interval; empty likewise.
         parts: name -> (T,) parts of the monitored cameras' mean height error, metres.
         conversion: arcseconds to metres.
         scatter: of repeated measurements.
@@ -165,8 +215,11 @@ class MonitorRun:
     intervals: Mapping[float, CaseErrors]
     angle: np.ndarray
     angle_sigma: np.ndarray
+    angle_noise: np.ndarray
     slopes: Mapping[str, np.ndarray]
     sigma: np.ndarray
+    sigma_total: np.ndarray | None
+    smoothing: Mapping[float, Smoothing]
     parts: Mapping[str, np.ndarray]
     conversion: Conversion
     scatter: Scatter
@@ -205,29 +258,54 @@ def analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRu
     true = _intersected(flight, [_true_pair(flight, k) for k in range(count)])
     cases = {name: _errors(_intersected(flight, _corrected(flight, each)), true) for name, each in changes.items()}
     cases["true"] = _errors(true, true)
-    intervals = {
-        interval: _errors(_intersected(flight, _corrected(flight, _interpolated(flight, monitored, interval))), true)
-        for interval in spec.compared
-    }
+
+    def interpolated(interval: float) -> CaseErrors:
+        changes = _interpolated(flight, monitored, interval)
+        return _errors(_intersected(flight, _corrected(flight, changes)), true)
+
+    intervals = {interval: interpolated(interval) for interval in spec.compared}
     slopes = _slopes(flight)
-    spread = sum(_propagated(flight, slopes, n, flight.monitored[n]) for n in flight.pair)
+    smoothing = {
+        interval: _smoothing(flight, slopes, interval, true, intervals.get(interval, cases["interval"]))
+        for interval in sorted(flight.smoothed)
+    }
+    if smoothing:
+        cases["smoothed"] = smoothing[spec.interval].case
     first, second = (flight.monitored[n] for n in flight.pair)
-    angle = exact(first, second, *flight.looks)
+    angle = exact(first, second, *flight.looks, *flight.monitored.across)
+    total = flight.monitored.total
     return MonitorRun(
         setup,
         seed,
         flight,
-        FrozenMap(cases),
+        FrozenMap({name: cases[name] for name in CASES if name in cases}),
         FrozenMap(intervals),
         angle.change_rad,
         angle.sigma_rad,
+        angle.noise_rad,
         FrozenMap(slopes),
-        np.sqrt(spread),
+        np.sqrt(_propagated(flight, slopes, flight.monitored.noise)),
+        None if total is None else np.sqrt(_propagated(flight, slopes, total)),
+        FrozenMap(smoothing),
         FrozenMap(_parts(flight, slopes, cases)),
         _conversion(flight),
         _scatter(flight, slopes),
         max(_residual(flight, n, k) for n in flight.pair for k in range(count)),
     )
+
+
+def _smoothing(
+    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], interval: float, true: np.ndarray, between: CaseErrors
+) -> Smoothing:
+    found, mask = flight.smoothed[interval], _mask(flight)
+    readings: Readings = found.readings
+    assert readings.total is not None
+    changes = {n: readings[n].vector * mask for n in flight.pair}
+    case = _errors(_intersected(flight, _corrected(flight, changes)), true)
+    wrong = [np.sum(slopes[n] * mask * (readings[n].vector - flight.truth[n]), axis=1) for n in flight.pair]
+    # what rounding leaves at the reference is no sigma
+    variance = np.maximum(_propagated(flight, slopes, readings.total), 0.0)
+    return Smoothing(case, between, np.sum(wrong, axis=0), np.sqrt(variance), found.consistency)
 
 
 def _mask(flight: MonitorFlight) -> np.ndarray:
@@ -290,15 +368,19 @@ def _slopes(flight: MonitorFlight) -> dict[str, np.ndarray]:
 
 
 def _propagated(
-    flight: MonitorFlight,
-    slopes: Mapping[str, np.ndarray],
-    name: str,
-    monitored: CameraParameters,
-    at: int | None = None,
+    flight: MonitorFlight, slopes: Mapping[str, np.ndarray], covariance: np.ndarray, at: int | None = None
 ) -> np.ndarray:
-    """Variance of the mean height by one camera's values, m^2; ``at``: all of them belong to this time."""
-    slope = (slopes[name] if at is None else slopes[name][at]) * _mask(flight)
-    return np.asarray(np.einsum("...i,...ij,...j->...", slope, monitored.covariance, slope))
+    """Variance (S,) of the mean height by the pair's values, m^2.
+
+    Args:
+        flight: truth and measurements.
+        slopes: camera -> (T, 4).
+        covariance: (S, 8, 8) of the pair's values.
+        at: number of the time to which all of them belong; None for one of each time.
+    """
+    both = np.concatenate([slopes[n] * _mask(flight) for n in flight.pair], axis=1)
+    slope = both if at is None else both[at]
+    return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
 
 
 def _parts(
@@ -360,7 +442,7 @@ def _scatter(flight: MonitorFlight, slopes: Mapping[str, np.ndarray]) -> Scatter
     for row in range(flight.spec.repeats):
         pair = [flight.calibrated[n].corrected(monitored[n][row]) for n in flight.pair]
         heights.append(_found(flight, pair, k, exact_data=True)[:, 2].mean())
-    variance = sum(_propagated(flight, slopes, n, flight.repeated[n], k) for n in flight.pair)
+    variance = _propagated(flight, slopes, flight.repeated.noise, k)
     return Scatter(np.array(heights), float(np.sqrt(np.mean(variance))))
 
 
