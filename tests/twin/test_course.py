@@ -152,7 +152,6 @@ def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
     assert told["chi_square"] > told["limit"]
 
 
-
 def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
     recovered = json.loads((folder / "recovered.json").read_text())
     truth = json.loads((folder / "truth.json").read_text())

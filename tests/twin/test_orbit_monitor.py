@@ -14,6 +14,7 @@ from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.orbit.monitoring.monitoring_report import monitor_report
 from twin.orbit.monitoring.monitoring_run import rms, run_monitor
 from twin.run.procedure import silent
 
@@ -47,6 +48,8 @@ errors: {image: 0.3}
 seed: 3
 """
 HOT = "[0 K/m, 0 K/m, 0 K/m], [0 K/m, 0 K/m, 0 K/m],\n        [0 K/m, 0 K/m, 0 K/m]]"
+WARM = SMALL.replace(HOT, "[2 mK/m, 9 mK/m, 5 mK/m], [4 mK/m, 18 mK/m, 10 mK/m],\n        [8 mK/m, 20 mK/m, 30 mK/m]]")
+assert WARM != SMALL
 
 
 def write(folder: Path, text: str) -> Path:
@@ -74,12 +77,15 @@ def quiet(setup, backend):
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory, backend):
-    """Noise everywhere, and a prism that warms unevenly at the end."""
-    text = SMALL.replace(
-        HOT, "[2 mK/m, 9 mK/m, 5 mK/m], [4 mK/m, 18 mK/m, 10 mK/m],\n        [8 mK/m, 20 mK/m, 30 mK/m]]"
-    )
-    assert text != SMALL
+    """Noise everywhere, a prism that warms unevenly at the end, and nothing stated: the monitor is read by `model`."""
+    text = WARM + "disturbances: none\n"
     return run_monitor(resolve_monitor(write(tmp_path_factory.mktemp("noisy"), text)), backend, 3, silent)
+
+
+@pytest.fixture(scope="module")
+def stated(tmp_path_factory, backend):
+    """The same with the instrument's disturbances."""
+    return run_monitor(resolve_monitor(write(tmp_path_factory.mktemp("stated"), WARM)), backend, 3, silent)
 
 
 # The correction
@@ -244,6 +250,64 @@ def test_causes_add_up(noisy) -> None:
         assert true == pytest.approx(flight.truth[name][flight.worst], abs=1e-3 * ARCSEC)
 
 
+# Stated disturbances
+
+
+def test_without_disturbances_there_is_nothing_to_smooth(noisy, stated) -> None:
+    assert (noisy.flight.estimator, stated.flight.estimator) == ("model", "posterior")
+    assert "smoothed" not in noisy.cases
+    assert noisy.sigma_total is None
+    assert not noisy.smoothing
+    assert set(stated.cases) == {*noisy.cases, "smoothed"}
+    assert list(stated.smoothing) == [600.0, 1200.0, 2400.0]
+
+
+def test_the_noise_is_not_the_whole_error(stated) -> None:
+    """Repeats scatter by the noise; the truth is missed by what the spots leave open, as the total sigma says."""
+    seen, free = stated.scatter, len(stated.scatter.heights) - 1
+    total = free * (seen.spread / seen.sigma) ** 2
+    assert chi2.ppf(FALSE_ALARM, free) < total < chi2.isf(FALSE_ALARM, free)
+    later = np.arange(5) != stated.flight.spec.referred
+    assert np.all(stated.sigma_total[later] > 20.0 * stated.sigma[later])
+    wrong = stated.cases["monitored"].camera
+    assert rms(wrong) > 5.0 * rms(stated.sigma)
+    # 4.9 sigmas: one in a million
+    assert np.abs(wrong[later] / stated.sigma_total[later]).max() < 4.9
+    assert stated.angle[0] == stated.angle_sigma[0] == stated.sigma_total[0] == 0.0
+
+
+def test_smoothed_heights(stated) -> None:
+    """At every interval no worse than linear between, less sure the fewer the measurements, and sure of the
+    reference; with every time measured at least as sure as each measurement alone."""
+    sigmas = [rms(one.sigma) for one in stated.smoothing.values()]
+    assert sigmas == sorted(sigmas)
+    every = stated.smoothing[600.0]
+    assert np.all(every.sigma <= stated.sigma_total * (1.0 + 1e-6))
+    assert every.factor == pytest.approx(1.0, abs=0.05)
+    chosen = stated.smoothing[1200.0]
+    assert chosen.factor > 1.1
+    assert chosen.case.camera_height_rms == stated.cases["smoothed"].camera_height_rms
+    assert chosen.factor == stated.cases["interval"].camera_height_rms / stated.cases["smoothed"].camera_height_rms
+    # the linear error is the intersected one but for products of two arcseconds
+    assert chosen.error == pytest.approx(chosen.case.camera, abs=2e-3)
+    for one in stated.smoothing.values():
+        assert one.sigma[0] == one.error[0] == 0.0
+        assert len(one.ratios) == 4
+        assert one.agrees
+        assert one.consistency.agrees
+        assert one.consistency.degrees % 8 == 0
+
+
+def test_shifts_that_contradict_the_disturbances_are_told(tmp_path: Path, backend) -> None:
+    """Cameras that turn by an arcsecond where nothing but focal planes and prisms was expected to move."""
+    text = SMALL.replace("points: 60", "points: 10").replace("repeats: 30", "repeats: 8")
+    text += "disturbances: {file: orbit, without: [base_heat, camera_heat, camera_mounts, mirror_mounts]}\n"
+    run = run_monitor(resolve_monitor(write(tmp_path, text)), backend, 3, silent)
+    assert not run.smoothing[1200.0].consistency.agrees
+    told = monitor_report(run)
+    assert any("contradict the stated disturbances" in warning for warning in told.warnings)
+
+
 # The command
 
 
@@ -259,15 +323,20 @@ def test_command(tmp_path: Path) -> None:
     numbers = ("height_rms_m", "height_worst_m", "plan_rms_m", "metres_per_arcsec", "interval_s")
     assert all(isinstance(data[key], float) for key in numbers)
     assert data["height_rms_m"] == data["cases"]["interval"]["height_rms_m"]
-    assert {"none", "monitored", "interval", "parameters", "true"} == set(data["cases"])
+    assert {"none", "monitored", "interval", "smoothed", "parameters", "true"} == set(data["cases"])
+    smoothing = data["smoothing"]
+    assert smoothing["disturbances"] == "orbit"
+    assert [row["interval_s"] for row in smoothing["intervals"]] == [600.0, 1200.0, 2400.0]
+    assert [row["measurements"] for row in smoothing["intervals"]] == [5, 3, 2]
+    assert len(smoothing["height_sigma_m"]) == len(data["propagation"]["height_total_sigma_m"]) == len(data["times_s"])
     assert [row["interval_s"] for row in data["intervals"]] == [600.0, 1200.0, 2400.0]
     count = len(data["times_s"])
     for name in ("forward", "backward"):
         camera = data["cameras"][name]
         assert len(camera["true"]["d_alpha_arcsec"]) == len(camera["monitored"]["d_alpha_arcsec_sigma"]) == count
     assert len(data["intersection_angle"]["monitored_change_arcsec"]) == count
-    figures = {"angle", "height", "interval", "remainder"}
-    tables = {"cases", "changes-forward", "changes-backward", "intervals", "parts", "causes", "conversion"}
+    figures = {"angle", "height", "smoothed", "interval", "remainder"}
+    tables = {"cases", "smoothing", "changes-forward", "changes-backward", "intervals", "parts", "causes", "conversion"}
     expected = {"manifest.json", "config.yaml", "monitor.json", "report.html"}
     expected |= {f"artefacts/{n}.svg" for n in figures} | {f"artefacts/{n}.csv" for n in tables}
     assert files(tmp_path / "run") == expected
@@ -282,6 +351,13 @@ BAD = {
     "pivot": ("pivot: rear_node", "pivot: front", "motion.base/backward/focal_plane.pivot", ["no such pivot"]),
     "too far": ("-1.2 arcsec, -0.8", "-500 arcsec, -0.8", "course", ["keep the beams on the mirrors"]),
     "interval": ("interval: 20 min", "interval: 50 min", "interval", ["longer than the course"]),
+    "disturbances": ("repeats: 30", "disturbances: orbits", "disturbances.file", ["did you mean 'orbit'"]),
+    "cause": (
+        "repeats: 30",
+        "disturbances: {causes: {focal_plane_mounts: {bodies: base/*/focal_planes}}}",
+        "disturbances.causes.focal_plane_mounts.bodies[0]",
+        ["base/forward/focal_plane"],
+    ),
     "short orbit": ("after: 42 min", "after: 2401 s", "orbit.after", ["a minute before the first and after"]),
     "no overlap": (
         "ground: {",

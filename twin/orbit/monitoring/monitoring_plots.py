@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.units import ARCSEC
-from twin.orbit.monitoring.monitoring_run import MonitorRun
+from twin.orbit.monitoring.monitoring_run import MonitorRun, rms
 from twin.run.svg import (
     BLUE,
     GREEN,
@@ -57,7 +57,10 @@ def angle_figure(run: MonitorRun) -> Figure:
     above.set_ylabel("change of the angle [arcsec]")
     above.legend(loc="best")
     below.axhline(0.0, color=GREY, lw=0.7)
+    sigma = run.angle_sigma / ARCSEC
+    below.fill_between(minutes, -sigma, sigma, color=SKY, alpha=0.4, lw=0, label="σ")
     below.plot(minutes, monitored - true, "o-", color=VERMILION, ms=3, lw=1.0)
+    below.legend(loc="best")
     below.set(ylabel="monitored − true,\narcsec", xlabel="time [min]")
     _finish(above, below)
     return figure
@@ -87,6 +90,28 @@ def height_figure(run: MonitorRun) -> Figure:
     return figure
 
 
+def smoothed_figure(run: MonitorRun) -> Figure:
+    """Mean height error of the cameras smoothed and interpolated, with the sigma that the smoother states."""
+    spec = run.flight.spec
+    minutes, chosen = run.flight.times / 60.0, run.smoothing[spec.interval]
+    figure = new_figure(3.8)
+    axes = figure.subplots()
+    axes.axhline(0.0, color=GREY, lw=0.7)
+    for many, alpha in ((2.0, 0.2), (1.0, 0.4)):
+        label = f"{'2' if many > 1.0 else ''}σ as the smoother states it"
+        axes.fill_between(minutes, -many * chosen.sigma, many * chosen.sigma, color=SKY, alpha=alpha, lw=0, label=label)
+    axes.plot(minutes, run.cases["interval"].camera, "s--", color=GREEN, ms=3.5, lw=1.0, label="linear between")
+    axes.plot(minutes, chosen.case.camera, "o-", color=PURPLE, ms=3.5, lw=1.2, label="smoothed")
+    at = spec.measured(spec.interval)
+    low = axes.get_ylim()[0]
+    axes.plot(minutes[at], np.full(len(at), low), "|", color=INK, ms=9, mew=1.4, label="measurements")
+    axes.set_ylim(bottom=low)
+    axes.set(xlabel="time [min]", ylabel="mean height error\nby the cameras [m]")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    _finish(axes)
+    return figure
+
+
 def interval_figure(run: MonitorRun) -> Figure:
     """RMS in height against the interval."""
     figure = new_figure(3.6)
@@ -96,7 +121,13 @@ def interval_figure(run: MonitorRun) -> Figure:
         minutes, [c.height_rms for c in run.intervals.values()], "o-", color=BLUE, ms=5, lw=1.2, label="all errors"
     )
     alone = np.array([c.camera_height_rms for c in run.intervals.values()])
-    axes.loglog(minutes, alone, "s--", color=GREEN, ms=4, lw=1.2, label="by the cameras alone")
+    axes.loglog(minutes, alone, "s--", color=GREEN, ms=4, lw=1.2, label="by the cameras alone, linear between")
+    if run.smoothing:
+        chosen = [run.smoothing[interval] for interval in run.intervals]
+        smoothed = [one.case.camera_height_rms for one in chosen]
+        axes.loglog(minutes, smoothed, "D-", color=PURPLE, ms=4, lw=1.2, label="by the cameras alone, smoothed")
+        stated = [rms(one.sigma) for one in chosen]
+        axes.loglog(minutes, stated, ":", color=PURPLE, lw=1.4, label="σ that the smoother states")
     axes.axhline(run.cases["none"].height_rms, color=VERMILION, lw=1.1, label="without monitoring")
     axes.axhline(run.cases["true"].height_rms, color=INK, lw=1.1, ls=":", label="true cameras")
     axes.set_xticks(minutes, [f"{m:g}" for m in minutes])
@@ -130,6 +161,7 @@ def parts_figure(run: MonitorRun) -> Figure:
 FIGURES: dict[str, Callable[[MonitorRun], Figure]] = {
     "angle": angle_figure,
     "height": height_figure,
+    "smoothed": smoothed_figure,
     "interval": interval_figure,
     "remainder": parts_figure,
 }

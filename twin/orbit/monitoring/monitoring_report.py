@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 def sections(run: MonitorRun) -> tuple[Section, ...]:
     """All parts."""
-    return (_angle(run), _height(run), _interval(run), _rest(run), _conversion(run), _noise(run))
+    smoothed = (_smoothed(run),) if run.smoothing else ()
+    return (_angle(run), _height(run), *smoothed, _interval(run), _rest(run), _conversion(run), _noise(run))
 
 
 def _angle(run: MonitorRun) -> Section:
@@ -34,7 +35,10 @@ def _angle(run: MonitorRun) -> Section:
         "its reference.",
     )
     figure = SvgFigure(
-        "angle", "Intersection angle over the orbit", "Model estimator, all frames.", figure_svg("angle", run)
+        "angle",
+        "Intersection angle over the orbit",
+        f"Estimator {run.flight.estimator}, all frames.",
+        figure_svg("angle", run),
     )
     return Section("Intersection angle", text, (figure, *(_changes(run, name) for name in run.flight.pair)))
 
@@ -70,6 +74,49 @@ def _height(run: MonitorRun) -> Section:
     caption = "Above: mean over the points. Below: all errors, with the points' noise."
     figure = SvgFigure("height", "Height errors over the orbit", caption, figure_svg("height", run))
     return Section("Heights with and without monitoring", text, (figure,))
+
+
+def _smoothed(run: MonitorRun) -> Section:
+    spec, stated = run.flight.spec, run.setup.disturbances
+    assert stated is not None
+    chosen = run.smoothing[spec.interval]
+    found = chosen.consistency
+    rows: list[tuple[Cell, ...]] = [
+        (
+            float(interval / 60.0),
+            len(spec.measured(interval)),
+            one.interpolated.camera_height_rms,
+            one.case.camera_height_rms,
+            one.factor,
+            rms(one.sigma),
+            one.furthest,
+            one.consistency.chi_square / one.consistency.degrees,
+        )
+        for interval, one in run.smoothing.items()
+    ]
+    table = Table(
+        "smoothing",
+        "Heights smoothed against heights interpolated, from the same measurements",
+        "By the cameras alone, RMS over all times, metres; the sigma that the smoother states; the largest error over "
+        f"its sigma, limit {chosen.limit:.2f}; chi-square of the shifts over its degrees of freedom.",
+        ("interval [min]", "measurements", "linear [m]", "smoothed [m]", "factor", "σ [m]", "largest/σ", "χ²/n"),
+        rows,
+        (1, None, 3, 3, 2, 3, 2, 2),
+    )
+    fits = "agree" if found.agrees else "do not agree"
+    reach = "lies within" if chosen.agrees else "goes beyond"
+    text = (
+        f"All measurements together, by the stated disturbances ({stated.name}) and how they go on in time: the best "
+        f"linear estimate at every time. Measured every {moment(spec.interval)}, it makes the cameras' height error "
+        f"{chosen.factor:.2f} times smaller than values that are linear between the measurements.",
+        f"It states {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
+        f"{reach} the limit of {chosen.limit:.2f} (false alarm at most {FALSE_ALARM:g}). Measured shifts {fits} with "
+        f"what is stated: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
+        f"{found.limit:.4g}.",
+    )
+    caption = "Mean over the points, with the total sigma of the smoothed height."
+    figure = SvgFigure("smoothed", "Heights between the measurements", caption, figure_svg("smoothed", run))
+    return Section("Between the measurements", text, (figure, table))
 
 
 def _interval(run: MonitorRun) -> Section:
@@ -216,6 +263,7 @@ def monitor_report(run: MonitorRun) -> Report:
         f"Monitoring every {moment(spec.interval)} takes the heights' error from {none.height_rms:.2f} m to "
         f"{chosen.height_rms:.2f} m RMS{'' if bought > 0.0 else ', which is no gain'}, while the intersection angle "
         f"changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec",
+        _gain(run),
         f"with the true cameras {floor.height_rms:.2f} m are left, so that most of it comes from {limit}: see the "
         "errors over the course",
     )
@@ -235,17 +283,33 @@ def monitor_report(run: MonitorRun) -> Report:
     )
 
 
+def _gain(run: MonitorRun) -> str:
+    """What smoothing buys at the file's interval; empty where nothing is stated to move."""
+    if not run.smoothing:
+        return ""
+    chosen = run.smoothing[run.flight.spec.interval]
+    fits = "as" if chosen.agrees else "other than"
+    return (
+        f"smoothed together, the same measurements leave {chosen.case.camera_height_rms:.2f} m by the cameras, "
+        f"{chosen.factor:.2f} times less than linear between, {fits} their stated sigma of "
+        f"{rms(chosen.sigma):.2f} m says"
+    )
+
+
 def _table(run: MonitorRun) -> Table:
     spec = run.flight.spec
     names = {
         "none": "as calibrated, no monitoring",
         "interval": f"monitored every {moment(spec.interval)}",
+        "smoothed": "the same measurements, smoothed",
         "monitored": "monitored at every time",
         "parameters": "true four parameters (bound)",
         "true": "true cameras (bound)",
     }
     rows: list[tuple[Cell, ...]] = []
     for key, name in names.items():
+        if key not in run.cases:
+            continue
         case = run.cases[key]
         numbers = (case.height_rms, case.worst, case.camera_height_rms, case.plan_rms, rms(case.camera_plan))
         rows.append((name, *numbers))
@@ -270,6 +334,10 @@ def _facts(setup: MonitorSetup) -> tuple[tuple[str, str], ...]:
         ("Course", f"{span}, from {test.orbit.epoch}"),
         ("Reference", moment(test.reference)),
         ("Applied", ", ".join(test.apply)),
+        (
+            "Disturbances",
+            setup.disturbances.name if setup.disturbances else "none stated: sigmas are of the noise alone",
+        ),
         ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
         ("Image points", f"σ {errors.image:g} px, drawn, not matched in images" if on else "exact"),
         ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
@@ -289,4 +357,17 @@ def _warnings(run: MonitorRun) -> tuple[str, ...]:
         )
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
         out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
+    if run.smoothing:
+        chosen = run.smoothing[run.flight.spec.interval]
+        found = chosen.consistency
+        if not found.agrees:
+            out.append(
+                f"the measured shifts contradict the stated disturbances: chi-square {found.chi_square:.4g}, limit "
+                f"{found.limit:.4g}; the stated sigmas cannot be relied on"
+            )
+        if not chosen.agrees:
+            out.append(
+                f"smoothed heights are wrong by up to {chosen.furthest:.3g} of their stated sigma, limit "
+                f"{chosen.limit:.2f}"
+            )
     return tuple(out)

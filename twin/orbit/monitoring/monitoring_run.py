@@ -176,7 +176,7 @@ class Smoothing:
 
     @property
     def limit(self) -> float:
-        """Of it: exceeded with a chance of `FALSE_ALARM` at most, however the times' errors go together (Bonferroni)."""
+        """Of it: exceeded with a chance of `FALSE_ALARM` at most, however errors of the times go together."""
         return float(norm.isf(0.5 * FALSE_ALARM / max(len(self.ratios), 1)))
 
     @property
