@@ -123,7 +123,7 @@ def smooth(
     when, wanted = np.asarray(measured, np.float64), np.asarray(times, np.float64)
     order = np.argsort(when, kind="stable")
     when = when[order]
-    width, count = 4 * (len(stated.parameters) // 4), len(wanted)
+    width, count = len(stated.parameters), len(wanted)
     found = {
         which: SeriesChanges(np.empty((count, width)), np.empty((count, width, width)), np.empty((count, width, width)))
         for which in ("filtered", "smoothed")
@@ -190,15 +190,14 @@ class _Process:
 
     def parameters(self, wanted: Array) -> Array:
         """(m, 4 K, 4 K) of the parameters at each time."""
-        out = 0.0
+        width = len(self.parts[0][3])
+        out = np.zeros((len(wanted), width, width))
         for law, _, _, own in self.parts:
-            apart = np.zeros_like(wanted)
-            kept = np.ones_like(wanted)
+            share = np.ones_like(wanted)
             if self.reference is not None:
-                apart = law.correlation(wanted - self.reference)
-                kept = 2.0 * (1.0 - apart)
-            out = out + kept[:, None, None] * own
-        return np.asarray(out)
+                share = 2.0 * (1.0 - law.correlation(wanted - self.reference))
+            out += share[:, None, None] * own
+        return out
 
 
 def _together(parts: list[tuple[Array, Array]]) -> Array:

@@ -144,12 +144,35 @@ def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
             if key.endswith("_sigma"):
                 assert np.all(np.array(late) <= np.array(group["filtered"][key]) * (1.0 + 1e-9))
                 assert np.all(np.array(late) >= np.array(group["smoothed"][f"{key}_noise"]))
+    between = found["between"]
+    assert between["times_s"] == pytest.approx(
+        [90.0 * k for k in range(1, 8)] + [720.0 + 135.0 * k for k in range(1, 8)]
+    )
+    for name, camera in between["cameras"].items():
+        assert set(camera) == {"filtered", "smoothed"}
+        sigma = np.array(camera["smoothed"]["d_alpha_arcsec_sigma"])
+        ends = np.array(found["cameras"][name]["smoothed"]["d_alpha_arcsec_sigma"])
+        assert np.all(sigma[:7] > ends[:2].min())
+        assert sigma[7:].max() > sigma[:7].max()  # 18 min leave more open than 12
+    assert set(between) == {"times_s", "cameras", "intersection_angle", "ground"}
     told = found["disturbances"]
     assert told["name"] == "orbit"
     assert told["degrees_of_freedom"] == 3 * 8
     assert sum(told["innovations"]["chi_square"]) == pytest.approx(told["chi_square"])
     assert not told["agrees"]
     assert told["chi_square"] > told["limit"]
+
+
+def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
+    resolved = resolve(written(tmp_path, JOB.replace("course:", "disturbances: none\ncourse:")))
+    experiment = MonitorExperiment(resolved, backend)
+    series = run_series(experiment, resolved, series_states(experiment, resolved.job))
+    assert series.smoothed is None
+    told = series.to_dict()
+    assert "disturbances" not in told
+    assert "between" not in told
+    assert "smoothed" not in told["cameras"]["forward"]
+    assert "model" in told["ground"]
 
 
 def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
@@ -215,7 +238,16 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
     assert [page["time_s"] for page in said] == [0.0, 720.0, 1800.0]
     assert {page["camera"] for page in said} == {"forward, left area CCD"}
     about = {"schema", "reference_frames"}
-    contents = {"times_s", "detail", "temperatures", "cameras", "intersection_angle", "ground", "disturbances"}
+    contents = {
+        "times_s",
+        "detail",
+        "temperatures",
+        "cameras",
+        "intersection_angle",
+        "ground",
+        "disturbances",
+        "between",
+    }
     assert set(found) == about | contents
     assert (found["times_s"], found["detail"]) == ([0.0, 720.0, 1800.0], 1)
     assert found["temperatures"][LEFT]["change_K"] == pytest.approx([0.5, 0.6, 0.7])

@@ -225,14 +225,14 @@ class MonitorSeries:
             numbers: of their times.
         """
         stated, spec = self.experiment.disturbances, self.spec
-        cameras = self.experiment.cameras
+        cameras, (before, after) = self.experiment.cameras, measured.positions
         if stated is None:
-            every = LeastSquares().gain(Shifts(*measured.positions, measured.covariance, cameras))
+            every = LeastSquares().gain(Shifts(before, after, measured.covariance, cameras))
             return np.asarray(every[:, self._own])
         out = []
         for k, number in enumerate(numbers):
             one, span = slice(k, k + 1), stated.since(spec.course.times[number] - spec.reference)
-            shifts = Shifts(*measured.positions[:, one], measured.covariance[one], cameras, span)
+            shifts = Shifts(before[one], after[one], measured.covariance[one], cameras, span)
             out.append(Posterior().gain(shifts)[0, self._own])
         return np.array(out)
 
