@@ -1,6 +1,7 @@
 """From the on-board monitor to heights on the ground, end to end, and as a user runs it."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -298,6 +299,19 @@ def test_smoothed_heights(stated) -> None:
         assert one.consistency.degrees % 8 == 0
 
 
+def test_contradictions_stand_in_the_report(stated) -> None:
+    chosen = stated.smoothing[1200.0]
+    assert not monitor_report(stated).warnings
+    off = replace(chosen, consistency=replace(chosen.consistency, chi_square=500.0), error=50.0 * chosen.sigma)
+    told = monitor_report(replace(stated, smoothing={**stated.smoothing, 1200.0: off}))
+    assert [warning.split(":")[0] for warning in told.warnings[:1]] == [
+        "the measured shifts contradict the stated disturbances"
+    ]
+    assert "wrong by up to 50 of their stated sigma" in told.warnings[1]
+    assert "other than their stated sigma" in told.verdict
+
+
+@pytest.mark.slow
 def test_shifts_that_contradict_the_disturbances_are_told(tmp_path: Path, backend) -> None:
     """Cameras that turn by an arcsecond where nothing but focal planes and prisms was expected to move."""
     text = SMALL.replace("points: 60", "points: 10").replace("repeats: 30", "repeats: 8")

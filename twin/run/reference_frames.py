@@ -16,7 +16,7 @@ __all__ = ["FRAMES", "described", "frames_text", "schema"]
 
 _VERSION = 2
 """Of the files' keys; 1 had no statement of frames."""
-_LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3, "recovered": 3, "course": 3})
+_LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3, "recovered": 3, "course": 3, "monitor": 3})
 """Kind of file -> version, where keys went or changed their meaning since then: what a paper prints and whether it
 holds; sigmas, which were those of the noise alone."""
 _CAMERA = (
