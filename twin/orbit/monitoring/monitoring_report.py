@@ -108,7 +108,7 @@ def _smoothed(run: MonitorRun) -> Section:
     text = (
         f"All measurements together, by the stated disturbances ({stated.name}) and how they go on in time: the best "
         f"linear estimate at every time. Measured every {moment(spec.interval)}, it makes the cameras' height error "
-        f"{chosen.factor:.2f} times smaller than values that are linear between the measurements.",
+        f"{_times(chosen.factor, 'smaller')} than values that are linear between the measurements.",
         f"It states {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
         f"{reach} the limit of {chosen.limit:.2f} (false alarm at most {FALSE_ALARM:g}). Measured shifts {fits} with "
         f"what is stated: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
@@ -283,6 +283,13 @@ def monitor_report(run: MonitorRun) -> Report:
     )
 
 
+def _times(factor: float, less: str) -> str:
+    """By what factor an error is smaller, or larger."""
+    if factor >= 1.0:
+        return f"{factor:.2f} times {less}"
+    return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
+
+
 def _gain(run: MonitorRun) -> str:
     """What smoothing buys at the file's interval; empty where nothing is stated to move."""
     if not run.smoothing:
@@ -291,7 +298,7 @@ def _gain(run: MonitorRun) -> str:
     fits = "as" if chosen.agrees else "other than"
     return (
         f"smoothed together, the same measurements leave {chosen.case.camera_height_rms:.2f} m by the cameras, "
-        f"{chosen.factor:.2f} times less than linear between, {fits} their stated sigma of "
+        f"{_times(chosen.factor, 'less')} than linear between, {fits} their stated sigma of "
         f"{rms(chosen.sigma):.2f} m says"
     )
 
