@@ -7,15 +7,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import combinations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from optics.geometry.pose import triple
 from optics.geometry.tree import ORIGIN, Motion, State, compose
 from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
-from scenes.models.thermal_model import ThermalModel
+from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
 from scenes.specs.disturbances import CauseSpec, DisturbancesSpec, TimeLawSpec
 from scenes.specs.job import NodeInfo
@@ -171,34 +172,44 @@ def motions_of_spec(
     components: list[Component] = []
     laws: list[TimeLawSpec] = []
     blocks: list[np.ndarray] = []
-    issues: list[Issue] = []
+    issues = _strangers(spec, instrument, where)
     for name, cause in spec.causes.items():
-        own: list[Component] = []
-        for k, pattern in enumerate(cause.bodies):
-            found = [path for path in instrument.nodes if _matches(pattern, path)]
-            if not found:
-                meant = nearest(pattern, instrument.nodes)
-                text = f"no body of {instrument.spec.name} is called so"
-                allowed = names_text(sorted(instrument.nodes))
-                issues.append(where(name, ("bodies", k))(text, found=pattern, allowed=allowed, suggestion=meant))
-            for path in found:
-                if any(c.body == path for c in own):
-                    continue
-                faults, some = _of_body(spec, name, cause, path, instrument, path in glass, where)
-                issues += faults
-                own += some
-        matrix, faults = _correlation(name, cause, own, where)
-        issues += faults
-        components += own
-        laws += [cause.time] * len(own)
-        blocks.append(matrix)
+        bodies = [path for pattern in cause.bodies for path in instrument.nodes if _matches(pattern, path)]
+        own, faults = _of_cause(spec, name, cause, list(dict.fromkeys(bodies)), instrument, glass, where)
+        matrix, more = _correlation(name, cause, own, where)
+        # a correlation with what is not the same quantity tells nothing where the quantity itself was refused
+        issues += faults or (more if bodies else [])
+        # what does not move is named by correlations all the same, so that one number can be set to zero
+        moving = [k for k, c in enumerate(own) if c.sigma > 0.0]
+        components += [own[k] for k in moving]
+        laws += [cause.time] * len(moving)
+        blocks.append(matrix[np.ix_(moving, moving)])
     if issues:
         raise InputError(*issues)
-    correlation, start = np.zeros((len(components), len(components))), 0
-    for block in blocks:
-        correlation[start : start + len(block), start : start + len(block)] = block
-        start += len(block)
-    return StatedMotions(spec.name, tuple(components), correlation, tuple(laws))
+    return StatedMotions(spec.name, tuple(components), block_diag(*blocks), tuple(laws))
+
+
+def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalModel) -> None:
+    """Check that what is stated of temperatures can be worked out: that glasses have a dn/dT that is known there.
+
+    Args:
+        resolved: the job.
+        stated: of it.
+        thermal: of its instrument.
+
+    Raises:
+        InputError: it cannot.
+    """
+    cause_of = {c.body: c.cause for c in stated.components if c.kind in HEAT}
+    warmer = {
+        body: Temperature(sum(c.sigma for c in stated.components if (c.body, c.kind) == (body, "temperature")))
+        for body in cause_of
+    }
+    try:
+        thermal.check(warmer)
+    except TemperatureError as error:
+        issue = _issue_at(resolved, cause_of[error.origin], ("temperature",))
+        raise InputError(issue(str(error), allowed=error.allowed)) from error
 
 
 def state_of(
@@ -269,42 +280,78 @@ def _issue_of(spec: DisturbancesSpec, key: KeyPath) -> IssueAt:
 
 
 def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath) -> IssueAt:
-    """An issue at the line that said it: the job's where it changes the file."""
+    """An issue at the line that said it: the job's where it changes the file, or names the bodies to which the file's
+    motions are now given.
+    """
     changes = resolved.job.disturbances
     own = changes.causes.get(cause) if changes is not None else None
     if own is not None and (not key or key[0] in own.given):
         return lambda problem, **more: resolved.job.issue(problem, ("disturbances", "causes", cause, *key), **more)
+    if own is not None and "bodies" in own.given:
+        text = f"{key[0]} of {cause}: "
+        at: KeyPath = ("disturbances", "causes", cause, "bodies")
+        return lambda problem, **more: resolved.job.issue(text + problem, at, **more)
     assert resolved.disturbances is not None
     return _issue_of(resolved.disturbances, ("causes", cause, *key))
 
 
-def _of_body(
+def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: Callable[[str, KeyPath], IssueAt]) -> list[Issue]:
+    """One issue for each pattern of which the instrument has no body, at the first cause that has it."""
+    first: dict[str, tuple[str, int]] = {}
+    causes: dict[str, list[str]] = {}
+    for name, cause in spec.causes.items():
+        for k, pattern in enumerate(cause.bodies):
+            if not any(_matches(pattern, path) for path in instrument.nodes):
+                first.setdefault(pattern, (name, k))
+                causes.setdefault(pattern, []).append(name)
+    out = []
+    for pattern, (name, k) in first.items():
+        also = f", nor for {names_text(causes[pattern][1:])}" if causes[pattern][1:] else ""
+        text = f"{instrument.spec.name} has no body of this name{also}"
+        meant, allowed = nearest(pattern, instrument.nodes), names_text(sorted(instrument.nodes))
+        issue = where(name, ("bodies", k))
+        out.append(issue(text, found=pattern, allowed=allowed, suggestion=meant))
+    return out
+
+
+def _of_cause(
     spec: DisturbancesSpec,
     name: str,
     cause: CauseSpec,
-    path: str,
+    bodies: Sequence[str],
     instrument: Instrument,
-    transparent: bool,
+    glass: set[str],
     where: Callable[[str, KeyPath], IssueAt],
-) -> tuple[list[Issue], list[Component]]:
-    """The components that a cause gives to one body, those of zero sigma left out; and what is wrong with them."""
-    info, issues = instrument.nodes[path], []
-    pivot = cause.pivot or ("centre" if "centre" in info.pivots else ORIGIN)
-    if pivot != ORIGIN and pivot not in info.pivots:
-        known = tuple(dict.fromkeys((ORIGIN, *info.pivots)))
-        meant = nearest(pivot, known)
+) -> tuple[list[Component], list[Issue]]:
+    """The components that a cause gives to bodies, also those of zero sigma; and what is wrong, one issue a key."""
+    components: list[Component] = []
+    turned: list[str] = []
+    refused: dict[KeyPath, list[str]] = {}
+    for path in bodies:
+        info = instrument.nodes[path]
+        pivot = cause.pivot or ("centre" if "centre" in info.pivots else ORIGIN)
+        if pivot not in (ORIGIN, *info.pivots):
+            turned.append(path)
+        can = _possible(info, path in glass)
+        for key, kind, axis, sigma in _sigmas(cause):
+            if _NEEDS.get(kind, kind) in can:
+                components.append(Component(name, path, kind, axis, pivot, sigma / spec.sigmas))
+            elif path not in refused.setdefault(key[:1], []):
+                refused[key[:1]].append(path)
+    issues = []
+    if turned:
+        known = tuple(dict.fromkeys((ORIGIN, *instrument.nodes[turned[0]].pivots)))
+        text, meant = f"{_some(turned)} has no such pivot", nearest(str(cause.pivot), known)
         issue = where(name, ("pivot",))
-        issues.append(issue(f"{path} has no such pivot", found=pivot, allowed=names_text(known), suggestion=meant))
-    out = []
-    for key, kind, axis, sigma in _sigmas(cause):
-        needs = _NEEDS.get(kind, kind)
-        if not (transparent if kind == "index_gradient" else needs in info.allows):
-            rigid = names_text(sorted(_possible(info, transparent)))
-            issues.append(where(name, key)(f"{path} does not allow {needs}", found=path, allowed=rigid))
-            break
-        if sigma > 0.0:
-            out.append(Component(name, path, kind, axis, pivot, sigma / spec.sigmas))
-    return issues, out
+        issues.append(issue(text, found=cause.pivot, allowed=names_text(known), suggestion=meant))
+    for key, paths in refused.items():
+        allowed = names_text(sorted(_possible(instrument.nodes[paths[0]], paths[0] in glass))) or "nothing"
+        issues.append(where(name, key)(f"{_some(paths)} does not allow {key[0]}", allowed=allowed))
+    return components, issues
+
+
+def _some(paths: Sequence[str]) -> str:
+    return paths[0] if len(paths) == 1 else f"{paths[0]}, as {len(paths) - 1} more,"
 
 
 def _possible(info: NodeInfo, transparent: bool) -> set[str]:
@@ -329,7 +376,10 @@ def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
 def _correlation(
     name: str, cause: CauseSpec, own: Sequence[Component], where: Callable[[str, KeyPath], IssueAt]
 ) -> tuple[np.ndarray, list[Issue]]:
-    """Correlation matrix of a cause's components, and what is wrong with it."""
+    """Correlation matrix of a cause's components, and what is wrong with it.
+
+    ``correlations`` stand in place of ``together`` where both speak of the same two components.
+    """
     matrix, issues = np.eye(len(own)), []
     if cause.together is not None:
         for i, one in enumerate(own):
@@ -340,27 +390,45 @@ def _correlation(
             count = len({c.body for c in own})
             allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
             text = "bodies cannot all move against one another so much"
-            issues.append(where(name, ("together",))(text, found=f"{cause.together:g}", allowed=allowed))
+            return matrix, [where(name, ("together",))(text, found=f"{cause.together:g}", allowed=allowed)]
     known = {c.name: k for k, c in enumerate(own)}
+    said: dict[tuple[int, int], float] = {}
     for n, group in enumerate(cause.correlations):
         key: KeyPath = ("correlations", n)
         unknown = [k for k, text in enumerate(group.between) if text not in known]
         for k in unknown:
             text, meant = group.between[k], nearest(group.between[k], known)
             issue = where(name, (*key, "between", k))
-            issues.append(
-                issue(f"no component of {name}", found=text, allowed=names_text(sorted(known)), suggestion=meant)
-            )
+            allowed = names_text(sorted(known))
+            issues.append(issue(f"no component of {name}", found=text, allowed=allowed, suggestion=meant))
         if unknown:
             continue
         at = [known[text] for text in group.between]
+        for i, j in combinations(range(len(at)), 2):
+            value = group.table[i][j]
+            before = said.setdefault((min(at[i], at[j]), max(at[i], at[j])), value)
+            if before != value:
+                text = f"{group.between[i]} and {group.between[j]} have a correlation already"
+                issues.append(where(name, key)(text, found=f"{value:g} and {before:g}", allowed="one of them"))
+        matrix[np.ix_(at, at)] = np.array(group.table)
+    least = _least(matrix)
+    if not issues and least < _INDEFINITE:
+        text = "these correlations cannot be, alone or with those before them: the matrix is not positive definite"
+        issue = where(name, ("correlations", _first_impossible(cause, known)))
+        allowed = "correlations of real quantities: smaller ones"
+        issues.append(issue(text, found=f"an eigenvalue of {least:.3g}", allowed=allowed))
+    return matrix, issues
+
+
+def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
+    """The correlation from which on they cannot be, of some that cannot be together."""
+    matrix, last = np.eye(len(known)), len(cause.correlations) - 1
+    for n, group in enumerate(cause.correlations[:last]):
+        at = [known[text] for text in group.between]
         matrix[np.ix_(at, at)] = np.array(group.table)
         if _least(matrix) < _INDEFINITE:
-            found: Any = f"an eigenvalue of {_least(matrix):.3g}"
-            text = "these correlations cannot be, alone or with those before them: the matrix is not positive definite"
-            issues.append(where(name, key)(text, found=found, allowed="correlations of real quantities: smaller ones"))
-            break
-    return matrix, issues
+            return n
+    return last
 
 
 def _least(matrix: np.ndarray) -> float:

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import Term, moment
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Name, Named, Number, OneOf, Reference, Spec, Text
 from scenes.yaml.units import (
@@ -34,6 +34,14 @@ def _spread(kind: Kind, largest: str) -> Quantity:
     return Quantity(kind, smallest=f"0 {kind.units[0]}", largest=largest)
 
 
+def _something(value: Any) -> Any:
+    if value is None:
+        raise Problem("nothing stands here", "nothing", "a value; leave the key out where there is none")
+    return value
+
+
+STATED = BeforeValidator(_something)
+"""Of a key that may be left out, not empty: an empty standard deviation is a forgotten one."""
 ShiftSigma = Annotated[tuple[float, float, float], Vector(_spread(LENGTH, "10 mm"), alike=True)]
 RotateSigma = Annotated[tuple[float, float, float], Vector(_spread(ANGLE, "1 deg"), alike=True)]
 GradientSigma = Annotated[tuple[float, float, float], Vector(_spread(TEMPERATURE_GRADIENT, "1000 K/m"), alike=True)]
@@ -121,7 +129,7 @@ class CorrelationSpec(Spec):
     """
 
     between: Annotated[tuple[Annotated[str, Field(strict=True)], ...], Field(min_length=2)]
-    correlation: Correlation | None = None
+    correlation: Annotated[Correlation | None, STATED] = None
     matrix: tuple[tuple[Correlation, ...], ...] | None = None
 
     @model_validator(mode="after")
@@ -177,14 +185,14 @@ class CauseSpec(Spec):
     """
 
     bodies: BodyPatterns
-    shift: ShiftSigma | None = None
-    rotate: RotateSigma | None = None
-    scale: ScaleSigma | None = None
-    figure: FigureSigmas | None = None
-    temperature: TemperatureSigmaSpec | None = None
-    index_gradient: IndexSigma | None = None
-    pivot: Name | None = None
-    together: Correlation | None = None
+    shift: Annotated[ShiftSigma | None, STATED] = None
+    rotate: Annotated[RotateSigma | None, STATED] = None
+    scale: Annotated[ScaleSigma | None, STATED] = None
+    figure: Annotated[FigureSigmas | None, STATED] = None
+    temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
+    index_gradient: Annotated[IndexSigma | None, STATED] = None
+    pivot: Annotated[Name | None, STATED] = None
+    together: Annotated[Correlation | None, STATED] = None
     correlations: tuple[CorrelationSpec, ...] = ()
     time: TimeLaw = TimeLawSpec(kind="white")
     reason: Annotated[Text, Field(min_length=1)]
@@ -197,7 +205,7 @@ class CauseSpec(Spec):
 
 
 class CauseChangeSpec(Spec):
-    """What a job says of a cause in place of the disturbances file, key by key; a cause that the file does not have
+    """What a job says of a cause in place of the disturbances file, number by number; a cause that the file does not have
     needs all that a cause needs.
 
     Attributes:
@@ -205,23 +213,35 @@ class CauseChangeSpec(Spec):
             as of a cause.
     """
 
-    bodies: BodyPatterns | None = None
-    shift: ShiftSigma | None = None
-    rotate: RotateSigma | None = None
-    scale: ScaleSigma | None = None
-    figure: FigureSigmas | None = None
-    temperature: TemperatureSigmaSpec | None = None
-    index_gradient: IndexSigma | None = None
-    pivot: Name | None = None
-    together: Correlation | None = None
-    correlations: tuple[CorrelationSpec, ...] | None = None
-    time: TimeLaw | None = None
-    reason: Annotated[Text, Field(min_length=1)] | None = None
+    bodies: Annotated[BodyPatterns | None, STATED] = None
+    shift: Annotated[ShiftSigma | None, STATED] = None
+    rotate: Annotated[RotateSigma | None, STATED] = None
+    scale: Annotated[ScaleSigma | None, STATED] = None
+    figure: Annotated[FigureSigmas | None, STATED] = None
+    temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
+    index_gradient: Annotated[IndexSigma | None, STATED] = None
+    pivot: Annotated[Name | None, STATED] = None
+    together: Annotated[Correlation | None, STATED] = None
+    correlations: Annotated[tuple[CorrelationSpec, ...] | None, STATED] = None
+    time: Annotated[TimeLaw | None, STATED] = None
+    reason: Annotated[Annotated[Text, Field(min_length=1)] | None, STATED] = None
 
     @property
     def given(self) -> Mapping[str, Any]:
         """What it says."""
         return {name: getattr(self, name) for name in self.model_fields_set if getattr(self, name) is not None}
+
+    def made_to(self, cause: CauseSpec) -> CauseSpec:
+        """The cause with this change; what it does not say stays, of figures term by term and of temperatures number
+        by number.
+        """
+        update = dict(self.given)
+        if self.figure is not None and cause.figure is not None:
+            update["figure"] = FrozenMap({**cause.figure, **self.figure})
+        if self.temperature is not None and cause.temperature is not None:
+            own = {name: getattr(self.temperature, name) for name in self.temperature.model_fields_set}
+            update["temperature"] = cause.temperature.model_copy(update=own)
+        return cause.model_copy(update=update)
 
 
 class DisturbancesSpec(Spec):
@@ -248,23 +268,25 @@ class DisturbancesSpec(Spec):
         causes = dict(self.causes)
         for k, name in enumerate(changes.without):
             if name not in causes:
-                allowed = ", ".join(self.causes)
-                raise changes.error(f"no such cause in {self.name}", ("without", k), found=name, allowed=allowed)
+                problem, meant = f"no such cause in {self.name}", nearest(name, self.causes)
+                allowed = names_text(self.causes)
+                raise changes.error(problem, ("without", k), found=name, allowed=allowed, suggestion=meant)
             del causes[name]
         for name, change in changes.causes.items():
             if name in causes:
-                causes[name] = causes[name].model_copy(update=dict(change.given))
+                causes[name] = change.made_to(causes[name])
                 continue
             missing = [key for key in ("bodies", "reason") if key not in change.given]
             if missing or not any(key in change.given for key in MOVES):
-                allowed = f"a change of {', '.join(self.causes)}; or bodies, a reason and one of {', '.join(MOVES)}"
-                raise changes.error(f"no cause of this name in {self.name}", ("causes", name), allowed=allowed)
-            rest = {"time": TimeLawSpec(kind="white"), "correlations": ()}
-            causes[name] = CauseSpec.model_construct(**{**rest, **change.given})
+                problem, meant = f"no such cause in {self.name}", nearest(name, self.causes)
+                new = f"a new one with bodies, a reason and one of {names_text(MOVES)}"
+                allowed = f"a change of {names_text(self.causes)}; or {new}"
+                raise changes.error(problem, ("causes", name), found=name, allowed=allowed, suggestion=meant)
+            # of checked parts: to validate them again would ask for quantities as text
+            causes[name] = CauseSpec.model_construct(**change.given)
         if not causes:
-            raise changes.error("no cause is left", ("without",), allowed="disturbances: none")
-        same = self.model_copy(update={"causes": FrozenMap(causes)})
-        return same
+            raise changes.error("no cause is left", ("without",), allowed="`disturbances: none` for none at all")
+        return self.model_copy(update={"causes": FrozenMap(causes)})
 
 
 class JobDisturbancesSpec(Spec):
@@ -273,13 +295,24 @@ class JobDisturbancesSpec(Spec):
     Attributes:
         file: name of a file in scenes/library/disturbances, or path of one's own; the instrument's by default; `none`
             for none at all.
-        causes: what is to be said instead of, or besides, the causes of the file.
+        causes: what is to be said instead of, or besides, the causes of the file, in as many standard deviations as
+            the file's own numbers.
         without: causes of the file that are left out.
     """
 
     file: Reference | None = None
     causes: Named[CauseChangeSpec] = Field(default_factory=FrozenMap)
     without: tuple[Name, ...] = ()
+
+    @model_validator(mode="after")
+    def _each_once(self) -> "JobDisturbancesSpec":
+        for k, name in enumerate(self.without):
+            if name in self.without[:k]:
+                raise Problem("a cause is left out twice", shown(name), "each once", within=("without", k))
+            if name in self.causes:
+                text = "a cause is both changed and left out"
+                raise Problem(text, shown(name), "one of both", within=("without", k))
+        return self
 
 
 def _named(value: Any) -> Any:

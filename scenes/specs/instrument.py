@@ -17,7 +17,7 @@ from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Spec, Text, Whole, name_in
-from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, TEMPERATURE_GRADIENT, TIME
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
 
 Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]
 
@@ -265,31 +265,9 @@ class InstrumentSpec(Spec):
     disturbances: Reference | None = None
 
 
-Steadiness = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, above_zero=True, largest="100 K")]
-GradientSteadiness = Annotated[float, Quantity(TEMPERATURE_GRADIENT, above_zero=True, largest="100 K/m")]
-RotationSteadiness = Annotated[float, Quantity(ANGLE, above_zero=True, largest="1 deg")]
 AngleErrors = Annotated[
     dict[Name, Annotated[dict[Name, Tilt], AfterValidator(FrozenMap)]], NothingIsEmpty, AfterValidator(FrozenMap)
 ]
-
-
-class SteadinessSpec(Spec):
-    """How far things change between the nominal measurement and a later one: 3 sigma of each component, independent
-    for every body and axis.
-
-    Attributes:
-        focal_plane_temperature: of each camera's focal plane, kelvin.
-        prism_180_gradient, prism_0_gradient, central_prism_gradient: change of the temperature gradient in the glass,
-            K/m.
-        prism_180_rotation, prism_0_rotation: of the prisms in their mounts, radians.
-    """
-
-    focal_plane_temperature: Steadiness
-    prism_180_gradient: GradientSteadiness
-    prism_0_gradient: GradientSteadiness
-    prism_180_rotation: RotationSteadiness
-    prism_0_rotation: RotationSteadiness
-    central_prism_gradient: GradientSteadiness
 
 
 class ErrorBudgetSpec(Spec):
@@ -303,7 +281,8 @@ class ErrorBudgetSpec(Spec):
         trials: number of random states for each line.
         all_together: number of random states with all causes at once.
         angle_errors: prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.
-        steadiness: what changes, and by how much.
+        disturbances: what changes, and by how much: a file of scenes/library/disturbances or of one's own. Each of its
+            causes is a line.
     """
 
     description: Text = ""
@@ -313,7 +292,7 @@ class ErrorBudgetSpec(Spec):
     trials: Annotated[Whole, Field(ge=20, le=100_000)] = 100
     all_together: Annotated[Whole, Field(ge=20, le=100_000)] = 300
     angle_errors: AngleErrors
-    steadiness: SteadinessSpec
+    disturbances: Reference
 
     def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
         """The instrument with this budget's angle errors and light."""

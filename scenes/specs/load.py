@@ -227,7 +227,8 @@ def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative
 
 
 def _names_and_paths(folder: str) -> str:
-    return f"{names_text(library_names(folder))}, or the path of a .yaml file"
+    names = (*library_names(folder), *([NONE] if folder == DISTURBANCES else []))
+    return f"{names_text(names)}, or the path of a .yaml file"
 
 
 def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:

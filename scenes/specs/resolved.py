@@ -1,7 +1,7 @@
 """A job together with everything it refers to, so that one file says all that went into a run."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 from pydantic import Field
 
@@ -9,7 +9,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, TargetsSpec
 from scenes.specs.load import (
     find_disturbances,
@@ -100,6 +100,21 @@ def resolve_job(job: JobSpec) -> ResolvedJob:
         line_detectors=line_detectors,
         disturbances=find_disturbances(job, instrument),
     )
+
+
+def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
+    """The nominal job on an error budget's instrument, with what the budget states to change.
+
+    Raises:
+        InputError: as `resolve`; or the budget names no disturbances.
+    """
+    named = {"file": budget.disturbances}
+    job = JobSpec.model_validate({"instrument": budget.instrument, "disturbances": named}).with_source(budget.source)
+    resolved = resolve_job(cast(JobSpec, job))
+    if resolved.disturbances is None:
+        text = "an error budget is one of disturbances"
+        raise budget.error(text, ("disturbances",), found=budget.disturbances, allowed="the name of a file of them")
+    return resolved
 
 
 def target_band(camera: CameraSpec) -> str:

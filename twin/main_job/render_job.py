@@ -95,6 +95,7 @@ def render_job(
     stage.begin(0)
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
     check_nodes(resolved.job, experiment.instrument.nodes)
+    experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
     course = resolved.job.course
     states = [experiment.state(resolved.job)] if course is None else series_states(experiment, resolved.job)

@@ -21,7 +21,7 @@ from optics.geometry.pose import triple
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
-from scenes.models.disturbances import StatedMotions, stated_motions
+from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
@@ -162,9 +162,12 @@ class MonitorExperiment:
         """What the job states to move, component by component; None for nothing.
 
         Raises:
-            InputError: a body that the instrument does not have, or that cannot move so.
+            InputError: a body that the instrument does not have, or that cannot move or be warmed so.
         """
-        return stated_motions(self.resolved, self.instrument)
+        stated = stated_motions(self.resolved, self.instrument)
+        if stated is not None:
+            check_heat(self.resolved, stated, self.thermal)
+        return stated
 
     @cached_property
     def disturbances(self) -> Disturbances | None:

@@ -1,7 +1,8 @@
 """A monitor's error budget by its mechanisms: random states of each cause, rendered, measured, and turned into angles.
 
-A line of the budget is the error of one spot's position by one cause, as an angle: displacement / principal distance.
-Every line is 3 sigma: three times the rms over random states, all spots and both axes.
+The first line is the noise of the centroid, each of the others one cause of a disturbances file. A line is the error of
+one spot's position as an angle, displacement / principal distance, and 3 sigma: three times the rms over random states,
+all spots and both axes.
 """
 
 from __future__ import annotations
@@ -12,30 +13,22 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import coefficients
 from analysis.monitor.recovery import Recovery, measure_spots, recover
 from analysis.units import ARCSEC
-from optics.geometry.tree import Motion, State, compose
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
-from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.models.disturbances import state_of
+from scenes.specs.channel import BASE
 from scenes.specs.instrument import ErrorBudgetSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 
-LINES = (
-    "centroid",
-    "coordinate_thermal",
-    "prism_180_thermal",
-    "prism_0_thermal",
-    "prism_180_rotation",
-    "prism_0_rotation",
-    "central_prism_thermal",
-)
-"""The causes: noise of the centroid, then what moves or warms; in the order of paper 001, Table 3."""
+CENTROID = "centroid"
+"""The line that nothing causes but the noise of the image."""
 
 ALLOWED = 0.1 * ARCSEC
 """Error of one line that the inverse view asks for, 3 sigma, radians."""
@@ -51,11 +44,11 @@ class BudgetLine:
     """One line as simulated.
 
     Attributes:
-        name: one of LINES.
+        name: CENTROID or a cause.
         three_sigma: three times the rms of a spot's angle error per axis, radians.
         sigma: standard deviation of ``three_sigma``, radians.
         by_axis: the same for the spots' rows (along Y) and columns (along X), radians.
-        value, unit: the input, 3 sigma.
+        value, unit: the input, 3 sigma; 1 "times stated" where a cause's components have several.
         allowed: input at which the line would be 0.1 arcsec, in the unit of ``value``.
     """
 
@@ -88,16 +81,38 @@ class ErrorBudget:
 
     Args:
         spec: its inputs.
-        resolved: a job on its instrument without perturbation; the budget's light and angle errors are applied here.
+        resolved: a job on its instrument without perturbation, with its disturbances (``resolve_budget``); the
+            budget's light and angle errors are applied here.
         backend: where to trace.
         seed: of all random numbers.
+
+    Raises:
+        InputError: the disturbances are not of this instrument, or one of their causes is called as a line that is
+            there anyway.
     """
 
     def __init__(self, spec: ErrorBudgetSpec, resolved: ResolvedJob, backend: Backend, seed: int) -> None:
         self.spec = spec
         self.resolved = resolved.model_copy(update={"instrument": spec.applied_to(resolved.instrument)})
         self.experiment = MonitorExperiment(self.resolved, backend)
+        stated = self.experiment.stated
+        if stated is None or self.resolved.disturbances is None:
+            raise ValueError("error budget: the job states no disturbances")
+        self.stated = stated
+        if CENTROID in self.causes:
+            text = f"{CENTROID} is the line of the centroid's own noise"
+            raise self.resolved.disturbances.error(text, ("causes", CENTROID), allowed="another name of the cause")
         self.seed = seed
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """What moves or warms, in the order of the file; causes that are zero left out."""
+        return tuple(dict.fromkeys(c.cause for c in self.stated.components))
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Names of all lines."""
+        return (CENTROID, *self.causes)
 
     @cached_property
     def radians_per_pixel(self) -> float:
@@ -111,77 +126,44 @@ class ErrorBudget:
         Raises:
             ValueError: no such line.
         """
-        if name == "centroid":
+        if name == CENTROID:
             return self._centroid_line()
-        progress(0.0, f"{name}: states")
-        states = self.states((name,), self.spec.trials, LINES.index(name))
-        progress(0.3, f"{name}: render and measure")
         value, unit = self.input_of(name)
+        progress(0.0, f"{name}: states")
+        states = self.states((name,), self.spec.trials, self.lines.index(name))
+        progress(0.3, f"{name}: render and measure")
         return self._line(name, _shifts(self.experiment, states), value, unit)
 
-    def input_of(self, name: str) -> tuple[float, str]:
-        """A line's input, 3 sigma, and its unit."""
-        steady = self.spec.steadiness
-        return {
-            "coordinate_thermal": (steady.focal_plane_temperature, "K"),
-            "prism_180_thermal": (1e3 * steady.prism_180_gradient, "mK/m"),
-            "prism_0_thermal": (1e3 * steady.prism_0_gradient, "mK/m"),
-            "prism_180_rotation": (steady.prism_180_rotation / ARCSEC, "arcsec"),
-            "prism_0_rotation": (steady.prism_0_rotation / ARCSEC, "arcsec"),
-            "central_prism_thermal": (1e3 * steady.central_prism_gradient, "mK/m"),
-        }[name]
+    def input_of(self, cause: str) -> tuple[float, str]:
+        """A cause's input, 3 sigma, and its unit. Raises ValueError if there is no such cause."""
+        components = self.stated.of_causes((cause,)).components
+        if not components:
+            raise ValueError(f"error budget: no cause {cause!r}; there are {', '.join(self.causes)}")
+        first = components[0]
+        if any((c.sigma, c.unit) != (first.sigma, first.unit) for c in components):
+            return 1.0, "times stated"
+        return 3.0 * first.sigma / first.unit_size, first.unit
 
-    def states(self, lines: Sequence[str], trials: int, stream: int) -> list[State]:
-        """Random states in which these causes act, each body and axis by itself.
+    def states(self, causes: Sequence[str], trials: int, stream: int) -> list[State]:
+        """Random states in which these causes act, each by itself.
 
         Args:
-            lines: which of LINES, without the centroid's.
+            causes: which.
             trials: how many.
             stream: number of the random stream.
         """
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(7, stream)))
-        bodies = {b.path: b for b in self.experiment.instrument.assembly.tree.bodies}
-        out = []
-        for _ in range(trials):
-            heat: dict[str, Temperature] = {}
-            turns: dict[str, Motion] = {}
-            for name in LINES[1:]:
-                if name in lines:
-                    self._draw(name, rng, heat, turns)
-            thermal = self.experiment.thermal.state(heat) if heat else {}
-            out.append(compose(thermal, turns, bodies))
-        return out
+        stated = self.stated.of_causes(causes)
+        amounts = stated.draw(rng, trials)
+        return [state_of(row, stated.components, self.experiment.thermal) for row in amounts]
 
-    def _draw(
-        self, name: str, rng: np.random.Generator, heat: dict[str, Temperature], turns: dict[str, Motion]
-    ) -> None:
-        """Draw one cause for all bodies that it acts on."""
-        steady, instrument = self.spec.steadiness, self.experiment.instrument
+    def grown_focal_planes(self, warmer: float) -> tuple[float, float]:
+        """True change of d_f when every focal plane is warmer, and what paper 001, eq. (7) reads, metres.
 
-        def triple(three_sigma: float) -> tuple[float, float, float]:
-            x, y, z = three_sigma / 3.0 * rng.standard_normal(3)
-            return (float(x), float(y), float(z))
-
-        if name == "coordinate_thermal":
-            for camera in instrument.cameras:
-                change = steady.focal_plane_temperature / 3.0 * float(rng.standard_normal())
-                heat[f"{BASE}/{camera}/focal_plane"] = Temperature(change)
-        elif name == "central_prism_thermal":
-            heat[CENTRAL_PRISM] = Temperature(0.0, triple(steady.central_prism_gradient))
-        else:
-            prism, _, kind = name.rpartition("_")
-            for channel in instrument.channels:
-                body = channel.prism_body(prism)
-                if kind == "thermal":
-                    heat[body] = Temperature(0.0, triple(getattr(steady, f"{prism}_gradient")))
-                else:
-                    turns[body] = Motion(rotate=triple(getattr(steady, f"{prism}_rotation")), pivot="centre")
-
-    def grown_focal_planes(self) -> tuple[float, float]:
-        """True change of d_f when every focal plane is warmer by the input, 3 sigma, and what paper 001, eq. (7)
-        reads, metres.
+        Args:
+            warmer: by how much, kelvin.
         """
-        experiment, change = self.experiment, Temperature(self.spec.steadiness.focal_plane_temperature)
+        experiment, change = self.experiment, Temperature(warmer)
         names = list(experiment.instrument.cameras)
         state = experiment.thermal.state({f"{BASE}/{camera}/focal_plane": change for camera in names})
         true = trace_truth(experiment.instrument, experiment.backend, [state]).cameras[names[0]].d_f[0]
@@ -189,11 +171,14 @@ class ErrorBudget:
         geometry = experiment.calibration.cameras[names[0]].geometry
         return float(true), float(coefficients("paper_single", geometry)[3] @ shift)
 
-    def halved_glass(self) -> tuple[float, float, float]:
+    def halved_glass(self, slope: float) -> tuple[float, float, float]:
         """What halving the 180-deg prisms' glass does to the line of their temperature gradient.
 
         The rhomboids take over half of the transfer. The same gradients across the prism, once along its y and once
         along its z, act on both instruments.
+
+        Args:
+            slope: of the temperature, K/m.
 
         Returns:
             Glass path before and after, metres (mean over the channels), and the ratio of the rms spot displacements.
@@ -206,7 +191,6 @@ class ErrorBudget:
         instrument = whole.instrument.spec.model_copy(update={"monitor": longer})
         resolved = self.resolved.model_copy(update={"instrument": instrument})
         half = MonitorExperiment(resolved, whole.backend)
-        slope = self.spec.steadiness.prism_180_gradient
         rms, glass = [], []
         for experiment in (whole, half):
             states = [
@@ -241,7 +225,7 @@ class ErrorBudget:
             slope = (size[-1] - size[-2]) / (share[-1] - share[-2])
             share.append(share[-1] + (target - size[-1]) / slope)
         light = self.spec.photons_per_frame
-        return self._line("centroid", scatter, light, "photons per frame", light * float(np.exp(share[-1])))
+        return self._line(CENTROID, scatter, light, "photons per frame", light * float(np.exp(share[-1])))
 
     def _centroid_scatter(self, light: float) -> np.ndarray:
         """Energy centroids of single frames about their mean, px, (frames, C, 2), at a share of the light."""
@@ -267,7 +251,7 @@ class ErrorBudget:
     def together(self, progress: Progress = lambda fraction, text: None) -> Together:
         """All causes at once, through noisy images and every estimator, each measurement the mean of ``frames``."""
         progress(0.0, "all causes: states")
-        states = self.states(LINES[1:], self.spec.all_together, len(LINES))
+        states = self.states(self.causes, self.spec.all_together, len(self.lines))
         calibration = self.experiment.calibration
         before = self.experiment.frames_before(self.spec.frames, self.seed)
         truth = trace_truth(self.experiment.instrument, self.experiment.backend, states).cameras
@@ -279,7 +263,7 @@ class ErrorBudget:
                 pieces.append(recover(before, after, calibration, "energy", cores()))
         angle = self.radians_per_pixel * np.concatenate([p.after - p.before for p in pieces])
         parameters: dict[str, dict[str, tuple[float, float]]] = {}
-        for estimator in ESTIMATORS:
+        for estimator in next(iter(pieces[0].parameters.values())):
             parameters[estimator] = {}
             for name in PARAMETER_FIELDS:
                 values = [

@@ -236,7 +236,9 @@ class RenderBase:
     def check(self, tree: Tree, backend: Backend) -> None:
         """Whether the perturbed nodes are there and allow what is done to them. Raises InputError."""
         resolved = read_job(tree)
-        check_nodes(resolved.job, self._experiment(resolved, backend)[1].instrument.nodes)
+        experiment = self._experiment(resolved, backend)[1]
+        check_nodes(resolved.job, experiment.instrument.nodes)
+        experiment.stated  # noqa: B018 - raises where the instrument does not have what is stated
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         """Outcome of every run: ``truth`` and ``recovered``; if asked for, also ``quality``, and with a course, stray

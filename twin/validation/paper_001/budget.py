@@ -16,10 +16,9 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.specs.channel import BASE
-from scenes.specs.job import JobSpec
 from scenes.specs.load import load_error_budget
-from scenes.specs.resolved import resolve_job
-from twin.monitor.simulated_budget import LINES, BudgetLine, ErrorBudget, Together
+from scenes.specs.resolved import resolve_budget
+from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together
 from twin.monitor.truth import line_points, trace_sight
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import load_printed
@@ -31,7 +30,9 @@ TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
 TABLE_4 = load_printed("001").number("table4.spot_arcsec")
 INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
 """Why a tolerance is a fifth."""
-FEW_DRAWS = ("coordinate_thermal", "central_prism_thermal")
+FOCAL_PLANE, LONG_PRISM = "coordinate_thermal", "prism_180_thermal"
+"""Causes whose inputs are also applied by themselves."""
+FEW_DRAWS = (FOCAL_PLANE, "central_prism_thermal")
 """Lines of two or three random numbers a state, which need more states than those of a prism in every channel."""
 ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
 """Table 5's error of d_gamma."""
@@ -115,18 +116,18 @@ def measured(context: Context) -> BudgetImages:
     trials, together, groups = context.count(400, 60), context.count(1500, 80), context.count(400, 80)
     spec = spec.model_copy(update={"trials": trials, "all_together": together})
     context.progress(0.0, f"build {spec.instrument}")
-    budget = ErrorBudget(spec, resolve_job(JobSpec(instrument=spec.instrument)), context.backend, context.seed)
+    budget = ErrorBudget(spec, resolve_budget(spec), context.backend, context.seed)
     every = bool(context.selected & {"001.eq12", "001.table4.root_sum"})
-    wanted = [name for name in LINES if every or f"001.table3.{name}" in context.selected]
+    wanted = [name for name in budget.lines if every or f"001.table3.{name}" in context.selected]
     lines = {}
     for i, name in enumerate(wanted):
         context.progress(0.05 + 0.4 * i / len(wanted), name)
         lines[name] = more_trials(budget, 2 if name in FEW_DRAWS else 1).line(name)
-    grown = budget.grown_focal_planes() if "coordinate_thermal" in lines else None
+    grown = budget.grown_focal_planes(three_sigma(budget, FOCAL_PLANE)) if FOCAL_PLANE in lines else None
     halved = None
     if "001.table3.prism_180_thermal.halved" in context.selected:
         context.progress(0.45, "half the glass path")
-        halved = budget.halved_glass()
+        halved = budget.halved_glass(three_sigma(budget, LONG_PRISM))
     scatter = None
     if "001.eq12.frames" in context.selected:
         context.progress(0.5, "means of frames")
@@ -139,6 +140,11 @@ def measured(context: Context) -> BudgetImages:
     inputs = (trials, together, groups)
     pitch = next(iter(budget.experiment.instrument.cameras.values())).spec.line.pitch
     return BudgetImages(geometry, budget.radians_per_pixel, inputs, lines, grown, halved, causes, scatter, pitch, roll)
+
+
+def three_sigma(budget: ErrorBudget, cause: str) -> float:
+    """The input of a cause whose components are alike, SI."""
+    return 3.0 * budget.stated.of_causes((cause,)).components[0].sigma
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
