@@ -5,7 +5,7 @@ drawn from them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -308,10 +308,18 @@ def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: Callable[[
     for pattern, (name, k) in first.items():
         also = f", nor for {names_text(causes[pattern][1:])}" if causes[pattern][1:] else ""
         text = f"{instrument.spec.name} has no body of this name{also}"
-        meant, allowed = nearest(pattern, instrument.nodes), names_text(sorted(instrument.nodes))
+        meant, allowed = _nearest(pattern, instrument.nodes), names_text(sorted(instrument.nodes))
         issue = where(name, ("bodies", k))
         out.append(issue(text, found=pattern, allowed=allowed, suggestion=meant))
     return out
+
+
+def _nearest(pattern: str, nodes: Iterable[str]) -> str | None:
+    """What a pattern of no body was probably meant to be: with its stars, if that is the path of some body."""
+    parts = pattern.split("/")
+    alike = [path.split("/") for path in nodes if path.count("/") == pattern.count("/")]
+    starred = ["/".join("*" if p == "*" else q for p, q in zip(parts, path, strict=True)) for path in alike]
+    return nearest(pattern, dict.fromkeys(starred)) or nearest(pattern, nodes)
 
 
 def _of_cause(
@@ -390,7 +398,7 @@ def _correlation(
             count = len({c.body for c in own})
             allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
             text = "bodies cannot all move against one another so much"
-            return matrix, [where(name, ("together",))(text, found=f"{cause.together:g}", allowed=allowed)]
+            return matrix, [where(name, ("together",))(text, found=cause.together, allowed=allowed)]
     known = {c.name: k for k, c in enumerate(own)}
     said: dict[tuple[int, int], float] = {}
     for n, group in enumerate(cause.correlations):
@@ -408,15 +416,17 @@ def _correlation(
             value = group.table[i][j]
             before = said.setdefault((min(at[i], at[j]), max(at[i], at[j])), value)
             if before != value:
-                text = f"{group.between[i]} and {group.between[j]} have a correlation already"
-                issues.append(where(name, key)(text, found=f"{value:g} and {before:g}", allowed="one of them"))
+                text = f"{group.between[i]} and {group.between[j]} have a correlation already, {before:g}"
+                issues.append(where(name, key)(text, found=value, allowed="one of them"))
         matrix[np.ix_(at, at)] = np.array(group.table)
     least = _least(matrix)
     if not issues and least < _INDEFINITE:
-        text = "these correlations cannot be, alone or with those before them: the matrix is not positive definite"
+        text = (
+            "these correlations cannot be, alone or with those before them: the matrix is not positive definite, an "
+            f"eigenvalue is {least:.3g}"
+        )
         issue = where(name, ("correlations", _first_impossible(cause, known)))
-        allowed = "correlations of real quantities: smaller ones"
-        issues.append(issue(text, found=f"an eigenvalue of {least:.3g}", allowed=allowed))
+        issues.append(issue(text, allowed="correlations of real quantities: smaller ones"))
     return matrix, issues
 
 

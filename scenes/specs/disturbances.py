@@ -205,8 +205,8 @@ class CauseSpec(Spec):
 
 
 class CauseChangeSpec(Spec):
-    """What a job says of a cause in place of the disturbances file, number by number; a cause that the file does not have
-    needs all that a cause needs.
+    """What a job says of a cause in place of the disturbances file, number by number; a cause that the file does not
+    have needs all that a cause needs.
 
     Attributes:
         bodies, shift, rotate, scale, figure, temperature, index_gradient, pivot, together, correlations, time, reason:

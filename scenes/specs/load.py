@@ -24,7 +24,7 @@ from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import read_yaml
+from scenes.yaml.yaml_file import is_file, read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
 
@@ -239,7 +239,7 @@ def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
         meant = nearest(reference, library_names(folder))
         problem, allowed = f"no such name in {folder}", _names_and_paths(folder)
         raise owner.error(problem, key, found=reference, allowed=allowed, suggestion=meant)
-    if not path.is_file():
+    if not is_file(path):
         meant = nearest(path.stem, library_names(folder))
         raise owner.error(f"no such file: {path}", key, allowed=_names_and_paths(folder), suggestion=meant)
     return path

@@ -134,7 +134,11 @@ class Vector:
 
     def _check_length(self, value: object) -> object:
         if isinstance(value, str):
-            value = split_row(value, self.length) or ([value] * self.length if self.alike else value)
+            row = split_row(value, self.length)
+            if row is None and self.alike:
+                self.of.parse(value)  # what is wrong with it is said once
+                row = [value] * self.length
+            value = row or value
         if isinstance(value, list | tuple) and len(value) == self.length:
             return value
         example = ", ".join([self.of.kind.example] * self.length)

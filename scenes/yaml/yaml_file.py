@@ -123,8 +123,9 @@ def _styled(value: Any) -> Any:
         if not any(isinstance(item, dict | list) for item in items):
             items.fa.set_flow_style()
         return items
-    # Text that would be read as a number or a word such as null has to stand in quotes.
-    if isinstance(value, str) and (value in _WORDS or not isinstance(_number_or_text(value), str)):
+    # Text that would be read as a number or a word such as null has to stand in quotes; `[M?]`, too, for readers of
+    # YAML 1.1, to which ? means a key.
+    if isinstance(value, str) and (value in _WORDS or "?" in value or not isinstance(_number_or_text(value), str)):
         return DoubleQuotedScalarString(value)
     return value
 
@@ -153,6 +154,14 @@ def read_text(path: str | Path) -> str:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise InputError(Issue(f"not UTF-8 text: byte 0x{content[error.start]:02x}", file, line)) from None
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; there is none of a name that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _file_beside(path: Path) -> str | None:

@@ -159,6 +159,20 @@ def _renders() -> Iterator[Case]:
     for target in own:
         stem = Path(target).stem
         yield Case(f"render-own-{stem}", render, (), own, target, quick)
+    changes = """disturbances:
+  file: ./own.yaml
+  without: [CAUSE]
+  causes:
+    added: {bodies: base/*/M?, shift: [1 um, 0 um, 2 um], figure: {Z5: 2 nm}, together: 0.2, time: {drift: 6 h},
+      correlations: [{between: [base/forward/M1 shift x, base/forward/M1 shift z], correlation: -0.5}], reason: added}
+"""
+    for stem in ("orbit", "launch", "paper_001"):
+        text = _text(f"library/disturbances/{stem}.yaml")
+        cause = text.partition("causes:")[2].split(":")[0].strip().splitlines()[-1].strip()
+        job = _text("examples/aligned.yaml") + changes.replace("CAUSE", cause)
+        own = {"job.yaml": job, "own.yaml": text}
+        yield Case(f"render-disturbances-{stem}", render, (), own, "own.yaml", quick)
+    yield Case("render-disturbances-job", render, (), own, "job.yaml", quick)
     yield _config("render-config", render, "", resolve, "examples/targets.yaml", options=quick, weight=0.5)
 
 

@@ -118,9 +118,11 @@ class RenderRun:
 
     @cached_property
     def consistency(self) -> Consistency | None:
-        """Do the shifts agree with the stated disturbances? None where none are stated."""
+        """Do the shifts agree with the stated disturbances? None where none are stated, and where shifts have no noise:
+        a body that is stated to stand still would then be a contradiction by rounding.
+        """
         stated = self.experiment.disturbances
-        if stated is None:
+        if stated is None or not np.any(self.recovery.shift_covariance):
             return None
         others: dict[str, list[np.ndarray]] = {}
         for k, table in enumerate(self.crosstalk.values()):

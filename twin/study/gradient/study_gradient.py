@@ -240,9 +240,12 @@ class Asked:
 
     @property
     def roots(self) -> set[str]:
-        """Files of the results that it needs; those with a spread of noise need images."""
+        """Files of the results that it needs; what depends on the noise needs images: sigmas, and whether shifts agree
+        with the stated disturbances.
+        """
         keys: list[KeyPath] = [key for key in (self.spec.key, self.spec.minus) if key is not None]
-        return {"image" if "sigma" in str(key[-1]) else str(key[0]) for key in keys}
+        noisy = [key[:2] == ("recovered", "disturbances") or "sigma" in str(key[-1]) for key in keys]
+        return {"image" if of_noise else str(key[0]) for key, of_noise in zip(keys, noisy, strict=True)}
 
 
 @dataclass(eq=False)

@@ -20,7 +20,7 @@ from scenes.specs.study_factor import FactorSpec, Scalar
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
 from scenes.yaml.spec import Source, Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
+from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, is_file, parse_yaml, read_yaml
 from twin.run.versions import source_digest, versions
 from twin.study.runs.base_job import BaseJob
 from twin.study.runs.config_tree import Tree, with_place, with_values
@@ -28,6 +28,9 @@ from twin.study.runs.jobs import base_job
 
 WHERE = {"render": EXAMPLES, "lab": SCENES / LAB, "orbit": SCENES / ORBIT}
 """First word of a base's command -> folder of the library with its files."""
+BY_NAME = ("instrument", "disturbances")
+"""Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
+"""
 DATA_ONLY = ("name", "description", "limits", "report")
 """Keys of a study that change no number of it."""
 
@@ -174,7 +177,7 @@ def _base_file(study: StudySpec) -> Path:
     text, folder = study.base.file, WHERE[study.base.command.split()[0]]
     if "/" in text or text.endswith((".yaml", ".yml")):
         path = Path(study.source.file).parent / text
-        if not path.is_file():
+        if not is_file(path):
             raise study.error(f"no such file: {path}", ("base", "file"))
         return path
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -194,17 +197,26 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
     for name, factor in study.factors.items():
         for k, place in enumerate(factor.places):
             try:
+                _refuse_names(study, place)
                 tree = with_place(tree, model, place)
             except Problem as problem:
                 raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
         for k, scale in enumerate(factor.scales):
             try:
+                _refuse_names(study, scale.key)
                 tree = with_place(tree, model, scale.key)
             except Problem as problem:
                 raise setup.error(problem, ("factors", name, "scales", k, "key")) from None
     # an entry that was made for one factor may need another factor's value to be valid
     tree = with_values(tree, [(place, f.scalars()[-1]) for f in study.factors.values() for place in _unset(tree, f)])
     return StudySetup(study, tree)
+
+
+def _refuse_names(study: StudySpec, place: KeyPath) -> None:
+    """Refuse a factor that would change the name of a file that has been read. Raises Problem."""
+    if study.base.command == "render" and place[:1] == ("job",) and place[1:2] and place[1] in BY_NAME:
+        text = "the file that stands here has been read, its contents are what can be varied"
+        raise Problem(text, key_text(place), f"a key that begins with {place[1]}, without job", within=(0,))
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:

@@ -1,0 +1,419 @@
+"""Disturbances as files say them: what they come to on an instrument, what a job says instead, and what is refused."""
+
+import re
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from optics.thermal.heat import Temperature
+from scenes.models.disturbances import StatedMotions, motions_of_spec, state_of, stated_motions
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.thermal_model import ThermalModel
+from scenes.specs.disturbances import DisturbancesSpec
+from scenes.specs.load import DISTURBANCES, INSTRUMENTS, LIBRARY, library_names, load_disturbances
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import parse_yaml
+from tests.robustness.cases import Reached, cut
+from twin.render import app
+
+MIRRORS = [f"base/{camera}/M{k}" for camera in ("forward", "backward") for k in (1, 2, 3)]
+HEAD = "name: own\ncauses:\n"
+
+
+@pytest.fixture(scope="module")
+def pair(backend):
+    resolved = resolve(LIBRARY.parent / "examples/aligned.yaml")
+    return build_instrument(resolved.instrument, resolved.cameras, backend)
+
+
+def spec(causes: str, head: str = HEAD) -> DisturbancesSpec:
+    """Of a file's text, from line 3 on."""
+    return validate(DisturbancesSpec, parse_yaml(head + causes, "own.yaml"))
+
+
+def stated(pair, causes: str) -> StatedMotions:
+    return motions_of_spec(spec(causes), pair)
+
+
+def command(folder, job: str, own: str = "", instrument: str = "") -> tuple[int, str]:
+    """Exit code (-1: it would begin to compute) and message of the main command on files of one's own."""
+    (folder / "job.yaml").write_text(job)
+    (folder / "own.yaml").write_text(own)
+    if instrument:
+        (folder / "other.yaml").write_text(instrument)
+    with cut(soon=False):
+        try:
+            result = CliRunner().invoke(app, [str(folder / "job.yaml"), "--out", str(folder / "out")])
+        except Reached:
+            return -1, ""
+    if isinstance(result.exception, Reached):
+        return -1, ""
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, " ".join(result.output.split())
+
+
+# --- what is stated ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", library_names(DISTURBANCES))
+@pytest.mark.parametrize("instrument", library_names(INSTRUMENTS))
+def test_every_file_is_of_every_instrument_of_the_library(backend, name, instrument, tmp_path) -> None:
+    (tmp_path / "job.yaml").write_text(f"instrument: {instrument}\ndisturbances: {name}\n")
+    resolved = resolve(tmp_path / "job.yaml")
+    built = build_instrument(resolved.instrument, resolved.cameras, backend)
+    found = stated_motions(resolved, built)
+    assert {c.cause for c in found.components} == set(resolved.disturbances.causes)
+    assert found.correlation.shape == (len(found.components),) * 2
+    assert np.all(found.sigma > 0.0)
+
+
+def test_names_units_and_the_number_of_sigmas(pair) -> None:
+    text = """
+  a: {bodies: base/*/M?, shift: [0 um, 0 um, 3 um], figure: {Z5: 6 nm}, reason: r}
+  b: {bodies: base/central_prism, temperature: {change: 0.3 K, gradient: 30 mK/m}, reason: r}
+  d: {bodies: base/forward/monitor/left/prism_0, index_gradient: 9e-7 1/m, reason: r}
+  c: {bodies: [base/forward, base/backward], scale: 3 ppm, rotate: 3 arcsec, time: {drift: 6 h}, reason: r}
+"""
+    found = motions_of_spec(spec(text.lstrip("\n"), "sigmas: 3\n" + HEAD), pair)
+    names = [c.name for c in found.components]
+    assert names[:4] == [f"{m} {what}" for m in MIRRORS[:2] for what in ("shift z", "figure Z5")]
+    assert names[12:19] == [
+        *(f"base/central_prism {what}" for what in ("temperature", "gradient x", "gradient y", "gradient z")),
+        *(f"base/forward/monitor/left/prism_0 index_gradient {axis}" for axis in "xyz"),
+    ]
+    assert {(c.what, c.unit, round(c.sigma / c.unit_size, 9)) for c in found.components} == {
+        ("shift z", "um", 1.0),
+        ("figure Z5", "nm", 2.0),
+        ("temperature", "K", 0.1),
+        ("scale", "ppm", 1.0),
+        *((f"gradient {axis}", "mK/m", 10.0) for axis in "xyz"),
+        *((f"index_gradient {axis}", "ppm/m", 0.3) for axis in "xyz"),
+        *((f"rotate {axis}", "arcsec", 1.0) for axis in "xyz"),
+    }
+    assert {c.pivot for c in found.components if c.kind == "shift"} == {"centre"}
+    assert [law.text for law in found.laws[-1:]] == ["drift 6 h"]
+
+
+def test_one_number_for_all_axes_and_three(pair) -> None:
+    one, three, row = (
+        stated(pair, f"  a: {{bodies: base/forward/M2, shift: {text}, reason: r}}\n")
+        for text in ("2 um", "[2 um, 2 um, 2 um]", "2 2 2 um")
+    )
+    assert one.components == three.components == row.components
+    assert len(one.components) == 3
+
+
+def test_draws_have_the_stated_covariance(pair) -> None:
+    """Together, single correlations in place of it, and a number that is zero; 1e5 draws, each entry within 5 sigma."""
+    text = """
+  a:
+    bodies: [base/forward/M1, base/forward/M2, base/forward/M3]
+    shift: [1 um, 0 um, 2 um]
+    together: 0.5
+    correlations: [{between: [base/forward/M1 shift x, base/forward/M1 shift z], correlation: -0.6},
+                   {between: [base/forward/M1 shift x, base/forward/M2 shift x], correlation: 0.1}]
+    reason: r
+"""
+    found = stated(pair, text.lstrip("\n"))
+    assert len(found.components) == 6
+    expected = np.eye(6)
+    for i, j in ((0, 2), (0, 4), (2, 4), (1, 3), (1, 5), (3, 5)):
+        expected[i, j] = expected[j, i] = 0.5
+    expected[0, 1] = expected[1, 0] = -0.6
+    expected[0, 2] = expected[2, 0] = 0.1
+    np.testing.assert_array_equal(found.correlation, expected)
+    count = 100_000
+    drawn = found.draw(np.random.default_rng(4), count) / found.sigma
+    np.testing.assert_allclose(drawn.T @ drawn / count, expected, atol=5.0 * np.sqrt(2.0 / count))
+
+
+def test_correlations_may_be_possible_only_together(pair) -> None:
+    """Two strong ones of three are impossible while the third is unsaid, and its order does not matter."""
+    pairs = [("x", "y"), ("y", "z"), ("x", "z")]
+    between = [
+        f"{{between: [base/forward/M2 shift {a}, base/forward/M2 shift {b}], correlation: 0.9}}" for a, b in pairs
+    ]
+    cause = "  a: {{bodies: base/forward/M2, shift: 1 um, reason: r, correlations: [{}]}}\n"
+    np.testing.assert_allclose(stated(pair, cause.format(", ".join(between))).correlation, 0.1 * np.eye(3) + 0.9)
+    with pytest.raises(InputError, match="not positive definite"):
+        stated(pair, cause.format(", ".join(between[:2])))
+
+
+def test_a_standard_deviation_may_be_set_to_zero_where_it_is_correlated(pair) -> None:
+    between = "[{between: [base/forward/M2 shift x, base/forward/M2 shift y], correlation: 0.9}]"
+    found = stated(pair, f"  a: {{bodies: base/forward/M2, shift: 1 0 1 um, correlations: {between}, reason: r}}\n")
+    assert [c.what for c in found.components] == ["shift x", "shift z"]
+    np.testing.assert_array_equal(found.correlation, np.eye(2))
+
+
+def test_states_add_what_several_causes_do_to_a_body(pair) -> None:
+    """Heat adds in the body's frame before the thermal model, motions act one on the other."""
+    text = """
+  a: {bodies: base/central_prism, temperature: {change: 1 K, gradient: 0 0 20 mK/m}, shift: 0 0 1 um, reason: r}
+  b: {bodies: base/central_prism, temperature: {change: 2 K}, shift: 0 0 2 um, reason: r}
+"""
+    found, thermal = stated(pair, text.lstrip("\n")), ThermalModel(pair)
+    state = state_of(found.sigma, found.components, thermal)
+    warm = thermal.state({"base/central_prism": Temperature(3.0, (0.0, 0.0, 0.02))})
+    # the second shift is in the frame of what has grown by 0.5 ppm/K
+    assert state["base/central_prism"].shift[2] - warm["base/central_prism"].shift[2] == pytest.approx(3e-6, rel=1e-5)
+    assert state["base/central_prism"].stretch == pytest.approx(warm["base/central_prism"].stretch, rel=1e-9)
+
+
+# --- what a job says instead ------------------------------------------------------------------------------------------
+
+
+def test_a_job_changes_single_numbers(tmp_path) -> None:
+    job = """instrument: gf7_pair
+disturbances:
+  file: orbit
+  without: [base_heat]
+  causes:
+    mirror_figure: {figure: {Z5: 9 nm, Z11: 1 nm}}
+    central_prism_heat: {temperature: {change: 0.5 K}, time: white}
+    settling: {bodies: base/forward/focal_plane, shift: 1 um, reason: a test of vibration}
+"""
+    (tmp_path / "job.yaml").write_text(job)
+    plain, found = load_disturbances("orbit"), resolve(tmp_path / "job.yaml").disturbances
+    assert list(found.causes) == [name for name in plain.causes if name != "base_heat"] + ["settling"]
+    changed = found.causes["mirror_figure"]
+    assert {t: round(v * 1e9, 9) for t, v in changed.figure.items()} == {
+        "Z4": 2.0,
+        "Z5": 9.0,
+        "Z6": 2.0,
+        "Z7": 2.0,
+        "Z8": 2.0,
+        "Z11": 1.0,
+    }
+    assert changed.reason == plain.causes["mirror_figure"].reason
+    heat = found.causes["central_prism_heat"]
+    assert (heat.temperature.change, heat.temperature.gradient[0]) == (0.5, pytest.approx(0.04))
+    assert heat.time.text == "white"
+    assert found.causes["settling"].correlations == ()
+    same = {name for name, cause in plain.causes.items() if found.causes.get(name) == cause}
+    assert set(plain.causes) - same == {"base_heat", "mirror_figure", "central_prism_heat"}
+
+
+def test_a_config_reads_back_to_the_same(tmp_path, backend) -> None:
+    """New causes, changed ones, correlations and laws; twice, and to the same motions."""
+    job = """instrument: gf7_pair
+disturbances:
+  causes:
+    mirror_mounts: {together: 0.3, time: {period: 95 min}}
+    mirror_figure: {figure: {Z5: 9 nm}}
+    new:
+      bodies: [base/forward/M1, base/backward/M1]
+      shift: 1 um
+      correlations:
+        - {between: [base/forward/M1 shift x, base/backward/M1 shift y], matrix: [[1, -0.2], [-0.2, 1]]}
+      reason: why not
+"""
+    (tmp_path / "job.yaml").write_text(job)
+    first = resolve(tmp_path / "job.yaml")
+    (tmp_path / "config.yaml").write_text(first.to_yaml())
+    second = resolve(tmp_path / "config.yaml")
+    assert second == first
+    assert second.to_yaml() == first.to_yaml()
+    assert hash(second) == hash(first)
+    built = build_instrument(first.instrument, first.cameras, backend)
+    one, two = (stated_motions(resolved, built) for resolved in (first, second))
+    assert one.components == two.components
+    assert one.laws == two.laws
+    np.testing.assert_array_equal(one.correlation, two.correlation)
+
+
+def test_a_config_without_disturbances_states_none(tmp_path) -> None:
+    """As runs before there were any have it."""
+    (tmp_path / "job.yaml").write_text("instrument: gf7_pair\n")
+    data = yaml.safe_load(resolve(tmp_path / "job.yaml").to_yaml())
+    del data["disturbances"], data["instrument"]["disturbances"]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(data))
+    assert resolve(tmp_path / "config.yaml").disturbances is None
+
+
+def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
+    def named(text: str):
+        (tmp_path / "job.yaml").write_text(f"instrument: gf7_pair\ndisturbances: {text}\n")
+        return resolve(tmp_path / "job.yaml").disturbances
+
+    assert named("none") is None
+    assert named("launch") == named("{file: launch}") == load_disturbances("launch")
+    assert named("{}") == load_disturbances("orbit")
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+JOB = "instrument: gf7_pair\n\ndisturbances: ./own.yaml\n"
+M2 = "bodies: base/forward/M2"
+CORRELATED = f"  a: {{{M2}, shift: 1 um, reason: r, correlations: [{{between: [base/forward/M2 shift x, BETWEEN]"
+OF_FILE = {
+    "negative": (f"  a: {{{M2}, shift: -1 um, reason: r}}", "shift", "outside the limits; found '-1 um'"),
+    "negative term": (f"  a: {{{M2}, figure: {{Z5: -1 nm}}, reason: r}}", "figure.Z5", "at least 0 um"),
+    "missing": (f"  a: {{{M2}, reason: r}}", "a: a cause without any standard deviation", "at least one of shift"),
+    "empty": (f"  a: {{{M2}, shift: , rotate: 1 arcsec, reason: r}}", "a.shift: nothing stands here", "leave the key"),
+    "empty term": (f"  a: {{{M2}, figure: {{Z5: }}, reason: r}}", "figure.Z5", "nm"),
+    "one of three": (f"  a: {{{M2}, shift: [1 um, 2 um], reason: r}}", "shift", "3 times"),
+    "no reason": (f"  a: {{{M2}, shift: 1 um}}", "a.reason", "'reason' is missing"),
+    "unit": (f"  a: {{{M2}, shift: 1 arcsec, reason: r}}", "a.shift", "um"),
+    "no unit": (f"  a: {{{M2}, scale: 1, reason: r}}", "a.scale", "ppm"),
+    "not finite": (f"  a: {{{M2}, shift: .nan um, reason: r}}", "a.shift", "um"),
+    "key": (f"  a: {{{M2}, shifts: 1 um, reason: r}}", "a.shifts: unknown key", "did you mean 'shift'"),
+    "term": (f"  a: {{{M2}, figure: {{Z99: 1 nm}}, reason: r}}", "Z99", "not a Zernike term"),
+    "body": ("  a: {bodies: base/forwrd/M2, shift: 1 um, reason: r}", "a.bodies[0]", "mean 'base/forward/M2'"),
+    "pattern": ("  a: {bodies: [base/*/M2, base/*/mirror?], shift: 1 um, reason: r}", "a.bodies[1]", "has no body"),
+    "no bodies": ("  a: {bodies: [], shift: 1 um, reason: r}", "a.bodies", "at least 1 item"),
+    "prism": ("  a: {bodies: base/*/monitor/*/prism_90, rotate: 1 arcsec, reason: r}", "a.bodies[0]", "prism_"),
+    "motion": ("  a: {bodies: base/*/M?, scale: 1 ppm, reason: r}", "a.scale", "M1, as 5 more, does not allow scale"),
+    "heat of a face": (
+        "  a: {bodies: base/*/monitor/*/prism_0/exit, temperature: {gradient: 1 mK/m}, reason: r}",
+        "a.temperature",
+        "does not allow temperature; allowed: figure, rotate, shift",
+    ),
+    "index of a mirror": (f"  a: {{{M2}, index_gradient: 1e-9 1/m, reason: r}}", "a.index_gradient", "does not allow"),
+    "pivot": (f"  a: {{{M2}, pivot: center, rotate: 1 arcsec, reason: r}}", "a.pivot", "did you mean 'centre'"),
+    "together": ("  a: {bodies: base/*/M?, shift: 1 um, together: -0.5, reason: r}", "a.together", "at least -0.2 "),
+    "together too much": ("  a: {bodies: base/*/M?, shift: 1 um, together: 1.5, reason: r}", "a.together", "at most 1"),
+    "component": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shft y") + ", correlation: 0.1}]}",
+        "a.correlations[0].between[1]: no component of a",
+        "did you mean 'base/forward/M2 shift y'",
+    ),
+    "component twice": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shift x") + ", correlation: 0.1}]}",
+        "a.correlations[0].between",
+        "named twice",
+    ),
+    "neither": (CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + "}]}", "correlations[0]", "one of"),
+    "not symmetric": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", matrix: [[1, 0.2], [0.3, 1]]}]}",
+        "a.correlations[0].matrix[1][0]",
+        "symmetric; found 0.3 and 0.2",
+    ),
+    "not ones": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", matrix: [[1, 0.2], [0.2, 0.9]]}]}",
+        "a.correlations[0].matrix[1][1]",
+        "ones on its diagonal",
+    ),
+    "size": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", matrix: [[1, 0.2, 0], [0.2, 1, 0]]}]}",
+        "a.correlations[0].matrix",
+        "2 rows of 2 numbers",
+    ),
+    "indefinite": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y, base/forward/M2 shift z") + ", correlation: -0.6}]}",
+        "a.correlations[0]",
+        "not positive definite, an eigenvalue is -0.2",
+    ),
+    "said twice": (
+        CORRELATED.replace("BETWEEN", "base/forward/M2 shift y") + ", correlation: 0.1}, {between: "
+        "[base/forward/M2 shift y, base/forward/M2 shift x], correlation: 0.2}]}",
+        "a.correlations[1]",
+        "have a correlation already, 0.1; found 0.2",
+    ),
+    "law": (f"  a: {{{M2}, shift: 1 um, time: pink, reason: r}}", "a.time.kind", "white, constant"),
+    "two laws": (f"  a: {{{M2}, shift: 1 um, time: {{kind: white, drift: 1 h}}, reason: r}}", "a.time", "no law of"),
+    "no law": (f"  a: {{{M2}, shift: 1 um, time: {{}}, reason: r}}", "a.time", "{drift: 6 h}"),
+    "no time": (f"  a: {{{M2}, shift: 1 um, time: {{drift: 0 h}}, reason: r}}", "a.time.drift", "greater than zero"),
+    "wrong time": (f"  a: {{{M2}, shift: 1 um, time: {{period: 3 K}}, reason: r}}", "a.time.period", "min"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", OF_FILE)
+def test_what_a_file_says_wrong(tmp_path, case) -> None:
+    """One message with the file's own line, and nothing is written."""
+    cause, key, told = OF_FILE[case]
+    code, text = command(tmp_path, JOB, f"name: own\n\n\ncauses:\n{cause}\n")
+    assert code == 2
+    assert "own.yaml:5: causes" in text, text
+    assert text.count("own.yaml:") == 1, text
+    assert key in text
+    assert told in text
+    assert not (tmp_path / "out").exists()
+
+
+OF_JOB = {
+    "no such file": ("orbitt", "no such name in disturbances", "did you mean 'orbit'"),
+    "no such file at all": ("nowhere/at_all.yaml", "no such file", "launch, orbit, paper_001, none"),
+    "no cause left out": ("{file: orbit, without: [mirror_heat]}", "disturbances.without[0]: no such cause", "mirror_"),
+    "left out twice": ("{without: [base_heat, base_heat]}", "disturbances.without[1]", "left out twice"),
+    "changed and left out": (
+        "{without: [base_heat], causes: {base_heat: {time: white}}}",
+        "disturbances.without[0]",
+        "both changed and left out",
+    ),
+    "unknown cause": ("{causes: {mirror_mount: {shift: 1 um}}}", "causes.mirror_mount", "did you mean 'mirror_mounts'"),
+    "nothing to change": ("{file: none, without: [base_heat]}", "no disturbances file that could be", "name of"),
+    "key": ("{cause: {mirror_mounts: {shift: 1 um}}}", "disturbances.cause: unknown key", "did you mean 'causes'"),
+    "change of body": (
+        "{causes: {mirror_mounts: {bodies: base/*/M9}}}",
+        "disturbances.causes.mirror_mounts.bodies[0]: gf7_pair has no body",
+        "did you mean 'base/*/M3'? Found 'base/*/M9'",
+    ),
+    "other body, same motions": (
+        "{causes: {mirror_figure: {bodies: base/*/focal_plane}}}",
+        "disturbances.causes.mirror_figure.bodies: figure of mirror_figure: base/forward/focal_plane, as 1 more,",
+        "does not allow figure",
+    ),
+    "negative": ("{causes: {mirror_mounts: {shift: -1 um}}}", "causes.mirror_mounts.shift", "outside the limits"),
+    "empty": ("{causes: {mirror_mounts: {shift: }}}", "mirror_mounts.shift: nothing stands here", "leave the key out"),
+    "motion": ("{causes: {mirror_mounts: {scale: 1 ppm}}}", "causes.mirror_mounts.scale", "does not allow scale"),
+    "together": ("{causes: {mirror_mounts: {together: -0.9}}}", "causes.mirror_mounts.together", "at least -0.2"),
+    "correlations": (
+        "{causes: {mirror_mounts: {correlations: [{between: [a, b], correlation: 0.1}]}}}",
+        "causes.mirror_mounts.correlations[0].between[0]",
+        "no component of mirror_mounts",
+    ),
+    "of a new one": (
+        "{causes: {new: {bodies: base/*/M?, scale: 1 ppm, reason: r}}}",
+        "disturbances.causes.new.scale",
+        "does not allow scale",
+    ),
+    "not a mapping": ("[orbit]", "disturbances", "not a mapping"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", OF_JOB)
+def test_what_a_job_says_wrong(tmp_path, case) -> None:
+    """Told at the job's line, also where it changes what a file says."""
+    value, key, told = OF_JOB[case]
+    code, text = command(tmp_path, f"instrument: gf7_pair\n\ndisturbances: {value}\n")
+    assert code == 2
+    assert "job.yaml:3: disturbances" in text, text
+    assert key in text, text
+    assert told in text, text
+    assert not re.search(r"/(orbit|own)\.yaml:\d", text)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(tmp_path) -> None:
+    """Cameras of other names: the file that the instrument names is of another one."""
+    instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
+    instrument = instrument.replace("backward", "nadir")
+    code, text = command(tmp_path, "instrument: ./other.yaml\n", "", instrument)
+    assert code == 2
+    assert text.count("orbit.yaml:") == 1
+    assert "gf7_pair has no body of this name, nor for camera_mounts" in text
+    assert "'base/backward'" in text
+    assert command(tmp_path, "instrument: ./other.yaml\ndisturbances: none\n", "", instrument)[0] == -1
+
+
+def test_heat_of_a_glass_without_known_index_is_refused(tmp_path) -> None:
+    instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8").replace("fused silica", "Zerodur")
+    assert "Zerodur" in instrument
+    code, text = command(tmp_path, "instrument: ./other.yaml\n", "", instrument)
+    assert code == 2
+    assert "orbit.yaml:" in text
+    assert "temperature" in text
+    assert "a glass with known dn/dT" in text
+
+
+def test_a_name_that_no_file_can_have(tmp_path) -> None:
+    name = "n" * 300
+    code, text = command(tmp_path, f"instrument: gf7_pair\n\ndisturbances: ./{name}.yaml\n")
+    assert code == 2
+    assert "job.yaml:3: disturbances" in text
+    assert "no such file" in text
