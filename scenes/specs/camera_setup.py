@@ -15,7 +15,7 @@ from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names, load_camera, 
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.yaml.spec import Name, Paths, Source, Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, is_file, read_yaml
 
 ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run with one"
 
@@ -61,7 +61,7 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
         InputError: the file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
     """
     text = str(file)
-    if "/" not in text and not text.endswith((".yaml", ".yml")) and not Path(text).is_file():
+    if "/" not in text and not text.endswith((".yaml", ".yml")) and not is_file(Path(text)):
         return _of_library(text, name)
     yaml = read_yaml(file)
     data = yaml.data if isinstance(yaml.data, dict) else {}

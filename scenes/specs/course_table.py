@@ -22,7 +22,7 @@ from scenes.yaml.units import (
     Kind,
     parse_quantity,
 )
-from scenes.yaml.yaml_file import YamlFile, read_text
+from scenes.yaml.yaml_file import YamlFile, is_file, read_text
 
 TIME = "time"
 AXES = ("x", "y", "z")
@@ -70,7 +70,7 @@ def with_table(job: JobSpec) -> JobSpec:
     if job.course is None or job.course.table is None:
         return job
     path = Path(job.source.file).parent / job.course.table
-    if not path.is_file():
+    if not is_file(path):
         raise job.course.error(f"no such file: {path}", ("table",), allowed="a CSV file, relative to this file")
     course = _read(path, job.course)
     problem = pivot_problem(job.perturb, course)

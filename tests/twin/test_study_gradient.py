@@ -44,6 +44,12 @@ def without(setup: StudySetup, file: str) -> StudySetup:
     return StudySetup(setup.study.model_copy(update={"responses": FrozenMap(kept)}), setup.tree)
 
 
+def without_noise(setup: StudySetup) -> StudySetup:
+    """The study without responses that depend on the noise."""
+    kept = {name: setup.study.responses[name] for name in ("df", "height")}
+    return StudySetup(setup.study.model_copy(update={"responses": FrozenMap(kept)}), setup.tree)
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     return write_study(tmp_path_factory.mktemp("gradient"), text=STUDY)
@@ -114,6 +120,48 @@ def test_what_needs_images_is_by_the_whole_job(small, backend):
     assert np.isfinite(found.differences[8, 0])
 
 
+OF_STATED = """name: study
+base: {command: render, file: job.yaml}
+factors:
+  m2z: {key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 1 um}}
+  stated: {key: [disturbances, causes, mirror_mounts, shift, 2], uniform: [0.2 um, 0.4 um]}
+design: {kind: monte_carlo, runs: 4, seed: 3}
+responses:
+  df: {key: [recovered, cameras, forward, posterior, d_f_um]}
+  height: {key: [recovered, ground, posterior, height_m]}
+  total: {key: [recovered, cameras, forward, model, d_f_um_sigma]}
+  agreement: {key: [recovered, disturbances, chi_square]}
+"""
+
+
+def test_readings_by_posterior_are_differentiated(tmp_path, backend):
+    """By motions through the trace; by what is stated with differences, and so is all that depends on the noise."""
+    # about a state that is moved: there a change of what is stated changes the reading
+    path = write_study(tmp_path, text=OF_STATED)
+    job = tmp_path / "job.yaml"
+    job.write_text(job.read_text("utf-8") + "perturb: {base/forward/M2: {shift: 0 0 1 um}}\n", "utf-8")
+    found = study_gradient(resolve_study(path), backend)
+    assert found.method[8:10].tolist() == [[AD, TRACED]] * 2
+    assert found.method[10:].tolist() == [[WHOLE] * 2] * 2
+    assert found.worst < AGREEMENT
+    assert np.all(np.isfinite(found.best))
+    # a more likely motion of the mirror takes more of the shifts upon itself
+    assert abs(found.best[8, 1]) > 0.0
+    assert found.best[10, 1] > 0.0
+
+
+def test_what_is_stated_of_one_body_alone_has_a_gradient(tmp_path, backend):
+    """Without noise three motions explain eight coordinates or they do not; no matrix of theirs has an inverse."""
+    path = write_study(tmp_path, text=OF_STATED.replace("mirror_mounts", "one"))
+    own = "name: own\ncauses: {one: {bodies: base/forward/M2, shift: 0.3 um, reason: a test}}\n"
+    (tmp_path / "own.yaml").write_text(own, "utf-8")
+    job = tmp_path / "job.yaml"
+    job.write_text(job.read_text("utf-8") + "disturbances: ./own.yaml\n", "utf-8")
+    setup = resolve_study(path)
+    found = study_gradient(without_noise(setup), backend)
+    assert found.worst < AGREEMENT
+
+
 def test_images_say_the_same(small, backend, numbers):
     """The whole job, images and noise included, through steps that move spots by some 0.5 px.
 
@@ -126,7 +174,7 @@ def test_images_say_the_same(small, backend, numbers):
     ends = [Run(k, ((key, f"{amount!r} arcsec"),), None) for k, amount in enumerate((-10.0, 10.0))]
     low, high = setup.job.evaluate(setup.tree, ends, backend)
     at = [run["recovered"]["cameras"]["forward"]["paper_single"] for run in (low, high)]
-    sigma = np.hypot(*(one["d_gamma_arcsec_sigma"] for one in at)) / 20.0
+    sigma = np.hypot(*(one["d_gamma_arcsec_sigma_noise"] for one in at)) / 20.0
     exact = numbers["ad"][numbers["responses"].index("gamma")][numbers["factors"].index("turn")]
     assert sigma < 5e-3
     assert abs((at[1]["d_gamma_arcsec"] - at[0]["d_gamma_arcsec"]) / 20.0 - exact) < 5.0 * sigma

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from scenes.specs.job import PerturbationSpec
+from scenes.specs.resolved import resolve
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_path import MonitorPath
@@ -175,7 +177,72 @@ def test_other_keys_than_motions(study, backend) -> None:
     place = ("instrument", "monitor", "reticle", "photons_per_frame")
     runs = [Run(k, ((place, value),), 7) for k, value in enumerate((4e6, 1e6))]
     one, two = study.setup.job.evaluate(study.setup.tree, runs, backend)
-    sigma = [o["recovered"]["cameras"]["forward"]["model"]["d_f_um_sigma"] for o in (one, two)]
+    sigma = [o["recovered"]["cameras"]["forward"]["model"]["d_f_um_sigma_noise"] for o in (one, two)]
     # shot noise alone would give 2; read-out and fixed pattern noise change it a little
     assert 1.5 < sigma[1] / sigma[0] < 2.6
     assert np.isfinite(sigma).all()
+
+
+def test_what_is_stated_to_move_may_be_varied(tmp_path, backend, monkeypatch) -> None:
+    """One number on all axes: readings of `posterior` and total sigmas of all estimators are those of a job that says
+    it by hand; noise is not touched.
+    """
+    text = """name: study
+base: {command: render, file: job.yaml}
+factors:
+  heat:
+    keys:
+      - [disturbances, causes, prism_180_heat, temperature, gradient, 0]
+      - [disturbances, causes, prism_180_heat, temperature, gradient, 1]
+      - [disturbances, causes, prism_180_heat, temperature, gradient, 2]
+    values: [1 mK/m, 30 mK/m]
+  m2z: {key: [job, perturb, base/forward/M2, shift, 2], values: [2 um]}
+design: {kind: grid}
+responses:
+  df:
+    key: [recovered, cameras, forward, posterior, d_f_um]
+    sigma: [recovered, cameras, forward, posterior, d_f_um_sigma]
+  total: {key: [recovered, cameras, forward, model, d_f_um_sigma]}
+  noise: {key: [recovered, cameras, forward, model, d_f_um_sigma_noise]}
+"""
+    setup = resolve_study(write_study(tmp_path, text=text))
+    plan = Plan.of(setup)
+    outcomes = setup.job.evaluate(setup.tree, [plan.run(k) for k in range(2)], backend)
+    check_responses(setup, outcomes[0])
+    df, total, noise = (
+        [leaf(outcome, setup.study.responses[name].key) for outcome in outcomes] for name in ("df", "total", "noise")
+    )
+    assert total[1] > 2.0 * total[0] > 10.0 * noise[0]
+    assert noise[1] == pytest.approx(noise[0], rel=0.05)
+    assert df[0] != pytest.approx(df[1], rel=0.01)
+    for k, (outcome, amount) in enumerate(zip(outcomes, ("1 mK/m", "30 mK/m"), strict=True)):
+        job = {
+            "instrument": str(tmp_path / "small.yaml"),
+            "perturb": {"base/forward/M2": {"shift": "0 0 2 um"}},
+            "disturbances": {"causes": {"prism_180_heat": {"temperature": {"gradient": amount}}}},
+            "render": {"frames": 1, "seed": plan.run(k).seed or 1},
+        }
+        (tmp_path / "hand.yaml").write_text(dump_yaml(job), "utf-8")
+        by_hand = render_job(resolve(tmp_path / "hand.yaml"), backend).recovered_dict()
+        # single precision of a study's images: a hundredth of the noise
+        for estimator in ("model", "posterior"):
+            one, two = (r["cameras"]["forward"][estimator] for r in (outcome["recovered"], by_hand))
+            assert one["d_f_um"] == pytest.approx(two["d_f_um"], abs=0.02 * two["d_f_um_sigma_noise"])
+            assert one["d_f_um_sigma"] == pytest.approx(two["d_f_um_sigma"], rel=1e-3)
+
+
+@pytest.mark.parametrize("key", ["[job, disturbances, causes, mirror_mounts, shift, 0]", "[job, instrument]"])
+def test_a_name_of_a_file_that_was_read_is_no_factor(tmp_path, key) -> None:
+    """Its contents stand elsewhere in the base, and a change of the name would go unnoticed."""
+    with pytest.raises(
+        InputError, match=r"study.yaml:4: factors.m2z.key\[0\]: .*begins with (disturb|instr).*, without"
+    ):
+        resolve_study(write_study(tmp_path, ("[job, perturb, base/forward/M2, shift, 2]", key)))
+
+
+def test_what_is_stated_of_another_instrument_is_told_before_any_run(tmp_path, backend) -> None:
+    setup = resolve_study(write_study(tmp_path))
+    causes = {"mine": {"bodies": ["base/aft/M?"], "shift": ["1 um"] * 3, "reason": "r"}}
+    tree = {**setup.tree, "disturbances": {"name": "mine", "causes": causes}}
+    with pytest.raises(InputError, match=r"disturbances.causes.mine.bodies\[0\]: small has no body"):
+        setup.job.check(tree, backend)

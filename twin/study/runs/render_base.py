@@ -200,7 +200,7 @@ def _truth_of(truth: Truth, i: int) -> Truth:
         )
         for name, change in truth.cameras.items()
     }
-    return replace(truth, cameras=cameras, angle_change=truth.angle_change[one])
+    return replace(truth, cameras=cameras, angle_change=truth.angle_change[one], lines=truth.lines[:, [0, i + 1]])
 
 
 BLOCK = 25
