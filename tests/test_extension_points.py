@@ -25,6 +25,8 @@ import twin.render
 import twin.validate
 from analysis.monitor import monitoring, recovery
 from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.estimators import Estimator, OfEachCamera, Shifts
 from analysis.monitor.monitoring import PARAMETERS, MonitorGeometry
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import gaussian_fit, mean_frames
@@ -36,6 +38,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Motion, State
 from optics.geometry.vector_shape import Polygon
 from optics.materials.material import material
+from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import assemble
@@ -78,8 +81,10 @@ from twin.run.page import RunFacts, write_test
 from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
+from twin.study.gradient.study_gradient import study_gradient
 from twin.study.report.study_report import write_report
 from twin.study.runs.block_result import BlockResult
+from twin.study.runs.engine import check_responses
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
@@ -258,7 +263,7 @@ def test_an_unknown_noise_is_told_with_file_line_key_and_remedy(tmp_path: Path) 
 
 # --- estimator, target, report section, format of frames --------------------------------------------------------------
 
-ESTIMATORS = "analysis.monitor.recovery.ESTIMATORS"
+ESTIMATORS = "analysis.monitor.estimators.ESTIMATORS"
 TARGETS = "optics.targets.target_shapes.TARGETS"
 SECTIONS = "twin.run.further_sections.SECTIONS"
 FRAMES = "twin.run.data_files.FRAME_FORMATS"
@@ -266,9 +271,25 @@ BAR = (8, 60)
 """Width and length of the toy target, pixels."""
 
 
-HALF = recovery.Estimator(
-    "half", "half of what derived says", lambda camera: 0.5 * monitoring.coefficients("derived", camera.geometry)
-)
+class Half(OfEachCamera):
+    """Half of what the corrected formulas say."""
+
+    title = "half"
+    note = "half of what derived says"
+
+    def camera_gain(self, camera: CameraCalibration, covariance: np.ndarray) -> np.ndarray:
+        return 0.5 * monitoring.coefficients("derived", camera.geometry)
+
+
+class Nothing(Estimator):
+    """No camera has changed, whatever the spots say, where something is stated."""
+
+    title = "nothing"
+    note = "that nothing has changed"
+    stated = True
+
+    def gain(self, shifts: Shifts) -> np.ndarray:
+        return np.zeros_like(shifts.covariance)
 
 
 def one_bar(pitch: float, region: int) -> Target:
@@ -295,7 +316,7 @@ def turned(count: int) -> dict[str, np.ndarray]:
     start = generator.uniform(40.0, 60.0, (count, 4, 2))
     roots = generator.normal(0.0, 1e-3, (count, 2, 4, 4))
     joint = roots @ np.swapaxes(roots, -1, -2) + 1e-7 * np.eye(4)
-    return {"start": start, "end": start + generator.normal(0.0, 0.3, start.shape), "joint": joint}
+    return {"start": start, "end": start + generator.normal(0.0, 0.3, start.shape), "covariance": joint}
 
 
 def calibrations() -> dict[str, CameraCalibration]:
@@ -306,21 +327,75 @@ def calibrations() -> dict[str, CameraCalibration]:
     return {name: CameraCalibration(geometry, look, jacobian, changes, motions) for name, look in looks.items()}
 
 
+def three_motions() -> Disturbances:
+    """Of the first camera, the second, and both."""
+    generator = np.random.default_rng(5)
+    names = ("one", "two", "both")
+    return Disturbances(
+        "toys",
+        names,
+        names,
+        names,
+        np.ones(3),
+        ("um",) * 3,
+        generator.normal(0.0, 0.2, (8, 3)),
+        generator.normal(0.0, 1e-6, (8, 3)),
+        np.eye(3),
+        (TimeLaw(),) * 3,
+    )
+
+
 @extends(ESTIMATORS)
 def test_an_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of what ``derived`` reads, with half of its sigma, for every camera and for the angle between them."""
-    without = recovery.estimates(**turned(5), cameras=calibrations())
-    add(monkeypatch, ESTIMATORS, "half", HALF)
+    """Half of what ``derived`` reads, with half of its noise, for every camera and for the angle between them; in the
+    total sigma stands the other half, which it misses.
+    """
+    without = recovery.estimates(**turned(5), cameras=calibrations()).parameters
+    add(monkeypatch, ESTIMATORS, "half", Half())
+    add(monkeypatch, ESTIMATORS, "nothing", Nothing())
     found = recovery.estimates(**turned(5), cameras=calibrations())
-    assert list(found["forward"]) == [*without["forward"], "half"]
-    for camera, estimators in found.items():
-        np.testing.assert_allclose(estimators["half"].vector, 0.5 * estimators["derived"].vector, rtol=1e-13)
-        np.testing.assert_allclose(estimators["half"].sigma, 0.5 * estimators["derived"].sigma, rtol=1e-13)
+    assert list(found.parameters["forward"]) == [*without["forward"], "half"]
+    for camera, estimators in found.parameters.items():
+        half, derived = estimators["half"], estimators["derived"]
+        np.testing.assert_allclose(half.vector, 0.5 * derived.vector, rtol=1e-13)
+        np.testing.assert_allclose(half.sigma, 0.5 * derived.sigma, rtol=1e-13)
         for name, other in without[camera].items():
             np.testing.assert_array_equal(estimators[name].vector, other.vector)
-    angles = recovery.angles(found, calibrations())
+    angles = found.angle
     # to first order; the exact formula departs by products of angles of 1e-6, and of the turn of 1e-5
     np.testing.assert_allclose(angles["half"].change_rad, 0.5 * angles["derived"].change_rad, rtol=1e-3)
+    stated = three_motions()
+    total = recovery.estimates(**turned(5), cameras=calibrations(), disturbances=stated).parameters
+    assert list(total["forward"]) == [*without["forward"], "posterior", "half", "nothing"]
+    both = ("forward", "backward")
+    prior = np.sqrt(np.diag(stated.parameter_covariance))
+    np.testing.assert_allclose(np.concatenate([total[c]["nothing"].sigma[0] for c in both]), prior, rtol=1e-12)
+    half, derived = (np.concatenate([total[c][name].sigma_noise for c in both], -1) for name in ("half", "derived"))
+    np.testing.assert_allclose(half, 0.5 * derived, rtol=1e-13)
+    for name in ("half", "derived", "model"):
+        assert np.all(np.concatenate([total[c][name].sigma - total[c]["posterior"].sigma for c in both]) > 0.0)
+
+
+def test_an_estimator_of_a_study(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its readings and sigmas are responses of a study, and a study's gradient goes through it."""
+    add(monkeypatch, ESTIMATORS, "half", Half())
+    text = """name: study
+base: {command: render, file: job.yaml}
+factors: {m2z: {key: [job, perturb, base/forward/M2, shift, 2], values: [2 um]}}
+design: {kind: grid}
+responses:
+  half: {key: [recovered, cameras, forward, half, d_f_um], sigma: [recovered, cameras, forward, half, d_f_um_sigma]}
+  derived: {key: [recovered, cameras, forward, derived, d_f_um]}
+"""
+    setup = resolve_study(write_study_file(tmp_path, text=text))
+    (outcome,) = setup.job.evaluate(setup.tree, [Plan.of(setup).run(0)], load_backend())
+    check_responses(setup, outcome)
+    forward = outcome["recovered"]["cameras"]["forward"]
+    assert forward["half"]["d_f_um"] == pytest.approx(0.5 * forward["derived"]["d_f_um"], rel=1e-12)
+    gradient = study_gradient(setup, load_backend())
+    half, derived = (gradient.ad[gradient.responses.index(name), 0] for name in ("half", "derived"))
+    assert half == pytest.approx(0.5 * derived, rel=1e-9)
+    assert abs(derived) > 1.0
 
 
 def bar_size(image: np.ndarray) -> tuple[float, float]:
@@ -404,7 +479,7 @@ def test_an_output_format_of_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_all_of_them_in_one_run_of_the_main_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the command, with one camera whose focal plane moves."""
     add(monkeypatch, NOISE, "two_levels", TwoLevels)
-    add(monkeypatch, ESTIMATORS, "half", HALF)
+    add(monkeypatch, ESTIMATORS, "half", Half())
     add(monkeypatch, TARGETS, "one_bar", one_bar)
     add(monkeypatch, SECTIONS, ("render", "brightest"), brightest)
     add(monkeypatch, FRAMES, "npy", as_npy)
@@ -413,6 +488,12 @@ def test_all_of_them_in_one_run_of_the_main_job(tmp_path: Path, monkeypatch: pyt
     instrument["name"], instrument["cameras"] = "single", {"one": instrument["cameras"]["forward"]}
     instrument["monitor"]["area_ccd"] |= {"rows": 48, "columns": 48, "detector": "noisy.yaml"}
     del instrument["baffles"]
+    instrument["disturbances"] = "./stated.yaml"
+    stated = "name: stated\ncauses:\n  one: {bodies: base/one, rotate: 5 arcsec, shift: 5 um, reason: a test}\n"
+    stated += "  mirrors: {bodies: base/one/M?, shift: 1 um, reason: a test}\n"
+    (tmp_path / "stated.yaml").write_text(
+        stated + "  prisms: {bodies: base/one/monitor/*/prism_0, rotate: 1 arcsec, reason: a test}\n"
+    )
     (tmp_path / "single.yaml").write_text(yaml.safe_dump(instrument), "utf-8")
     (tmp_path / "job.yaml").write_text(
         "instrument: single.yaml\n"
@@ -439,9 +520,10 @@ def test_all_of_them_in_one_run_of_the_main_job(tmp_path: Path, monkeypatch: pyt
     assert abs(camera["derived"]["d_gamma_arcsec"]) > 10.0
     for key in PARAMETERS:
         # files state values to a millionth of their sigma
-        within = 1e-5 * camera["derived"][f"{key}_sigma"]
-        for name in (key, f"{key}_sigma"):
+        within = 1e-5 * camera["derived"][f"{key}_sigma_noise"]
+        for name in (key, f"{key}_sigma_noise"):
             assert camera["half"][name] == pytest.approx(0.5 * camera["derived"][name], abs=within)
+        assert camera["half"][f"{key}_sigma"] > camera["posterior"][f"{key}_sigma"] * (1.0 - 1e-9)
     for row in read(folder, "crosstalk")["one"]["motions"]:
         for key in PARAMETERS:
             assert row["half"][key] == pytest.approx(0.5 * row["derived"][key], rel=1e-9, abs=1e-12)

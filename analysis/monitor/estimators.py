@@ -23,7 +23,7 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 
-__all__ = ["ESTIMATORS", "Estimator", "Formula", "LeastSquares", "Posterior", "Shifts", "applicable"]
+__all__ = ["ESTIMATORS", "Estimator", "Formula", "LeastSquares", "OfEachCamera", "Posterior", "Shifts", "applicable"]
 
 Array = NDArray[np.float64]
 COORDINATES = 4
