@@ -24,7 +24,9 @@ from typer._click.exceptions import MissingParameter
 
 from docs.site.command_pages import parser, programs
 from docs.site.spec_examples import accepted, examples
+from scenes.models.disturbances import motions_of_spec
 from scenes.schema import MODELS
+from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
@@ -142,6 +144,8 @@ def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument) -> None:
     if models[0] is JobSpec:
         job = validate(JobSpec, parse_yaml(block.text))
         check_nodes(job, instrument(job.instrument).nodes)
+    if models[0] is DisturbancesSpec:
+        motions_of_spec(validate(DisturbancesSpec, parse_yaml(block.text)), instrument("gf7_pair"))
 
 
 @pytest.mark.parametrize("block", tables(), ids=str)

@@ -17,6 +17,7 @@ READ_BY = {
     "camera": "`python -m twin.camera FILE`; instruments, tests and designs, which name it: `camera: gf7`",
     "camera_design": "`python -m twin.design FILE`",
     "detector": "instruments, bands of cameras and lines of payloads, which name it: `detector: monitor_ccd`",
+    "disturbances": "jobs, instruments and error budgets, which name it: `disturbances: orbit`",
     "error_budget": "`python -m twin.validate --only 001.table3,001.table4,001.table5`",
     "principle_experiment": "`python -m twin.validate --only 001.table2`",
     "focus_test": "`python -m twin.lab focus FILE`",
@@ -30,7 +31,7 @@ READ_BY = {
     "study": "`python -m twin.study FILE`",
 }
 """Sort of file -> what reads it."""
-ORDER = ("job", "instrument", "camera", "detector", "study", "camera_design")
+ORDER = ("job", "instrument", "disturbances", "camera", "detector", "study", "camera_design")
 """Sorts that stand first in the list, what a new user meets first."""
 
 
