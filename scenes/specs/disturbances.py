@@ -5,7 +5,7 @@ The estimator `posterior` and the total sigmas of all others rest on this statem
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -13,7 +13,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import Term, moment
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Named, Number, OneOf, Reference, Spec, Text
+from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text
 from scenes.yaml.units import (
     ANGLE,
     LENGTH,
@@ -77,7 +77,7 @@ class TimeLawSpec(Spec):
         period: it comes back with, seconds.
     """
 
-    kind: Annotated[str, OneOf(lambda: ("white", "constant"))] | None = None
+    kind: Literal["white", "constant"] | None = None
     drift: Span | None = None
     period: Span | None = None
 
@@ -107,13 +107,16 @@ def _some_paths(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
+BodyPattern = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 BodyPatterns = Annotated[
-    tuple[Annotated[str, Field(strict=True, min_length=1, max_length=200)], ...],
-    BeforeValidator(_some_paths),
+    tuple[BodyPattern, ...],
     Field(min_length=1),
+    BeforeValidator(_some_paths, json_schema_input_type=BodyPattern | tuple[BodyPattern, ...]),
 ]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
-TimeLaw = Annotated[TimeLawSpec, BeforeValidator(_law)]
+TimeLaw = Annotated[
+    TimeLawSpec, BeforeValidator(_law, json_schema_input_type=Literal["white", "constant"] | TimeLawSpec)
+]
 MOVES = ("shift", "rotate", "scale", "figure", "temperature", "index_gradient")
 """Keys of a cause that hold standard deviations."""
 
@@ -209,8 +212,8 @@ class CauseChangeSpec(Spec):
     have needs all that a cause needs.
 
     Attributes:
-        bodies, shift, rotate, scale, figure, temperature, index_gradient, pivot, together, correlations, time, reason:
-            as of a cause.
+        bodies, shift, rotate, scale, figure, temperature, index_gradient: as of a cause.
+        pivot, together, correlations, time, reason: as of a cause.
     """
 
     bodies: Annotated[BodyPatterns | None, STATED] = None
@@ -320,4 +323,6 @@ def _named(value: Any) -> Any:
     return {"file": value} if isinstance(value, str) else value
 
 
-JobDisturbances = Annotated[JobDisturbancesSpec, BeforeValidator(_named)]
+JobDisturbances = Annotated[
+    JobDisturbancesSpec, BeforeValidator(_named, json_schema_input_type=Reference | JobDisturbancesSpec)
+]

@@ -28,6 +28,7 @@ FOLDERS = {
     "library/budgets": "error_budget",
     "library/cameras": "camera",
     "library/detectors": "detector",
+    "library/disturbances": "disturbances",
     "library/instruments": "instrument",
     "library/payloads": "three_line_camera",
     "orbit/angle": "orbit_angle",

@@ -149,7 +149,7 @@ NODE = "  base/forward/M2: "
             2,
             ["not one of the choices", "did you mean 'gaussian'?"],
         ),
-        ("- 1", 1, ["not a mapping", "instrument, perturb, course, render, analysis"]),
+        ("- 1", 1, ["not a mapping", "instrument, perturb, course, disturbances, render, analysis"]),
         ("just text", 1, ["not a mapping"]),
     ],
 )

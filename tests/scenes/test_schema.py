@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from scenes.schema import MODELS, json_schema, main, shipped_nodes, with_nodes, write_schemas
-from scenes.specs.load import EXAMPLES, INSTRUMENTS, library_names
+from scenes.specs.load import DISTURBANCES, EXAMPLES, INSTRUMENTS, LIBRARY, library_names
 from scenes.yaml.units import (
     ANGLE,
     KINDS,
@@ -128,6 +128,18 @@ def test_the_schema_of_jobs_knows_the_nodes_of_shipped_instruments(nodes) -> Non
     assert problems(schema, {"instrument": "own.yaml", **FAULTS["node"]}) == 0
     for path in (EXAMPLES / name for name in ("perturb.yaml", "orbit.yaml", "targets.yaml", "steady.yaml")):
         assert problems(schema, read_yaml(path).data) == 0, path
+
+
+def test_short_ways_of_writing_are_no_mistakes_to_an_editor() -> None:
+    job, own = json_schema("job"), json_schema("disturbances")
+    for said in ("orbit", "none", {"file": "orbit", "without": ["base_heat"]}, {"causes": {"a": {"time": "white"}}}):
+        assert problems(job, {"instrument": "gf7_pair", "disturbances": said}) == 0, said
+    assert problems(job, {"instrument": "gf7_pair", "disturbances": {"fil": "orbit"}}) > 0
+    for path in (LIBRARY / DISTURBANCES).glob("*.yaml"):
+        assert problems(own, read_yaml(path).data) == 0, path
+    cause = {"bodies": "base/*/M?", "shift": "1 um", "reason": "r"}
+    for fault in ({"time": "pink"}, {"shift": "1 arcsec"}, {"bodies": 3}, {"together": 2}, {"shifts": "1 um"}):
+        assert problems(own, {"name": "a", "causes": {"a": {**cause, **fault}}}) > 0, fault
 
 
 def test_an_editor_completes_what_the_instrument_has(nodes) -> None:
