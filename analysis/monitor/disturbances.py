@@ -133,6 +133,19 @@ class Disturbances:
         kept = np.array([float(law.correlation(np.array(gap))) for law in self.laws])
         return self.scaled(np.sqrt(2.0 * (1.0 - kept)))
 
+    def best_gain(self, noise: Array) -> Array:
+        """Parameters per pixel of the best linear unbiased prediction, B C A' (A C A' + R)^-1, (..., 4 K, D).
+
+        Args:
+            noise: R, (..., D, D) of the shifts, px^2.
+        """
+        across = self.parameters @ self.correlation @ self.spots.T
+        spread = self.spot_covariance + noise
+        if np.any(noise):
+            return np.asarray(np.swapaxes(np.linalg.solve(spread, across.T), -1, -2))
+        # without noise, what moves no spot has no say; spots move by pixels for one standard deviation
+        return np.asarray(across @ np.linalg.pinv(spread, rcond=1e-13, hermitian=True))
+
     def error_root(self, gain: Array) -> Array:
         """What is left of the motions in an estimate: (gain A - B) root, (..., 4 K, M).
 

@@ -170,12 +170,7 @@ class Posterior(Estimator):
         stated = shifts.disturbances
         if stated is None:
             raise ValueError("posterior: needs stated disturbances")
-        across = stated.parameters @ stated.correlation @ stated.spots.T
-        spread = stated.spot_covariance + shifts.covariance
-        if np.any(shifts.covariance):
-            return np.swapaxes(np.linalg.solve(spread, across.T), -1, -2)
-        # without noise, what moves no spot has no say; spots move by pixels for one standard deviation
-        return np.asarray(across @ np.linalg.pinv(spread, rcond=1e-13, hermitian=True))
+        return stated.best_gain(shifts.covariance)
 
 
 ESTIMATORS: dict[str, Estimator] = {

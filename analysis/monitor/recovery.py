@@ -19,7 +19,16 @@ from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
-__all__ = ["CENTROIDS", "Estimates", "Recovery", "estimates", "estimates_of", "measure_spots", "recover"]
+__all__ = [
+    "CENTROIDS",
+    "Estimates",
+    "Recovery",
+    "estimates",
+    "estimates_of",
+    "joint",
+    "measure_spots",
+    "recover",
+]
 
 Array = NDArray[np.float64]
 CENTROIDS = ("ml", "gaussian", "energy")

@@ -24,6 +24,9 @@ _FLUX_SIGMAS = 5.0
 _NEAR_PX = 32
 _NEAR_STEPS = 2
 
+EDGE_PX = 10.0
+"""Least distance of a spot's centre from the outermost pixel centres."""
+
 
 def maximum_likelihood_fit(
     mean: ArrayLike,
@@ -31,7 +34,7 @@ def maximum_likelihood_fit(
     noise: NoiseModel,
     template: SpotTemplate,
     index: NDArray[np.intp] | None = None,
-    edge_px: float = 10.0,
+    edge_px: float = EDGE_PX,
     weights: str = "total",
     keep_maps: bool = True,
     threads: int = 1,

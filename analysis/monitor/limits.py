@@ -1,0 +1,293 @@
+"""What limits the readings of a monitor: the variance of every quantity before and after the measurement, motion by
+motion; the motions that spots see least; and what further measurements would leave.
+
+With spots s = A x + noise, parameters p = B x, x ~ N(0, C) and a quantity q = r p, an estimate g s is wrong by
+(g A - r B) x + g noise. With e = g A - r B the share of motion i in the variance e C e' is e_i (C e)_i: the shares add
+up to the variance, and those of motions that go together can be negative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.ground_error import AXES, GroundGeometry
+from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.units import ARCSEC
+
+__all__ = [
+    "ANGLE_GROUP",
+    "GROUND_GROUP",
+    "LeastSeen",
+    "Quantity",
+    "Split",
+    "calibrated_sigma",
+    "extended",
+    "field_covariance",
+    "known_sigma",
+    "least_seen",
+    "posterior_sigma",
+    "quantities",
+    "split",
+]
+
+Array = NDArray[np.float64]
+ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
+ANGLE_KEY = "change_arcsec"
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """Something that is read, to first order a row on the parameters of all cameras.
+
+    Attributes:
+        group: a camera, ``intersection_angle`` or ``ground``.
+        key: in results, ends in its unit.
+        row: (4 K,) in that unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the other.
+    """
+
+    group: str
+    key: str
+    row: Array
+
+
+def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None) -> tuple[Quantity, ...]:
+    """All that is read of an instrument: every parameter; of a pair the intersection angle; where its altitude is
+    known the errors at the middle of the line on the ground.
+
+    Args:
+        cameras: by name, in the order of the spots.
+        ground: of a pair.
+    """
+    count = len(PARAMETERS)
+    unit = np.eye(count * len(cameras))
+    out = [
+        Quantity(name, key, PER_SI[k] * unit[count * c + k])
+        for c, name in enumerate(cameras)
+        for k, key in enumerate(PARAMETERS)
+    ]
+    if len(cameras) == 2:
+        first, second = (camera.look_rad for camera in cameras.values())
+        # positive where the lines of sight open: the forward one's d_alpha minus the other's
+        sign = 1.0 if first > second else -1.0
+        out.append(Quantity(ANGLE_GROUP, ANGLE_KEY, sign * (unit[0] - unit[count]) / ARCSEC))
+    if ground is not None:
+        one, two = (camera.geometry.focal_length_m for camera in cameras.values())
+        rows = ground.rows((one, two))
+        out += [Quantity(GROUND_GROUP, f"{axis}_m", row) for axis, row in zip(AXES, rows[len(rows) // 2], strict=True)]
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """The variance of Q quantities by the M stated motions.
+
+    Attributes:
+        before: (Q, M) shares without any measurement, units of the quantities squared.
+        after: (Q, M) shares of what an estimator makes wrong; negative ones are possible where motions go together.
+        noise: (Q,) what the noise of the images adds to ``after``.
+    """
+
+    before: Array
+    after: Array
+    noise: Array
+
+    @property
+    def sigma_before(self) -> Array:
+        """(Q,) standard deviations without a measurement."""
+        return np.sqrt(self.before.sum(axis=1))
+
+    @property
+    def sigma(self) -> Array:
+        """(Q,) of the estimate's error."""
+        return np.sqrt(self.after.sum(axis=1) + self.noise)
+
+    @staticmethod
+    def by(shares: Array, names: Sequence[str]) -> dict[str, Array]:
+        """Shares summed over the motions of one name each, (Q,); in the order of the names' first mention.
+
+        Args:
+            shares: (Q, M).
+            names: (M,), for example their bodies.
+        """
+        own = np.array(names)
+        return {name: shares[:, own == name].sum(axis=1) for name in dict.fromkeys(names)}
+
+
+def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split:
+    """The variance of quantities by motions, before a measurement and after it.
+
+    Args:
+        rows: (Q, 4 K) of the quantities.
+        stated: what moves.
+        noise: (D, D) of the shifts, px^2.
+        gain: (4 K, D) of an estimator.
+    """
+    prior, reading = rows @ stated.parameters, rows @ gain
+    error = reading @ stated.spots - prior
+    by_noise = np.einsum("qd,de,qe->q", reading, noise, reading)
+    return Split(prior * (prior @ stated.correlation), error * (error @ stated.correlation), by_noise)
+
+
+def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
+    """(Q,) standard deviations that the best linear unbiased prediction leaves.
+
+    Args:
+        rows: (Q, 4 K) of the quantities.
+        stated: what moves, with any number of spots.
+        noise: (D, D) of their shifts, px^2.
+    """
+    return split(rows, stated, noise, stated.best_gain(noise)).sigma
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSeen:
+    """The most likely motions by which a quantity is wrong by one sigma though all spots have been measured.
+
+    Attributes:
+        amounts: (M,) in standard deviations.
+        change: of the quantity, its posterior standard deviation.
+        spots: (D,) px by which the spots move with them.
+        noise: (D,) px, standard deviations of the measured shifts.
+    """
+
+    amounts: Array
+    change: float
+    spots: Array
+    noise: Array
+
+
+def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastSeen:
+    """The combination of motions that hides best from the spots and still changes a quantity.
+
+    With Q the posterior covariance of the motions and b = row B it is Q b / sqrt(b' Q b): of all combinations that
+    change the quantity by its posterior sigma the one of the largest posterior probability.
+
+    Args:
+        row: (4 K,) of the quantity.
+        stated: what moves.
+        noise: (D, D) of the shifts, px^2.
+    """
+    b = row @ stated.parameters
+    spread = stated.spot_covariance + noise
+    across = stated.spots @ stated.correlation  # (D, M)
+    direction = stated.correlation @ b - across.T @ np.linalg.lstsq(spread, across @ b, rcond=1e-13)[0]
+    change = float(np.sqrt(max(float(b @ direction), 0.0)))
+    if change > 0.0:
+        direction = direction / change
+    return LeastSeen(direction, change, stated.spots @ direction, np.sqrt(np.diagonal(noise)))
+
+
+def known_sigma(rows: Array, stated: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
+    """(G, Q) standard deviations that the best linear unbiased prediction leaves, if some motions were known exactly.
+
+    Args:
+        rows: (Q, 4 K) of the quantities.
+        stated: what moves.
+        noise: (D, D) of the shifts, px^2.
+        groups: G times the labels of motions that are known; those that go with them are then known better, too.
+    """
+    prior, c, labels = rows @ stated.parameters, stated.correlation, np.array(stated.labels)
+    both = np.concatenate([stated.spots, prior])
+    spread, count = both @ c @ both.T, len(noise)
+    spread[:count, :count] += noise
+    out = np.empty((len(groups), len(rows)))
+    for g, group in enumerate(groups):
+        own = np.isin(labels, group)
+        told = both @ c[:, own]
+        left = spread - told @ np.linalg.pinv(c[np.ix_(own, own)], hermitian=True) @ told.T
+        solved = np.linalg.solve(left[:count, :count], left[:count, count:])
+        variance = np.diagonal(left)[count:] - np.einsum("qd,dq->q", left[count:, :count], solved)
+        out[g] = np.sqrt(np.maximum(variance, 0.0))
+    return out
+
+
+def extended(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
+    """With further spots that are measured at the same time.
+
+    Args:
+        stated: what moves.
+        spots: (D', M) px for one standard deviation of the motions.
+        own: (M,) whether a body exists once more for the further spots, as the prisms of their channels do, and moves
+            there as much but independently.
+    """
+    apart = np.array(own, bool)
+    copies = np.flatnonzero(apart)
+    count, more = len(stated.labels), len(copies)
+    moved = np.zeros((len(stated.spots) + len(spots), count + more))
+    moved[: len(stated.spots), :count] = stated.spots
+    moved[len(stated.spots) :, :count] = np.where(apart, 0.0, spots)
+    moved[len(stated.spots) :, count:] = spots[:, copies]
+    correlation = np.zeros((count + more, count + more))
+    correlation[:count, :count] = stated.correlation
+    correlation[count:, count:] = stated.correlation[np.ix_(copies, copies)]
+
+    def with_copies(values: tuple[str, ...]) -> tuple[str, ...]:
+        return (*values, *(values[k] for k in copies))
+
+    laws: tuple[TimeLaw, ...] = (*stated.laws, *(stated.laws[k] for k in copies))
+    return Disturbances(
+        name=stated.name,
+        labels=with_copies(stated.labels),
+        bodies=with_copies(stated.bodies),
+        causes=with_copies(stated.causes),
+        sigmas=np.concatenate([stated.sigmas, stated.sigmas[copies]]),
+        units=with_copies(stated.units),
+        spots=moved,
+        parameters=np.concatenate([stated.parameters, np.zeros((len(stated.parameters), more))], axis=1),
+        correlation=correlation,
+        laws=laws,
+    )
+
+
+def field_covariance(
+    direction_rad: float, cameras: Mapping[str, CameraCalibration], half_field: Sequence[float]
+) -> Array:
+    """(4 K, 4 K) of parameters that points on the ground give, when they fix the directions of the line's middle and of
+    each half of the line against the other to some angle: d_gamma and d_f are that angle at the line's end.
+
+    Args:
+        direction_rad: standard deviation of a direction, rad.
+        cameras: by name.
+        half_field: tangent of half the field along the line, of each camera.
+    """
+    sigma = [
+        direction_rad * np.array([1.0, 1.0, 1.0 / t, camera.geometry.focal_length_m / t])
+        for camera, t in zip(cameras.values(), half_field, strict=True)
+    ]
+    return np.asarray(np.diag(np.concatenate(sigma) ** 2))
+
+
+def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Array, gap_s: float) -> Array:
+    """(Q,) standard deviations when a test field on the ground gave the parameters some time ago and the monitor
+    measured then as well as now: what is the same as then is known, what went on is not.
+
+    Args:
+        rows: (Q, 4 K) of the quantities.
+        stated: what moves, with its laws in time; motions that go together have the same one.
+        noise: (D, D) of the shifts, px^2, of each of the two measurements.
+        field: (4 K, 4 K) covariance of what the test field gives.
+        gap_s: since then, seconds.
+    """
+    kept = np.array([float(law.correlation(np.array(gap_s))) for law in stated.laws])
+    now, then = stated.correlation, stated.correlation * kept
+    a, b = stated.spots, stated.parameters
+    measured = np.concatenate([a, a, b])
+    parts = len(a), 2 * len(a)
+    old = np.arange(len(measured)) >= parts[0]
+    same = old[:, None] == old[None, :]
+    spread = np.where(same, measured @ now @ measured.T, measured @ then @ measured.T)
+    spread[: parts[0], : parts[0]] += noise
+    spread[parts[0] : parts[1], parts[0] : parts[1]] += noise
+    spread[parts[1] :, parts[1] :] += field
+    across = rows @ b @ np.where(old, then @ measured.T, now @ measured.T)
+    # pixels and radians side by side: solved in units of their own spread
+    unit = np.sqrt(np.diagonal(spread))
+    solved = np.linalg.solve(spread / (unit[:, None] * unit), (across / unit).T)
+    prior = np.einsum("qm,mn,qn->q", rows @ b, now, rows @ b)
+    return np.sqrt(np.maximum(prior - np.einsum("qd,dq->q", across / unit, solved), 0.0))
