@@ -53,6 +53,7 @@ RUNS = {
     "twin.study.gradient.study_gradient",
     "twin.study.gradient.gradient_numbers",
     "twin.study.study_files",
+    "twin.uncertainty.uncertainty_numbers",
 }
 """What computes where no procedure is made of it, and writes what was computed."""
 COMMANDS = {"analysis.mtf.__main__"}

@@ -17,6 +17,7 @@ from scenes.specs.load import (
     load_band_detectors,
     load_camera,
     load_detector,
+    load_disturbances,
     load_instrument,
     load_job,
     path_of_detector,
@@ -84,7 +85,10 @@ def resolve(path: str | Path) -> ResolvedJob:
 
 def resolve_job(job: JobSpec) -> ResolvedJob:
     """A job with all it refers to. Raises InputError as `resolve`."""
-    instrument = load_instrument(instrument_path(job))
+    return _with_instrument(job, load_instrument(instrument_path(job)))
+
+
+def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     files = paths_of_cameras(instrument)
     cameras = {mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()}
     detector = load_detector(path_of_detector(instrument))
@@ -115,6 +119,35 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
         text = "an error budget is one of disturbances"
         raise budget.error(text, ("disturbances",), found=budget.disturbances, allowed="the name of a file of them")
     return resolved
+
+
+def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJob:
+    """A job, or an instrument to which nothing happens, with all it refers to.
+
+    Args:
+        file: of a job or an instrument, the config.yaml of a run, or the name of an instrument in the library.
+        disturbances: name in the library or path of a disturbances file, in place of what is stated; None for that.
+
+    Raises:
+        InputError: as `resolve`; there is no such instrument or no such disturbances file.
+    """
+    text = str(file)
+    named = "/" not in text and not text.endswith((".yaml", ".yml")) and not Path(text).is_file()
+    if named or "monitor" in _keys(file):
+        instrument = load_instrument(text if named else Path(text))
+        job = JobSpec.model_validate({"instrument": text})
+        resolved = _with_instrument(job, instrument)
+    else:
+        resolved = resolve(file)
+    if disturbances is None:
+        return resolved
+    return resolved.model_copy(update={"disturbances": load_disturbances(disturbances)})
+
+
+def _keys(file: str | Path) -> tuple[str, ...]:
+    """What a file says something of, at its top."""
+    data = read_yaml(file).data
+    return tuple(data) if isinstance(data, dict) else ()
 
 
 def target_band(camera: CameraSpec) -> str:

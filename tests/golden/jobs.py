@@ -81,6 +81,7 @@ ALL = (
     _job("render_course", f"twin.render {RUN % 'course'} --json"),
     _job("render_stray", f"twin.render {RUN % 'stray'}"),
     _job("render_refused", f"twin.render {RUN % 'bad'}"),
+    _job("uncertainty", "twin.uncertainty gf7_pair --states 4 --seed 5 --out {out}"),
     _job("lab_focus", f"twin.lab focus {RUN % 'focus'} --seed 5"),
     _job("lab_distortion", f"twin.lab distortion {RUN % 'distortion'}"),
     _job("lab_turntable", f"twin.lab turntable {RUN % 'turntable'} --json"),

@@ -31,6 +31,7 @@ from twin.run.run_folder import write_manifest
 from twin.targets.edge_images import DIRECTIONS
 from twin.targets.target_images import PLACES
 from twin.targets.target_result import EdgeReading, TargetRun
+from twin.uncertainty.uncertainty_report import limits_section
 
 DECIMALS = {"d_alpha_arcsec": 4, "d_beta_arcsec": 4, "d_gamma_arcsec": 3, "d_f_um": 2, ANGLE.key: 4}
 """Of a parameter in the terminal's table."""
@@ -72,7 +73,7 @@ def write_run(run: RenderRun, session: Session, picture: bool = False) -> str:
     session.advance(WRITE, 0, 1)
     write_data(run, folder)
     folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
-    sections = further_sections("render", run)
+    sections = (limits_section(run.limits), *further_sections("render", run))
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     folder.write_with("summary.png", lambda file: write_summary(run, file))
     problem = ""

@@ -17,6 +17,7 @@ from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_f
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun
+from twin.uncertainty.uncertainty_numbers import limits_numbers
 
 
 def write_data(run: RenderRun, folder: RunFolder) -> None:
@@ -33,6 +34,8 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
     recovered = recovered_numbers(run)
     for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
         _write_numbers(folder, kind, data)
+    if run.limits is not None:
+        _write_numbers(folder, "uncertainty", limits_numbers(run.limits))
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             facts = _spot_facts(run, channel, "nominal" if when == "before" else "perturbed")

@@ -26,6 +26,7 @@ from twin.monitor.time_series import TimeSeries
 from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
 from twin.targets.target_result import TargetRun
+from twin.uncertainty.monitor_limits import MonitorLimits, find_limits
 
 PROGRAM = "twin.render"
 
@@ -132,6 +133,11 @@ class RenderRun:
                 others.setdefault(motion.body, []).append(column)
         tables = {body: np.stack(columns, axis=1) for body, columns in others.items()}
         return self.recovery.consistency(stated, others=tables)
+
+    @cached_property
+    def limits(self) -> MonitorLimits | None:
+        """What limits the readings; None where nothing is stated to move."""
+        return find_limits(self.experiment, self.recovery.joint_covariance[0], self.frames)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""

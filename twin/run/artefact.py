@@ -169,24 +169,28 @@ class PngFigure(Artefact):
 class Table(Artefact):
     """A table for the report, and as CSV; heads carry the units.
 
-    ``decimals`` are those that the report shows of a column's numbers, None for six significant digits; the CSV holds
-    all digits.
+    ``decimals`` are those that the report shows of a column's numbers, None for so many significant ``digits``; the CSV
+    holds all digits.
     """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     decimals: Sequence[int | None] = ()
+    digits: int = 6
 
     def shown(self) -> list[list[Cell]]:
         """The rows as the report shows them."""
         places = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
         return [
             [
-                fixed(cell, place) if isinstance(cell, float) and place is not None else cell
+                self._text(cell, place) if isinstance(cell, float) else cell
                 for cell, place in zip(row, places, strict=True)
             ]
             for row in self.rows
         ]
+
+    def _text(self, value: float, place: int | None) -> str:
+        return significant(value, self.digits, floor=0.0) if place is None else fixed(value, place)
 
     @property
     def kind(self) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from optics.numerics.backend import Backend, load_backend
@@ -235,7 +236,7 @@ def print_report(report: Report, console: Console) -> None:
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(head, justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
-        table.add_row(*(cell_text(cell) for cell in row))
+        table.add_row(*(escape(cell_text(cell)) for cell in row))  # [m] is a unit
     print_whole(console, table)
     for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -47,6 +47,11 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "times_s": "seconds from the beginning of the course",
             "motions": "in the moved body's own nominal axes, about its pivot",
         },
+        "uncertainty": {
+            **_CHANGES,
+            "motion": "in the moved body's own nominal axes",
+            "spots_px": "left before right spot of every camera, of each row and column",
+        },
         "crosstalk": {"rows and columns": _CAMERA, "motions": "in the moved body's own nominal axes"},
         "stray": {"sources": "shares of light, of no frame", "detector": "by the name of the channel"},
         "quality": {"fields": "shares of half the line, +1 at its left end, +Y of the focal plane"},

@@ -1,0 +1,236 @@
+"""What limits a monitor, and whether its sigmas hold in images of random states: ``python -m twin.uncertainty``."""
+
+import json
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, chi2, t
+
+from analysis.monitor import limits as theory
+from analysis.monitor.ground_error import GroundGeometry
+from analysis.units import ARCSEC
+from optics.geometry.tree import Motion
+from optics.numerics.backend import load_backend
+from scenes.specs.job import JobSpec
+from scenes.specs.resolved import resolve_job
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import parse_yaml
+from tests.twin.commands import invoke
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import trace_truth
+from twin.uncertainty import __main__ as command
+from twin.uncertainty.coverage import FALSE, run_states
+from twin.uncertainty.monitor_limits import BEST, expected_covariance, find_limits
+from twin.uncertainty.uncertainty_report import limits_section
+
+INSTRUMENTS = ("gf7_pair", "monitor_pair")
+FRAMES = 9
+TOGETHER = """
+disturbances:
+  file: orbit
+  causes:
+    camera_mounts: {together: 0.9}
+    mirror_mounts: {together: 0.3}
+    prism_180_heat: {together: 0.6}
+    mirror_figure:
+      correlations:
+        - {between: [base/forward/M2 figure Z7, base/backward/M2 figure Z7], correlation: -0.8}
+        - {between: [base/forward/M2 figure Z7, base/forward/M2 figure Z4], correlation: 0.5}
+"""
+
+
+@cache
+def bench(instrument, disturbances):
+    """The experiment and its limits."""
+    told = disturbances if "\n" in disturbances else f"disturbances: {disturbances}\n"
+    resolved = resolve_job(validate(JobSpec, parse_yaml(f"instrument: {instrument}\n{told}", "job.yaml")))
+    experiment = MonitorExperiment(resolved, load_backend())
+    return experiment, find_limits(experiment, expected_covariance(experiment, FRAMES), FRAMES)
+
+
+def check_states(instrument, disturbances, count):
+    """Coverage, errors and chi-square of random states; false alarms ``FALSE`` in each of the three."""
+    experiment, limits = bench(instrument, disturbances)
+    found = run_states(experiment, limits.quantities, count, FRAMES, seed=11)
+    assert found.outliers == ()
+    n, every = found.measured, found.measured == count
+    tail = 0.5 * FALSE / (len(found.errors) * len(found.quantities))
+    for name in found.errors:
+        # sigmas of a reading are those of the limits, which no image was drawn for, but for a little noise
+        assert found.sigmas[name][0] == pytest.approx(limits.splits[name].sigma, rel=0.02)
+        if every or name == BEST:
+            square = n * found.ratio(name) ** 2
+            assert np.all((square > chi2.ppf(tail, n)) & (square < chi2.isf(tail, n))), (name, found.ratio(name))
+        if name != BEST:
+            # the mean difference of squared errors, state by state: nothing is better beyond chance
+            gap = found.errors[name] ** 2 - found.errors[BEST] ** 2
+            spread = gap.std(axis=0, ddof=1) / np.sqrt(n)
+            assert np.all(gap.mean(axis=0) > -t.isf(tail, n - 1) * spread), name
+    assert found.alarms <= found.alarm_limit
+    if every:
+        freedom, total = n * experiment.disturbances.spots.shape[0], float(np.sum(found.chi_square))
+        assert chi2.ppf(0.5 * FALSE, freedom) < total < chi2.isf(0.5 * FALSE, freedom)
+    return found
+
+
+def test_sigmas_hold_in_a_few_states():
+    found = check_states("gf7_pair", "orbit", 40)
+    assert set(found.errors) >= {"paper_single", "derived", "model", "posterior"}
+    # a sigma of the noise alone would not: it is a hundredth of the errors
+    _, limits = bench("gf7_pair", "orbit")
+    noise = np.sqrt(limits.splits[BEST].noise)
+    assert np.all(found.rms(BEST) > 20.0 * noise)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", INSTRUMENTS)
+@pytest.mark.parametrize("disturbances", ["orbit", "launch", TOGETHER], ids=["orbit", "launch", "together"])
+def test_sigmas_hold_in_images(instrument, disturbances):
+    check_states(instrument, disturbances, 500)
+
+
+def test_states_whose_spots_leave_their_ccd_are_left_out_and_counted():
+    """As often as the linear model says, within binomial limits."""
+    experiment, limits = bench("monitor_pair", "launch")
+    count = 40
+    found = run_states(experiment, limits.quantities, count, 1, seed=2)
+    lost = count - found.measured
+    assert limits.outside > 0.1
+    assert binom.ppf(1e-4, count, limits.outside) <= lost <= binom.isf(1e-4, count, limits.outside)
+    assert len(found.chi_square) == found.measured == len(found.truth)
+
+
+def test_states_do_not_depend_on_how_many_are_drawn_at_once(monkeypatch):
+    experiment, limits = bench("gf7_pair", "orbit")
+    whole = run_states(experiment, limits.quantities, 6, 1, seed=3)
+    monkeypatch.setattr("twin.uncertainty.coverage.CHUNK", 4)
+    parts = run_states(experiment, limits.quantities, 6, 1, seed=3)
+    np.testing.assert_array_equal(whole.truth, parts.truth)
+    np.testing.assert_array_equal(whole.errors[BEST], parts.errors[BEST])
+    other = run_states(experiment, limits.quantities, 6, 1, seed=4)
+    assert np.all(other.errors[BEST] != whole.errors[BEST])
+
+
+def test_shares_add_up_to_the_variance_and_known_motions_take_theirs_away():
+    for disturbances in ("orbit", TOGETHER):
+        _, limits = bench("gf7_pair", disturbances)
+        for name, split in limits.splits.items():
+            for q in range(len(limits.quantities)):
+                lines = limits.lines(name, q)
+                total = sum(share for _, share in lines) + split.noise[q] / split.sigma[q] ** 2
+                assert total == pytest.approx(1.0, rel=1e-9)
+                assert sum(share for _, share in limits.lines("", q)) == pytest.approx(1.0, rel=1e-9)
+        now = limits.splits[BEST].sigma
+        for left in limits.known.values():
+            assert np.all(left <= now * (1 + 1e-9))
+    _, limits = bench("gf7_pair", "orbit")
+    first = limits.lines(BEST, 0)[0]
+    assert first[0] == "base/forward/M2 figure Z7"
+    # without that motion at most its share goes
+    left = limits.known[first[0]][0]
+    assert limits.splits[BEST].sigma[0] * np.sqrt(1.0 - first[1]) * (1 - 1e-9) <= limits.splits[BEST].sigma[0]
+    assert left < 0.7 * limits.splits[BEST].sigma[0]
+
+
+def test_a_second_monitor_and_other_remedies_never_harm():
+    experiment, _ = bench("gf7_pair", "orbit")
+    limits = find_limits(experiment, expected_covariance(experiment, FRAMES), FRAMES, second_monitor=True)
+    now = limits.splits[BEST].sigma
+    found = {remedy.name: remedy.sigma for remedy in limits.remedies}
+    assert set(found) == {"more_frames", "no_noise", "field_now", "field_day", "field_month", "second_monitor"}
+    assert all(np.all(sigma <= now * (1 + 1e-9)) for sigma in found.values())
+    assert np.all(found["no_noise"] <= found["more_frames"] * (1 + 1e-9))
+    # it sees other places of the mirrors: figures show, which noise does not explain
+    assert np.all(found["second_monitor"] < 0.97 * now)
+    assert np.all(found["more_frames"] > 0.98 * now)
+    assert limits.without == ""
+
+
+def test_the_truth_on_the_ground_is_that_of_turned_rays(backend):
+    """At the line's middle, by the traced changes of both cameras, whichever body it was that moved."""
+    experiment, limits = bench("gf7_pair", "orbit")
+    states = [
+        {"base/forward": Motion(rotate=(3 * ARCSEC, 2 * ARCSEC, 1 * ARCSEC))},
+        {"base/backward/M2": Motion(shift=(2e-6, 3e-6, 1e-6))},
+        {"base/forward/focal_plane": Motion(shift=(5e-6, 5e-6, 0)), "base/backward": Motion(rotate=(0, 2 * ARCSEC, 0))},
+    ]
+    truth = trace_truth(experiment.instrument, backend, states)
+    ground = experiment.ground
+    assert isinstance(ground, GroundGeometry)
+    error = truth.ground_error(ground)
+    rows = {q.key: q.row for q in limits.quantities if q.group == theory.GROUND_GROUP}
+    values = np.concatenate([[c.d_alpha, c.d_beta, c.d_gamma, c.d_f] for c in truth.cameras.values()])
+    linear = np.stack([row @ values for row in rows.values()], axis=1)
+    assert np.max(np.abs(error), axis=0).min() > 1.0
+    np.testing.assert_allclose(error, linear, atol=1e-4 * np.abs(error).max())
+    # plain: two stations from which the changed rays meet in the point, and the calibrated rays from there
+    looks = [experiment.instrument.spec.cameras[name].look for name in truth.cameras]
+    for k in range(len(states)):
+        normal, right = np.zeros((3, 3)), np.zeros(3)
+        for c, (look, incidence, far) in enumerate(zip(looks, ground.incidences_rad, ground.ranges_m, strict=True)):
+            nominal = Rotation.from_euler("y", incidence).apply([0.0, 0.0, 1.0])
+            turn = Rotation.from_euler("y", incidence - look)
+            station = -far * turn.apply(truth.lines[c, 1 + k]) / np.linalg.norm(truth.lines[c, 1 + k])
+            taken = turn.apply(truth.lines[c, 0])
+            assert taken == pytest.approx(nominal, abs=1e-3)
+            square = np.eye(3) - np.outer(taken, taken) / (taken @ taken)
+            normal, right = normal + square, right + square @ station
+        along, across, down = np.linalg.solve(normal, right)
+        assert error[k] == pytest.approx([along, across, -down], abs=1e-7)
+
+
+def run(tmp_path, *words):
+    return invoke(command.app, *words, "--out", tmp_path / "out")
+
+
+def test_the_command_says_what_limits(tmp_path):
+    result = run(tmp_path, "gf7_pair", "--states", "8", "--seed", "5")
+    assert result.exit_code == 0, result.output
+    out = tmp_path / "out"
+    told = json.loads((out / "uncertainty.json").read_text())
+    assert told["disturbances"] == "orbit"
+    height = told["quantities"]["ground"]["height_m"]
+    assert height["after"]["posterior"]["sigma"] < 0.1 * height["before"]["sigma"]
+    assert len(height["after"]["posterior"]["lines"]) == 10
+    total = sum(line["share"] for line in height["after"]["posterior"]["lines"])
+    assert total + height["after"]["posterior"]["rest"] + height["after"]["posterior"]["noise"] == pytest.approx(1.0)
+    assert told["states"]["drawn"] == told["states"]["measured"] == 8
+    page = (out / "report.html").read_text()
+    assert "What limits the readings" in page
+    assert "Do the sigmas hold?" in page
+    assert told["verdict"] in result.output.replace("\n", " ")
+    # the run's own config.yaml makes the same bytes again
+    again = invoke(
+        command.app, out / "config.yaml", "--states", "8", "--seed", "5", "--out", tmp_path / "again", "--quiet"
+    )
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "again" / "uncertainty.json").read_bytes() == (out / "uncertainty.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (("gf7_par",), r"no such name in instruments.*gf7_pair"),
+        (("gf7_pair", "--disturbances", "none"), r"no such name in disturbances"),
+        (("gf7_pair", "--disturbances", "orbt"), r"no such name in disturbances.*orbit"),
+        (("missing.yaml",), r"missing\.yaml"),
+        (("{job}",), r"nothing is stated to move.*--disturbances"),
+    ],
+)
+def test_bad_input_is_one_message(tmp_path, words, found):
+    job = tmp_path / "job.yaml"
+    job.write_text("instrument: gf7_pair\ndisturbances: none\n")
+    result = run(tmp_path, *(word.format(job=job) for word in words))
+    assert result.exit_code == 2, result.output
+    assert re.search(found, result.output.replace("\n", " ")), result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_a_statement_the_section_says_how_to_make_one():
+    section = limits_section(None)
+    assert "noise" in section.text[0]
+    assert "disturbances: orbit" in section.text[0]
+    assert section.artefacts == ()

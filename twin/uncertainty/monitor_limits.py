@@ -1,0 +1,216 @@
+"""What limits the readings of an instrument under its stated disturbances, and what would help."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from analysis.monitor import limits
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.estimators import Shifts, applicable
+from analysis.monitor.limits import LeastSeen, Quantity, Split
+from analysis.monitor.monitoring import shift_covariance
+from analysis.monitor.recovery import joint, measure_spots
+from analysis.spots.likelihood import EDGE_PX
+from analysis.spots.spot_positions import difference_covariance
+from analysis.units import ARCSEC
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.models.instrument_model import MisplacedError
+from scenes.yaml.errors import InputError
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.stated_disturbances import disturbances_of
+
+BEST = "posterior"
+"""The estimator of the least variance: what it leaves only another measurement takes away."""
+LINES = 10
+"""Motions that are named, the rest is summed."""
+FIELD = 0.1 * ARCSEC
+"""Standard deviation with which a test field fixes a direction of a camera: a quarter of a metre on the ground from
+500 km, what control points of that accuracy give."""
+DAY = 86400.0
+MORE_FRAMES = 4
+_DRAWS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Remedy:
+    """Something that could be done.
+
+    Attributes:
+        name: short, small letters and _.
+        what: in words.
+        sigma: (Q,) standard deviations of the posterior that it would leave.
+    """
+
+    name: str
+    what: str
+    sigma: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorLimits:
+    """What limits an instrument's readings.
+
+    Attributes:
+        instrument: its name.
+        stated: what moves.
+        quantities: Q of them.
+        noise: (D, D) of the shifts of the spots, px^2.
+        frames: of each state.
+        splits: estimator -> the variances of all quantities.
+        least_seen: of every quantity.
+        remedies: what would help.
+        outside: chance that a spot leaves its CCD, or comes too near its edge, so that nothing is measured.
+        without: why there is no remedy by a second monitor; empty where there is one, or nobody asked.
+    """
+
+    instrument: str
+    stated: Disturbances
+    quantities: tuple[Quantity, ...]
+    noise: np.ndarray
+    frames: int
+    splits: Mapping[str, Split]
+    least_seen: tuple[LeastSeen, ...]
+    remedies: tuple[Remedy, ...]
+    outside: float
+    without: str = ""
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """(Q, 4 K) of the quantities."""
+        return np.stack([quantity.row for quantity in self.quantities])
+
+    def lines(self, estimator: str, quantity: int) -> list[tuple[str, float]]:
+        """Label and share of the variance of an estimate's error, largest first, noise apart.
+
+        Args:
+            estimator: its name, or empty for the variance before a measurement.
+            quantity: its number.
+        """
+        split = self.splits[estimator or BEST]
+        shares = split.after if estimator else split.before
+        total = (split.sigma if estimator else split.sigma_before)[quantity] ** 2
+        found = Split.by(shares, self.stated.labels)
+        return sorted(((name, float(value[quantity] / total)) for name, value in found.items()), key=lambda x: -x[1])
+
+    @cached_property
+    def known(self) -> Mapping[str, np.ndarray]:
+        """Label -> (Q,) what would be left if that motion were known, of all that the posterior's first lines name."""
+        names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
+        # in the order of the statement: a set has none
+        labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
+        left = limits.known_sigma(self.rows, self.stated, self.noise, [(label,) for label in labels])
+        return dict(zip(labels, left, strict=True))
+
+
+def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarray:
+    """(D, D) px^2 of the shifts between two measurements of so many frames each, without drawing any.
+
+    Args:
+        experiment: the instrument.
+        frames: of each.
+    """
+    mean = experiment.expected_frames(experiment.nominal_photons)
+    centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
+    spots = measure_spots(mean, frames, calibration, centroid)
+    each = difference_covariance(spots, spots, calibration.noise).reshape(1, len(calibration.cameras), 2, 2, 2)
+    return np.asarray(joint(shift_covariance(each[:, :, 0], each[:, :, 1]))[0])
+
+
+def find_limits(
+    experiment: MonitorExperiment, noise: np.ndarray, frames: int, second_monitor: bool = False
+) -> MonitorLimits | None:
+    """What limits the readings; None where nothing is stated to move.
+
+    Args:
+        experiment: the instrument.
+        noise: (D, D) of the shifts, px^2.
+        frames: of each state.
+        second_monitor: whether a second one is built to say what it would give; it takes a second or two.
+
+    Raises:
+        InputError: what is stated cannot be.
+    """
+    stated = experiment.disturbances
+    if stated is None:
+        return None
+    cameras = experiment.cameras
+    found = limits.quantities(cameras, experiment.ground)
+    rows = np.stack([quantity.row for quantity in found])
+    still = np.zeros((1, 2 * len(cameras), 2))
+    shifts = Shifts(still, still, noise[None], cameras, stated)
+    splits = {
+        name: limits.split(rows, stated, noise, estimator.gain(shifts)[0])
+        for name, estimator in applicable(stated).items()
+    }
+    remedies = [
+        Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
+        Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),
+    ]
+    field = limits.field_covariance(FIELD, cameras, _half_fields(experiment))
+    for name, gap, text in (
+        ("field_now", 0.0, "a test field at the same time"),
+        ("field_day", DAY, "a test field a day before"),
+        ("field_month", 30.0 * DAY, "a test field a month before"),
+    ):
+        remedies.append(Remedy(name, text, limits.calibrated_sigma(rows, stated, noise, field, gap)))
+    why = ""
+    if second_monitor:
+        try:
+            more = limits.extended(stated, _second_monitor(experiment).spots, _own(stated))
+            remedies.append(
+                Remedy(
+                    "second_monitor",
+                    "a second monitor on the other side of the pupil",
+                    _left(rows, more, np.kron(np.eye(2), noise)),
+                )
+            )
+        except (InputError, MisplacedError, AimError, BeamMissedError) as error:
+            why = str(error)
+    seen = tuple(limits.least_seen(row, stated, noise) for row in rows)
+    outside = _outside(experiment, stated, noise)
+    name = experiment.instrument.spec.name
+    return MonitorLimits(name, stated, found, noise, frames, splits, seen, tuple(remedies), outside, why)
+
+
+def _left(rows: np.ndarray, stated: Disturbances, noise: np.ndarray) -> np.ndarray:
+    return limits.posterior_sigma(rows, stated, noise)
+
+
+def _half_fields(experiment: MonitorExperiment) -> list[float]:
+    """Tangent of half the field along the line of every camera."""
+    distance = experiment.nominal_truth.principal_distance
+    lines = {name: model.spec.line for name, model in experiment.instrument.cameras.items()}
+    return [0.5 * line.pixels * line.pitch / distance[name] for name, line in lines.items()]
+
+
+def _own(stated: Disturbances) -> list[bool]:
+    """Whether a second monitor has a body of its own: its prisms; cameras and central prism are the same."""
+    return ["/monitor/" in body for body in stated.bodies]
+
+
+def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
+    """The same motions seen by a monitor whose sub-aperture is on the other side of every pupil."""
+    resolved = experiment.resolved
+    mirrored = {
+        name: mounted.model_copy(update={"pupil_offset": (-mounted.pupil_offset[0], -mounted.pupil_offset[1])})
+        for name, mounted in resolved.instrument.cameras.items()
+    }
+    instrument = resolved.instrument.model_copy(update={"cameras": mirrored})
+    other = MonitorExperiment(resolved.model_copy(update={"instrument": instrument}), experiment.backend)
+    assert experiment.stated is not None
+    return disturbances_of(experiment.stated, other.path, other.thermal, other.instrument, other.backend)
+
+
+def _outside(experiment: MonitorExperiment, stated: Disturbances, noise: np.ndarray) -> float:
+    """Chance that a spot is beyond its CCD, or too near its edge; from draws of the shifts, always the same ones."""
+    half = 0.5 * (np.array(experiment.path.shape) - 1) - EDGE_PX
+    middle = experiment.path.coarse_trace([{}]).place[:, 0]
+    root = np.linalg.cholesky(stated.spot_covariance + noise)
+    shifts = np.random.default_rng(1).standard_normal((_DRAWS, len(root))) @ root.T
+    place = middle + shifts.reshape(_DRAWS, *middle.shape)
+    return float(np.mean(np.any(np.abs(place) > half, axis=(1, 2))))

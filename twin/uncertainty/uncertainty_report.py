@@ -1,0 +1,269 @@
+"""The report of what limits a monitor's readings, and the section of it in the main job's report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP
+from analysis.units import ARCSEC
+from twin.run.artefact import Cell, SvgFigure, Table, significant
+from twin.run.report import Report, Section, one_sentence
+from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage
+from twin.uncertainty.monitor_limits import BEST, FIELD, LINES, MonitorLimits
+from twin.uncertainty.uncertainty_plot import limits_svg
+from twin.uncertainty.uncertainty_run import UncertaintyRun
+from twin.uncertainty.words import body_text, combination_text, quantity_text, short_text, unit_text
+
+FEW = 3
+"""Motions that are named of each quantity where the rest of a report is about something else."""
+RARE = 1e-3
+"""Chance that a spot leaves its CCD of which a reader need not know."""
+
+
+def limits_section(limits: MonitorLimits | None, lines: int = FEW) -> Section:
+    """What limits the readings: the figure and the tables.
+
+    Args:
+        limits: of the instrument, None where nothing is stated to move.
+        lines: motions that are named of each quantity.
+    """
+    title = "What limits the readings"
+    if limits is None:
+        unknown = (
+            "Nothing is stated to move, so that all sigmas are those of the noise of the images alone, and nothing can "
+            "be said of what else limits them. State what is expected to move and to warm up, disturbances: orbit in "
+            "the job or in the instrument: a file of scenes/library/disturbances or one of your own."
+        )
+        return Section(title, (unknown,))
+    figure = SvgFigure(
+        "limits",
+        "What the measurement takes away, and what is left",
+        f"Stated disturbances: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
+        "measurement over that before it. Right: whose motions make up the variance that the posterior leaves, bodies "
+        "of both cameras together.",
+        limits_svg(limits),
+    )
+    text = [_verdict(limits)]
+    if limits.outside > RARE:
+        text.append(f"{_lost(limits)}.")
+    return Section(title, tuple(text), (figure, _remedies(limits), _hidden(limits), _ledger(limits, lines)))
+
+
+def uncertainty_report(run: UncertaintyRun) -> Report:
+    """Report of the command."""
+    limits, coverage = run.limits, run.coverage
+    sections = [limits_section(limits, LINES), _before(limits)]
+    if coverage is not None:
+        sections.append(_states(coverage))
+    warnings = [_lost(limits)] if limits.outside > RARE else []
+    if limits.without:
+        warnings.append(f"what a second monitor would leave is not known, it cannot be built: {limits.without}")
+    said = "" if coverage is None else _holds(coverage)
+    if coverage is not None and coverage.outliers:
+        warnings.append(
+            "sigmas do not hold in the random states: "
+            + "; ".join(
+                f"{name} of {group} {key}, {100 * level:g}%" for name, group, key, level, _ in coverage.outliers
+            )
+        )
+    return Report(
+        f"{limits.instrument}: what limits its monitor under {limits.stated.name}",
+        one_sentence(_verdict(limits), said),
+        (),
+        (
+            (
+                "Disturbances",
+                f"{limits.stated.name}, {len(limits.stated.labels)} motions of {len(set(limits.stated.bodies))} bodies",
+            ),
+            ("Frames", f"{limits.frames} before and {limits.frames} after"),
+        ),
+        _sigmas(limits),
+        tuple(sections),
+        warnings=tuple(warnings),
+    )
+
+
+def headline(limits: MonitorLimits) -> int:
+    """Number of the quantity that an answer begins with: height, else the angle, else the first parameter."""
+    keys = [(q.group, q.key) for q in limits.quantities]
+    for wanted in ((GROUND_GROUP, "height_m"), (ANGLE_GROUP, "change_arcsec")):
+        if wanted in keys:
+            return keys.index(wanted)
+    return 0
+
+
+def _verdict(limits: MonitorLimits) -> str:
+    """What is left of the headline quantity, what makes it up and what would help most."""
+    q = headline(limits)
+    quantity, split = limits.quantities[q], limits.splits[BEST]
+    unit, name = unit_text(quantity), short_text(quantity)
+    motion, share = limits.lines(BEST, q)[0]
+    best = min(limits.remedies, key=lambda remedy: float(remedy.sigma[q]))
+    helped = f"of what could be added {best.what} would help most and leave {significant(best.sigma[q], 2)} {unit}"
+    if best.sigma[q] > 0.95 * split.sigma[q]:
+        helped = "neither more frames nor points on the ground nor further spots take away 5% of it"
+    return one_sentence(
+        f"Under {limits.stated.name} the posterior leaves a standard deviation of "
+        f"{significant(split.sigma[q], 2)} {unit} of the {name}, {significant(split.sigma_before[q], 2)} {unit} before "
+        "the measurement",
+        f"{body_text(motion)} makes {100 * share:.0f}% of the variance that is left, noise of the images "
+        f"{_percent(float(split.noise[q]) / float(split.sigma[q]) ** 2)}",
+        helped,
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}%" if share >= 5e-4 else "less than 0.1%"
+
+
+def _lost(limits: MonitorLimits) -> str:
+    return (
+        f"In {_percent(limits.outside)} of all states that {limits.stated.name} allows a spot leaves its area CCD, and "
+        "nothing is measured: a larger CCD or smaller motions of the cameras would help; all sigmas are those without "
+        "this loss"
+    )
+
+
+def _sigmas(limits: MonitorLimits) -> Table:
+    """Standard deviations before and after."""
+    heads = ("quantity", "before", *limits.splits, "of it noise")
+    rows: list[Sequence[Cell]] = []
+    for q, quantity in enumerate(limits.quantities):
+        after = [float(split.sigma[q]) for split in limits.splits.values()]
+        values = [float(limits.splits[BEST].sigma_before[q]), *after, float(np.sqrt(limits.splits[BEST].noise[q]))]
+        rows.append((quantity_text(quantity), *values))
+    caption = (
+        "Standard deviation of the quantity before the measurement, and of each estimator's error after it: noise and "
+        "what it makes wrong of the stated motions. Last: what the noise of the images makes of the posterior's."
+    )
+    return Table("sigmas", "Standard deviations", caption, heads, rows, digits=3)
+
+
+def _ledger(limits: MonitorLimits, lines: int) -> Table:
+    """The posterior's variance by motions."""
+    split = limits.splits[BEST]
+    rows: list[Sequence[Cell]] = []
+    for q, quantity in enumerate(limits.quantities):
+        name, found = quantity_text(quantity), limits.lines(BEST, q)
+        prior = dict(limits.lines("", q))
+        for motion, share in found[:lines]:
+            left = float(limits.known[motion][q])
+            rows.append((name, body_text(motion), 100.0 * prior[motion], 100.0 * share, left))
+        rest = [motion for motion, _ in found[lines:]]
+        before = 100.0 * sum(prior[motion] for motion in rest)
+        after = 100.0 * sum(share for _, share in found[lines:])
+        rows.append((name, f"the other {len(rest)} motions", before, after, None))
+        noise = 100.0 * float(split.noise[q] / split.sigma[q] ** 2)
+        rows.append((name, "noise of the images", None, noise, float(split.sigma[q])))
+    caption = (
+        "Shares of the variance before the measurement and of what the posterior leaves of it, per cent. Last: "
+        "standard deviation that would be left if that motion were known, in the quantity's unit; beside the noise, "
+        "what is left as it is. Shares of motions that go together can be negative."
+    )
+    heads = ("quantity", "motion", "before [%]", "after [%]", "left if known")
+    return Table(
+        "limits-motions", f"The first {lines} motions of each quantity", caption, heads, rows, (None, None, 2, 2), 3
+    )
+
+
+def _before(limits: MonitorLimits) -> Section:
+    """The variance before a measurement by motions, and after it by the other estimators."""
+    rows: list[Sequence[Cell]] = []
+    for q, quantity in enumerate(limits.quantities):
+        for name in ("", *(name for name in limits.splits if name != BEST)):
+            first = [f"{body_text(motion)} {100 * share:.0f}%" for motion, share in limits.lines(name, q)[:FEW]]
+            rows.append((quantity_text(quantity), name or "before", ", ".join(first)))
+    return Section(
+        "Before the measurement, and the other estimators",
+        ("All ten lines of each are in uncertainty.json.",),
+        (
+            Table(
+                "limits-others",
+                "The largest shares of the variance",
+                "Before the measurement, and of what the estimators beside the posterior leave.",
+                ("quantity", "estimator", "motions"),
+                rows,
+            ),
+        ),
+    )
+
+
+def _remedies(limits: MonitorLimits) -> Table:
+    """What further measurements would leave."""
+    heads = ["quantity", "before", "now", *(remedy.what for remedy in limits.remedies)]
+    rows: list[Sequence[Cell]] = []
+    for q, quantity in enumerate(limits.quantities):
+        split = limits.splits[BEST]
+        values = [split.sigma_before[q], split.sigma[q], *(remedy.sigma[q] for remedy in limits.remedies)]
+        rows.append((quantity_text(quantity), *map(float, values)))
+    second = (
+        ""
+        if any(r.name == "second_monitor" for r in limits.remedies)
+        else " What a second monitor would leave is worked out by python -m twin.uncertainty config.yaml."
+    )
+    caption = (
+        "Standard deviations that the posterior would leave. A test field on the ground fixes the direction of the "
+        f"line's middle, and of its ends against it, to {FIELD / ARCSEC:.2g} arcsec; the monitor measures then as well "
+        "as now, so that what has not changed since is known: all of a cause whose law of time is constant, nothing of "
+        "one that has forgotten where it was. A second monitor has prisms of its own, which move as much, and "
+        f"shares cameras and central prism.{second}"
+    )
+    return Table("limits-remedies", "What would help", caption, tuple(heads), rows, digits=3)
+
+
+def _hidden(limits: MonitorLimits) -> Table:
+    """The least-seen combinations."""
+    rows = [(quantity_text(q), combination_text(limits, k)) for k, q in enumerate(limits.quantities)]
+    caption = (
+        "Of all motions that change a quantity by the standard deviation that the posterior leaves, the most likely "
+        "ones; the largest of them by their standard deviations are named, uncertainty.json has more."
+    )
+    return Table("limits-hidden", "What the spots see least", caption, ("quantity", "motions that hide"), rows)
+
+
+def _holds(coverage: Coverage) -> str:
+    """Whether the sigmas hold."""
+    n, counts = coverage.measured, coverage.counts
+    if coverage.outliers:
+        return f"in {n} random states {len(coverage.outliers)} of {counts} coverages are out of their limits"
+    return f"in {n} random states all {counts} coverages of 68 and 95% intervals are within their limits"
+
+
+def _states(coverage: Coverage) -> Section:
+    """What random states gave."""
+    n, lost = coverage.measured, coverage.drawn - coverage.measured
+    rows: list[Sequence[Cell]] = []
+    for k, quantity in enumerate(coverage.quantities):
+        for name in coverage.errors:
+            rms, ratio = float(coverage.rms(name)[k]), float(coverage.ratio(name)[k])
+            cells: list[Cell] = []
+            for level in range(len(LEVELS)):
+                low, high = (100.0 * float(end[k]) / n for end in coverage.limits(name, level))
+                cells += [100.0 * float(coverage.held(name, level)[k]) / n, f"{low:.1f} to {high:.1f}"]
+            rows.append((quantity_text(quantity), name, rms, ratio, *cells))
+    said = f"{coverage.drawn} states were drawn from the stated disturbances, rendered, exposed and recovered"
+    widths = " and ".join(f"{width:.3f}" for width in HALF_WIDTHS)
+    text = [
+        f"{said}. Intervals of {widths} total sigma should hold the truth in 68 and 95% of them; beside each share "
+        f"stands what agrees with this, at a chance of {100 * FALSE:g}% that any of all falls out though every sigma "
+        "is right."
+    ]
+    if lost:
+        text.append(
+            f"In {lost} of them a spot left its CCD. Those that are left are calmer than is stated: their chi-square "
+            "is smaller, and so are errors that go with the motions of the spots, which the limits take into account; "
+            "the posterior's do not."
+        )
+    mean = float(np.mean(coverage.chi_square))
+    text.append(
+        f"The chi-square of the shifts was {mean:.2f} in the mean and beyond its limit in {coverage.alarms} states; "
+        f"with its false-alarm rate of {FALSE_ALARM:g} up to {coverage.alarm_limit} are to be expected."
+    )
+    heads = ("quantity", "estimator", "rms error", "rms of error / sigma", "68% hold [%]", "limits", "95% hold [%]")
+    caption = "Readings minus truth in the quantity's unit, and the share of intervals that hold the truth."
+    places = (None, None, None, 3, 1, None, 1, None)
+    table = Table("coverage", "Random states", caption, (*heads, "limits of these"), rows, places, 3)
+    return Section("Do the sigmas hold?", tuple(text), (table,))
