@@ -530,7 +530,7 @@ def test_all_of_them_in_one_run_of_the_main_job(tmp_path: Path, monkeypatch: pyt
     assert 'data-key="one.d_gamma_arcsec.half"' in page
     assert "half of what derived says" in page
     assert page.count("<th>half</th>") == 1 + 4  # results, crosstalk of four parameters
-    assert re.search(r"model +half +sigma", done.stdout), done.stdout
+    assert re.search(r"posterior +half +", done.stdout), done.stdout
 
     # target
     for when in ("before", "after"):

@@ -13,7 +13,7 @@ from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, surface_of
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec
 from scenes.specs.load import find_camera, load_camera
-from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import dump_yaml, read_yaml

@@ -93,7 +93,7 @@ class TimeLawSpec(Spec):
     @property
     def text(self) -> str:
         """In words."""
-        parts = [self.kind or ""]
+        parts: list[str] = [self.kind or ""]
         parts += [f"drift {moment(self.drift)}"] if self.drift is not None else []
         parts += [f"period {moment(self.period)}"] if self.period is not None else []
         return ", ".join(filter(None, parts)) or "nothing"

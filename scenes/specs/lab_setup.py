@@ -15,7 +15,7 @@ from scenes.specs.load import (
     load_lab_test,
     load_turntable_test,
 )
-from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.spec import Paths, Spec

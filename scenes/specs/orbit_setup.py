@@ -25,8 +25,7 @@ from scenes.specs.orbit_angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
-from scenes.specs.resolved import ResolvedJob, resolve_job
-from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath, names_text, nearest
 from scenes.yaml.spec import Paths, Spec

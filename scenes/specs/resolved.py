@@ -1,7 +1,7 @@
-"""A job together with everything it refers to, so that one file says all that went into a run."""
+"""A job, or a test, together with everything it refers to, so that one file says all that went into a run."""
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, Generic, Self, TypeVar, cast
 
 from pydantic import Field
 
@@ -27,6 +27,8 @@ from scenes.yaml.spec import Paths, Source, Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 
+TestType = TypeVar("TestType", bound=Spec)
+SetupType = TypeVar("SetupType", bound="ExperimentSetup")
 PANCHROMATIC = "P"
 """Name of a camera's panchromatic band."""
 
@@ -183,3 +185,38 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
             Source(source.file, source.lines, ("disturbances",))
         )
     return resolved.model_copy(update=changed)
+
+
+class ExperimentSetup(Spec, Generic[TestType]):
+    """A test together with all it refers to, so that one file says all that went into a run.
+
+    Attributes:
+        test: what the test's file says.
+    """
+
+    test: TestType
+
+    def with_seed(self, seed: int) -> Self:
+        """The same with another seed, for one that a command overrides."""
+        return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
+
+    def to_yaml(self) -> str:
+        """Text of a config.yaml, which ``read_setup`` reads back to the same values."""
+        return dump_yaml(self.plain())
+
+
+def read_setup(model: type[SetupType], path: str | Path) -> SetupType | None:
+    """The setup that a run's config.yaml holds; None for the file, or the name in the library, of a test alone.
+
+    Raises:
+        InputError: the file cannot be read, or is a config.yaml that is not valid.
+    """
+    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
+        return None
+    yaml = read_yaml(path)
+    if not (isinstance(yaml.data, dict) and "test" in yaml.data):
+        return None
+    setup = validate(model, yaml)
+    # the test knows where it was read, so that what is found wrong later is told by its line
+    test = setup.test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
+    return setup.model_copy(update={"test": test})

@@ -157,12 +157,12 @@ def test_own_files_are_found_from_the_file_that_names_them(tmp_path: Path) -> No
 
 def test_wrong_references_are_told_at_their_line(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"own\.yaml:6: cameras\.forward\.camera: no such name in cameras.*did you mean 'gf7'"
+        InputError, match=r"own\.yaml:4: cameras\.forward\.camera: no such name in cameras.*did you mean 'gf7'"
     ):
         resolve(own_instrument(tmp_path, camera="gf77"))
-    with pytest.raises(InputError, match=r"own\.yaml:6: cameras\.forward\.camera: no such file"):
+    with pytest.raises(InputError, match=r"own\.yaml:4: cameras\.forward\.camera: no such file"):
         resolve(own_instrument(tmp_path, camera="elsewhere.yaml"))
-    with pytest.raises(InputError, match=r"own\.yaml:13: monitor\.area_ccd\.detector: .*did you mean 'monitor_ccd'"):
+    with pytest.raises(InputError, match=r"own\.yaml:11: monitor\.area_ccd\.detector: .*did you mean 'monitor_ccd'"):
         resolve(own_instrument(tmp_path, detector="monitor_cc"))
 
 

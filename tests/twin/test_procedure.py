@@ -18,7 +18,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
-from scenes.specs.test_setup import ExperimentSetup, read_setup
+from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from optics.numerics.backend import Backend
-from scenes.specs.test_setup import ExperimentSetup
+from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 Advance = Callable[[str, int, int], None]

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from optics.numerics.backend import load_backend
-from scenes.specs.test_setup import ExperimentSetup
+from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.spec import Source
 from scenes.yaml.translate import validate
