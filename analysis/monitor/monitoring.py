@@ -111,7 +111,13 @@ class CameraParameters:
 
     @classmethod
     def from_vector(cls, values: ArrayLike, covariance: ArrayLike, total: ArrayLike | None = None) -> CameraParameters:
-        """From (..., 4) values [d_alpha, d_beta, d_gamma, d_f] and their (..., 4, 4) covariances."""
+        """From plain arrays.
+
+        Args:
+            values: (..., 4) d_alpha, d_beta, d_gamma (rad), d_f (m).
+            covariance: (..., 4, 4) of the noise.
+            total: (..., 4, 4) of noise and misfit; None where no disturbances are stated.
+        """
         vector, spread = np.asarray(values, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
         if vector.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
             raise ValueError(f"camera parameters: need (..., 4) and (..., 4, 4), found {vector.shape}, {spread.shape}")
