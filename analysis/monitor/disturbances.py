@@ -186,14 +186,18 @@ class Consistency:
     Attributes:
         chi_square: s' (A C A' + R)^-1 s.
         degrees: of freedom, the number of spot coordinates.
-        limit: of ``chi_square``, exceeded with a chance of ``FALSE_ALARM`` by shifts that are as stated.
+        limit: of ``chi_square``, exceeded with a chance of ``false_alarm`` by shifts that are as stated.
         suspects: bodies that would explain a contradiction, the best first; empty where there is none.
+        false_alarm: the chance that ``limit`` is for.
+        sigma_noise: by how much the noise of the images moves ``chi_square``, one standard deviation, to first order.
     """
 
     chi_square: float
     degrees: int
     limit: float
     suspects: tuple[Suspect, ...] = ()
+    false_alarm: float = FALSE_ALARM
+    sigma_noise: float = 0.0
 
     @property
     def agrees(self) -> bool:
@@ -204,6 +208,11 @@ class Consistency:
     def chance(self) -> float:
         """Probability of so large a chi-square by shifts that are as stated."""
         return float(chi2.sf(self.chi_square, self.degrees))
+
+    @property
+    def chance_sigma_noise(self) -> float:
+        """By how much the noise of the images moves ``chance``, one standard deviation, to first order."""
+        return float(chi2.pdf(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod
     def power(times: float, degrees: int) -> float:
@@ -217,7 +226,11 @@ class Consistency:
 
 
 def consistency(
-    shift: Array, noise: Array, stated: Disturbances, others: Mapping[str, Array] | None = None
+    shift: Array,
+    noise: Array,
+    stated: Disturbances,
+    others: Mapping[str, Array] | None = None,
+    false_alarm: float = FALSE_ALARM,
 ) -> Consistency:
     """Predictive chi-square of one measurement.
 
@@ -227,14 +240,18 @@ def consistency(
         stated: what was to be expected.
         others: bodies of which nothing is stated -> what motions of theirs do to the spots, (D, k) px, to be suspected
             too.
+        false_alarm: chance that shifts as stated are called a contradiction; of one of T measurements that are tested
+            together a T-th of what all may have.
     """
     spread = stated.spot_covariance + noise
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, shift)
     square, count = float(white @ white), len(shift)
-    limit = float(chi2.isf(FALSE_ALARM, count))
+    limit = float(chi2.isf(false_alarm, count))
+    slope = np.linalg.solve(root.T, white)
+    moved = 2.0 * float(np.sqrt(slope @ noise @ slope))
     if square <= limit:
-        return Consistency(square, count, limit)
+        return Consistency(square, count, limit, (), false_alarm, moved)
     candidates = {body: stated.spots[:, [b == body for b in stated.bodies]] for body in dict.fromkeys(stated.bodies)}
     candidates |= {body: np.asarray(table) for body, table in (others or {}).items() if body not in candidates}
     found = []
@@ -246,4 +263,4 @@ def consistency(
         best = int(np.argmax(gain))
         found.append(Suspect(body, float(np.sqrt(1.0 + _INFLATIONS[best])), float(gain[best])))
     found.sort(key=lambda one: -one.gain)
-    return Consistency(square, count, limit, tuple(one for one in found if one.gain > 0.0))
+    return Consistency(square, count, limit, tuple(one for one in found if one.gain > 0.0), false_alarm, moved)

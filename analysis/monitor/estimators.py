@@ -12,7 +12,7 @@ d_beta, d_gamma (rad), d_f (m) of one camera after the other.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,17 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 
-__all__ = ["ESTIMATORS", "Estimator", "Formula", "LeastSquares", "OfEachCamera", "Posterior", "Shifts", "applicable"]
+__all__ = [
+    "ESTIMATORS",
+    "Estimator",
+    "Formula",
+    "LeastSquares",
+    "OfEachCamera",
+    "Posterior",
+    "Shifts",
+    "applicable",
+    "judged",
+]
 
 Array = NDArray[np.float64]
 COORDINATES = 4
@@ -192,6 +202,26 @@ ESTIMATORS: dict[str, Estimator] = {
 """Name in the results -> estimator, in the order of tables. A new one is added here: it then stands in recovered.json,
 crosstalk.json, the tables and the figures.
 """
+
+
+JUDGED = ("posterior", "model")
+"""By which a measurement is judged: the first that stands in its results."""
+
+
+def judged(names: Iterable[str]) -> str:
+    """The estimator that verdicts, quoted sigmas and studies are about: the best one that could be used.
+
+    Args:
+        names: of those that stand in the results.
+
+    Raises:
+        ValueError: none of them is judged by.
+    """
+    known = list(names)
+    for name in JUDGED:
+        if name in known:
+            return name
+    raise ValueError(f"results without {' or '.join(JUDGED)}: there are {', '.join(known)}")
 
 
 def applicable(disturbances: Disturbances | None) -> dict[str, Estimator]:

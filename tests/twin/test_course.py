@@ -124,6 +124,7 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
                 np.testing.assert_array_equal(found["cameras"][name][estimator][key], value)
     for estimator, angle in recovery.angle.items():
         assert found["intersection_angle"][estimator] == angle.to_dict()
+    assert "posterior" in recovery.angle
     for estimator, ground in recovery.ground.items():
         assert found["ground"][estimator] == ground.to_dict()
     true = np.array([found["ground"]["true"][f"{axis}_m"] for axis in ("along", "across", "height")]).T

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency
-from analysis.monitor.estimators import Estimator, applicable
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, consistency
+from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import Recovery
+from analysis.monitor.recovery import Recovery, joint
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.specs.resolved import ResolvedJob
-from twin.monitor.crosstalk import CameraCrosstalk
+from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries
@@ -117,6 +117,17 @@ class RenderRun:
         """Those that stand in the results, by their names there: all but those that need what is not stated."""
         return applicable(self.experiment.disturbances)
 
+    @property
+    def judged(self) -> str:
+        """The estimator that the verdict is about: `posterior` where disturbances are stated, else `model`."""
+        return judged(self.estimators)
+
+    @cached_property
+    def gains(self) -> dict[str, np.ndarray]:
+        """Estimator -> (4 x cameras, 4 x cameras) parameters (rad, m) per pixel of shift, at this measurement."""
+        covariance = {name: self.recovery.shift_covariance[0, k] for k, name in enumerate(self.recovery.parameters)}
+        return estimator_gains(self.experiment, covariance)
+
     @cached_property
     def consistency(self) -> Consistency | None:
         """Do the shifts agree with the stated disturbances? None where none are stated, and where shifts have no noise:
@@ -125,14 +136,35 @@ class RenderRun:
         stated = self.experiment.disturbances
         if stated is None or not np.any(self.recovery.shift_covariance):
             return None
-        others: dict[str, list[np.ndarray]] = {}
+        return self.recovery.consistency(stated, others=self._any_motions(stated))
+
+    @cached_property
+    def worst_of_course(self) -> tuple[int, Consistency] | None:
+        """Of the times of a course the one whose shifts agree least with the stated disturbances, and how they do: its
+        limit is that of the largest of all times, at the same chance of a false alarm. None without course or
+        statement.
+        """
+        stated, series = self.experiment.disturbances, self.series
+        if stated is None or series is None:
+            return None
+        noise, false_alarm = joint(series.shift_covariance), FALSE_ALARM / len(series.times)
+        # suspects are looked for at one time only
+        found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(series.shift, noise, strict=True)]
+        worst = int(np.argmax(found))
+        return worst, consistency(
+            series.shift[worst], noise[worst], stated, self._any_motions(stated), false_alarm=false_alarm
+        )
+
+    def _any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
+        """Body -> what its motions do to all spots, px per table unit, stated or not."""
+        columns: dict[tuple[str, str, int], np.ndarray] = {}
         for k, table in enumerate(self.crosstalk.values()):
             for motion, moved in zip(table.motions, table.spot_shift.T, strict=True):
-                column = np.zeros(len(stated.spots))
-                column[4 * k : 4 * k + 4] = moved
-                others.setdefault(motion.body, []).append(column)
-        tables = {body: np.stack(columns, axis=1) for body, columns in others.items()}
-        return self.recovery.consistency(stated, others=tables)
+                # what both cameras look at stands in both tables
+                key = (motion.body, motion.kind, motion.axis)
+                columns.setdefault(key, np.zeros(len(stated.spots)))[4 * k : 4 * k + 4] = moved
+        bodies = dict.fromkeys(body for body, _, _ in columns)
+        return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     @cached_property
     def limits(self) -> MonitorLimits | None:
@@ -169,10 +201,12 @@ class RenderRun:
         return {
             "name": self.experiment.disturbances.name,
             "chi_square": _to_digits(found.chi_square),
+            "chi_square_sigma_noise": found.sigma_noise,
             "degrees_of_freedom": found.degrees,
             "limit": _to_digits(found.limit),
-            "false_alarm": FALSE_ALARM,
+            "false_alarm": found.false_alarm,
             "chance": _to_digits(found.chance),
+            "chance_sigma_noise": found.chance_sigma_noise,
             "agrees": found.agrees,
             "suspects": [
                 {

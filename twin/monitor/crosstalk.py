@@ -137,18 +137,18 @@ def estimator_gains(
 
 
 def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray]) -> dict[str, CameraCrosstalk]:
-    """Work out the table for every camera.
+    """Work out the table for every camera; readings are those of spots without noise, the same for every measurement.
 
     Args:
         experiment: the instrument.
-        covariance: camera -> (4, 4) px^2 of the spot shifts of a measurement, which weighs them.
+        covariance: camera -> (4, 4) px^2 of the spot shifts of a measurement, by which is told what it can separate.
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
     every = [motion for motions in sets.values() for motion in motions]
     all_spots = spot_jacobian(experiment.path, every)
     all_truth = truth_jacobian(instrument, experiment.backend, every)
-    gains = estimator_gains(experiment, covariance)
+    gains = estimator_gains(experiment)
     out = {}
     for k, (name, motions) in enumerate(sets.items()):
         own = slice(len(motions) * k, len(motions) * (k + 1))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 
@@ -55,6 +56,18 @@ class MonitorExperiment:
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
         self.path = MonitorPath(self.instrument, backend)
+
+    def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
+        """The same instrument, with all that has been worked out of it, under another job's stated disturbances.
+
+        Args:
+            resolved: the job; its instrument, cameras and detector must be this one's.
+        """
+        other = copy(self)
+        other.resolved = resolved
+        for name in ("stated", "disturbances"):
+            vars(other).pop(name, None)
+        return other
 
     @cached_property
     def wide_photons(self) -> np.ndarray:

@@ -105,6 +105,7 @@ class TimeSeries:
             None unless the altitude of a pair is known.
         recovered_ground: estimator -> the same as they are read, arrays (T,); empty likewise.
         smoothed: all measurements together; None where nothing is stated to move.
+        shift: (T, 4 x cameras) of the spots, in their order, px; shift_covariance: (T, cameras, 4, 4), px^2.
         photons: expected photons per pixel and frame, float32 (T, C, rows, columns).
         shown_photons: those of the time that is shown, as they were exposed, (C, rows, columns).
         frames: the first frame of each time, uint16 (T, C, rows, columns).
@@ -123,6 +124,8 @@ class TimeSeries:
     true_ground: np.ndarray | None
     recovered_ground: Mapping[str, GroundError]
     smoothed: SmoothedCourse | None
+    shift: np.ndarray
+    shift_covariance: np.ndarray
     photons: np.ndarray
     shown_photons: np.ndarray
     frames: np.ndarray
@@ -297,6 +300,8 @@ def run_series(
         else np.concatenate([t.ground_error(experiment.ground) for t in truths]),
         recovered_ground={e: _joined_ground([r.ground[e] for r in recoveries]) for e in recoveries[0].ground},
         smoothed=together.smoothed(),
+        shift=np.concatenate([r.shift for r in recoveries]),
+        shift_covariance=np.concatenate([r.shift_covariance for r in recoveries]),
         photons=photons,
         shown_photons=shown_photons,
         frames=first,
