@@ -1,6 +1,7 @@
 """`python -m twin.compare`: what differs is found, what does not is not, and the exit code says which."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -60,7 +61,7 @@ def test_what_differs_is_found(runs: Path, tmp_path: Path) -> None:
     assert true["in_sigma"] is None
     read = changed["recovered.json", "cameras.forward.model.d_f_um"]
     sigmas = [
-        json.loads((runs / name / "recovered.json").read_text())["cameras"]["forward"]["model"]["d_f_um_sigma"]
+        json.loads((runs / name / "recovered.json").read_text())["cameras"]["forward"]["model"]["d_f_um_sigma_noise"]
         for name in "ab"
     ]
     assert read["sigma"] == pytest.approx(np.hypot(*sigmas), rel=1e-12)
@@ -83,9 +84,28 @@ def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
     strict, loose = compare(folders, 1e-9, None), compare(folders, 1e-9, 5.0)
     readings = [one for one in strict.found[0].numbers if one.in_sigma is not None]
     assert len(readings) > 40
+    # also of the chi-square of the shifts, by their noise
+    assert any(one.key == "disturbances.chi_square" for one in readings)
     assert loose.same
     assert loose.found[0].compared > 500
     assert "no input" not in verdict(strict)  # the seed stands in config.yaml
+
+
+def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(runs: Path, tmp_path: Path) -> None:
+    """As runs wrote them before there were stated disturbances: `_sigma` alone, of the noise."""
+    old = []
+    for name in ("a", "seed"):
+        folder = tmp_path / name
+        shutil.copytree(runs / name, folder)
+        text = (folder / "recovered.json").read_text()
+        text = re.sub(r'\n *"[a-z_]+_sigma": [^\n]*', "", text).replace("_sigma_noise", "_sigma")
+        (folder / "recovered.json").write_text(text)
+        old.append(folder)
+    now, then = (compare(pair, 1e-9, None).found[0].numbers for pair in ([runs / "a", runs / "seed"], old))
+    key = "cameras.forward.model.d_f_um"
+    one, other = (next(n for n in numbers if n.key == key) for numbers in (now, then))
+    assert one.sigma == other.sigma is not None
+    assert compare(old, 1e-9, 5.0).same
 
 
 def test_order_of_runs_only_turns_signs(runs: Path) -> None:

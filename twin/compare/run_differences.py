@@ -308,16 +308,19 @@ def _same_number(here: Any, there: Any, rtol: float, sigma: float | None, sigmas
 
 
 def is_sigma(key: str) -> bool:
-    """Whether a key holds the standard deviation of another number."""
+    """Whether a key holds the standard deviation of another number, or what correcting by it leaves."""
     last = key.rpartition(".")[2]
-    return last == "sigma" or last.endswith("_sigma") or last.startswith("sigma_")
+    return last == "sigma" or last.endswith(("_sigma", "_sigma_noise")) or last.startswith(("sigma_", "left_"))
 
 
 def _sigma(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]) -> float | None:
-    """Of the difference of two numbers, from ``x_sigma``, ``sigma_x`` or ``sigma`` beside them in both runs."""
+    """Of the difference of two numbers by the noise of both runs, from ``x_sigma_noise`` beside them in both runs, else
+    ``x_sigma``, ``sigma_x`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs of the same
+    motions, and does not scatter between them.
+    """
     file, key = place
     head, dot, last = key.rpartition(".")
-    names = (f"{last}_sigma", f"sigma_{last}", *(("sigma",) if last == "value" else ()))
+    names = (f"{last}_sigma_noise", f"{last}_sigma", f"sigma_{last}", *(("sigma",) if last == "value" else ()))
     for name in names:
         both = [run.get((file, f"{head}{dot}{name}")) for run in (reference, other)]
         if all(_is_number(value) for value in both):
