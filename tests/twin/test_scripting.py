@@ -14,6 +14,7 @@ import xarray as xr
 import twin
 from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PARAMETERS
+from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, parse_yaml
 from twin.main_job.render_results import stated
@@ -27,7 +28,7 @@ TURN = {"base/backward/focal_plane": {"rotate": "2 -1.5 10 arcsec", "pivot": "re
 
 @pytest.fixture(scope="module")
 def pair() -> twin.InstrumentTwin:
-    return twin.load("gf7_pair")
+    return twin.load("gf7_pair", disturbances="launch")
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +49,16 @@ def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot
             assert np.array_equal(recorded, frames.sel(channel=key))
     recovered = json.loads((out / "recovered.json").read_text())
     found = pair.recover(shot.before, shot.after)
+    assert found.disturbances == recovered["disturbances"]["name"] == "launch"
     for camera in pair.cameras:
         for name in ESTIMATORS:
             own = {key: float(found.values.sel(camera=camera, estimator=name, parameter=key)) for key in PARAMETERS}
             own |= {
                 f"{key}_sigma": float(found.sigma.sel(camera=camera, estimator=name, parameter=key))
+                for key in PARAMETERS
+            }
+            own |= {
+                f"{key}_sigma_noise": float(found.sigma_noise.sel(camera=camera, estimator=name, parameter=key))
                 for key in PARAMETERS
             }
             assert stated(own) == {key: recovered["cameras"][camera][name][key] for key in own}
@@ -70,8 +76,16 @@ def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot
     reading = recovered["cameras"]["forward"]["model"]["d_f_um"]
     row = table.loc["forward", "d_f_um"]
     assert row["model"] == pytest.approx(reading, rel=1e-5)
-    assert row["error"] == row["model"] - row["true"]
+    assert found.judged == "posterior"
+    assert row["error"] == row["posterior"] - row["true"]
     assert row["in_sigma"] == row["error"] / row["sigma"]
+    assert 0.0 < row["sigma_noise"] < row["sigma"]
+    for axis in ("along", "across", "height"):
+        row, name = table.loc["ground", f"ground_{axis}_m"], f"{axis}_m"
+        assert row["true"] == truth["ground"][name]
+        for ending in ("", "_sigma", "_sigma_noise"):
+            own = recovered["ground"]["posterior"][f"{name}{ending}"]
+            assert row[f"posterior{ending}".replace("posterior_", "")] == pytest.approx(own, rel=1e-5)
     assert table.loc["both", "angle_change_arcsec"]["true"] == truth["intersection_angle"]["change_arcsec"]
 
 
@@ -123,9 +137,43 @@ def test_recover_takes_channels_by_name_and_refuses_other_frames(pair: twin.Inst
 
 
 def test_more_frames_never_hurt(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
-    few = pair.recover(shot.before[:, :3], shot.after[:, :3]).sigma
-    many = pair.recover(shot.before, shot.after).sigma
-    assert np.all(many < few)
+    few, many = (pair.recover(shot.before[:, :n], shot.after[:, :n]) for n in (3, 9))
+    assert np.all(many.sigma_noise.drop_sel(estimator="posterior") < few.sigma_noise.drop_sel(estimator="posterior"))
+    # the posterior lets in some more noise where that pays
+    assert np.all(many.sigma < few.sigma)
+
+
+def test_another_statement_makes_other_sigmas_of_the_same_instrument(
+    pair: twin.InstrumentTwin, shot: twin.Shot
+) -> None:
+    """Readings of the formulas and all noise stay; totals are those of a twin that was loaded with the statement."""
+    orbit, alone = pair.with_disturbances("orbit"), pair.with_disturbances("none")
+    loaded = twin.load("gf7_pair", disturbances="orbit")
+    first, second, third, none = (one.recover(shot.before, shot.after) for one in (pair, orbit, loaded, alone))
+    assert [found.disturbances for found in (first, second, third, none)] == ["launch", "orbit", "orbit", ""]
+    assert orbit.experiment.instrument is pair.experiment.instrument
+    assert pair.experiment.disturbances.name == "launch"
+    formulas = first.values.estimator.values != "posterior"
+    assert second.values[:, formulas].equals(first.values[:, formulas])
+    assert second.covariance_noise[:, formulas].equals(first.covariance_noise[:, formulas])
+    assert not np.any(np.isclose(second.sigma, first.sigma, rtol=1e-3))
+    np.testing.assert_allclose(third.covariance, second.covariance, rtol=1e-9, atol=1e-20)
+    assert none.judged == "model"
+    assert "posterior" not in none.values.estimator
+    assert none.covariance.equals(none.covariance_noise)
+    # a study of it reads what it is judged by
+    for one, name in ((pair, "posterior"), (alone, "model")):
+        text = config_text(one, {"base/forward/M2": {"shift": "0 0 (-5 .. 5) um"}}, 4, 1, "sobol")
+        responses = study_from_text(text).study.responses
+        assert responses["forward_d_alpha"].key[3] == name
+    # single lines, as in a job; and what a state says goes on with it
+    stiff = pair.with_disturbances({"file": "launch", "without": ["central_prism_mount"]})
+    assert np.all(stiff.recover(shot.before, shot.after).sigma <= first.sigma)
+    assert orbit.perturbed(DESPACE).resolved.disturbances.name == "orbit"
+    with pytest.raises(InputError, match="launhc"):
+        pair.with_disturbances("launhc")
+    with pytest.raises(InputError, match="no such cause"):
+        pair.with_disturbances({"without": ["gremlins"]})
 
 
 def test_the_jacobian_is_what_small_motions_do(pair: twin.InstrumentTwin) -> None:

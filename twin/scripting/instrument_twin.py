@@ -18,7 +18,7 @@ from analysis.monitor.recovery import CENTROIDS, recover
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend, load_backend
 from scenes.specs.job import JobSpec, NodeInfo, check_nodes
-from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.load import INSTRUMENTS, find_disturbances, library_names
 from scenes.specs.load import load_camera as read_camera
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
@@ -41,16 +41,22 @@ if TYPE_CHECKING:
 class _Bench:
     """An instrument that is built once, whatever is then done to it."""
 
-    def __init__(self, resolved: ResolvedJob, backend: str) -> None:
-        self._resolved, self._name = resolved, backend
+    def __init__(self, resolved: ResolvedJob, backend: str, like: _Bench | None = None) -> None:
+        self._resolved, self._name, self._like = resolved, backend, like
 
     @cached_property
     def backend(self) -> Backend:
-        return load_backend(self._name)
+        return load_backend(self._name) if self._like is None else self._like.backend
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
+        if self._like is not None:
+            return self._like.experiment.stating(self._resolved)
         return MonitorExperiment(self._resolved, self.backend)
+
+    def stating(self, resolved: ResolvedJob) -> _Bench:
+        """The same one under other stated disturbances."""
+        return _Bench(resolved, self._name, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +135,26 @@ class InstrumentTwin:
         check_nodes(twin.resolved.job, self._nodes)
         return twin
 
+    def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
+        """The same instrument with other motions stated, on which `posterior` and all total sigmas rest.
+
+        Args:
+            disturbances: as `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of one's
+                own, ``none`` for nothing, or ``{"file": ..., "causes": {...}, "without": [...]}``. It replaces what
+                was stated before.
+
+        Raises:
+            InputError: no such file, or one that is not valid for this instrument.
+        """
+        plain = self.resolved.job.plain()
+        plain["disturbances"] = disturbances if isinstance(disturbances, str) else dict(disturbances)
+        job = self._with_job(plain).resolved.job
+        stated = find_disturbances(job, self.resolved.instrument)
+        resolved = self.resolved.model_copy(update={"job": job, "disturbances": stated})
+        twin = InstrumentTwin(resolved, self._bench.stating(resolved))
+        twin.experiment.stated  # noqa: B018 - a body that the instrument lacks is told now
+        return twin
+
     def render(self, frames: int | None = None, seed: int | None = None, **render: Any) -> Shot:
         """Render the nominal and the perturbed instrument, and expose its detectors.
 
@@ -153,7 +179,8 @@ class InstrumentTwin:
         return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
 
     def recover(self, before: Any, after: Any, centroid: str | None = None) -> Found:
-        """What every estimator reads from images, given the calibration of the unperturbed instrument alone.
+        """What every estimator reads from images, given the calibration of the unperturbed instrument and what is
+        stated to move.
 
         Args:
             before: frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
@@ -173,8 +200,9 @@ class InstrumentTwin:
         keys = [channel.key for channel in path.channels]
         first = as_frames(before, "before", keys, path.shape)
         second = as_frames(after, "after", keys, path.shape)
-        recovery = recover(first, second[None], experiment.calibration, method)
-        return found_table(recovery, list(self.cameras), keys)
+        stated = experiment.disturbances
+        recovery = recover(first, second[None], experiment.calibration, method, disturbances=stated)
+        return found_table(recovery, list(self.cameras), keys, "" if stated is None else stated.name)
 
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
         """Exact derivatives by elementary motions, about the unperturbed instrument.
@@ -268,18 +296,27 @@ def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
     return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
 
 
-def load(what: str | Path, backend: str = "llvm") -> InstrumentTwin:
+def load(
+    what: str | Path, backend: str = "llvm", disturbances: str | Mapping[str, Any] | None = None
+) -> InstrumentTwin:
     """An instrument to work with.
 
     Args:
         what: name of an instrument in the library (``gf7_pair``), or path of an instrument's file, of a job, or of the
             config.yaml of a run; a job's perturbations come with it.
         backend: where to trace, ``llvm`` or ``cuda``.
+        disturbances: what is stated to move, as `InstrumentTwin.with_disturbances` takes it; the job's or the
+            instrument's own if not given.
 
     Raises:
         InputError: no such name, or a file that cannot be read or is not valid, with line and key.
         BackendUnavailable: this machine does not have it.
     """
+    loaded = _load(what, backend)
+    return loaded if disturbances is None else loaded.with_disturbances(disturbances)
+
+
+def _load(what: str | Path, backend: str) -> InstrumentTwin:
     text = str(what)
     if text not in library_names(INSTRUMENTS) or isinstance(what, Path):
         data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}

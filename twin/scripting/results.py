@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from analysis.monitor.estimators import ESTIMATORS
+from analysis.monitor.estimators import judged
+from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import Recovery
-from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import RenderRun
@@ -38,8 +38,9 @@ class Shot:
     Attributes:
         before, after: frames, uint16 grey values, (channel, frame, row, column).
         expected: expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc.
-        truth: true changes of every camera, by exact tracing: parameters of each ``camera`` and, of two cameras,
-            ``angle_change_arcsec``.
+        truth: true changes of every camera, by exact tracing: parameters of each ``camera``; of two cameras
+            ``angle_change_arcsec``, and ``ground_along_m``, ``ground_across_m``, ``ground_height_m``, errors of points
+            on the ground that are located as if nothing had changed.
         verdict: what was recovered, how well, and what limits it.
         warnings: what one should know before using the numbers.
         run: everything that the command ``twin.render`` would write: image quality, targets, stray light, course.
@@ -103,21 +104,43 @@ class Found:
 
     Attributes:
         values: readings, (camera, estimator, parameter), in arcsec and um as the parameters' names end.
-        covariance: (camera, estimator, parameter, parameter_2), products of these units.
-        angle: of two cameras, ``change_arcsec`` and ``change_arcsec_sigma`` by estimator; empty otherwise.
+        covariance: of the whole error, (camera, estimator, parameter, parameter_2), products of these units: by noise
+            and by what is stated to move; where nothing is stated, by noise alone.
+        covariance_noise: of that what the noise of the images does, likewise.
+        angle: of two cameras, ``change_arcsec`` with ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise``
+            by estimator; empty otherwise.
+        ground: of two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, likewise.
+        disturbances: name of what is stated to move, on which the total sigmas rest; empty for nothing.
         spots: ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
     """
 
     values: xr.DataArray
     covariance: xr.DataArray
+    covariance_noise: xr.DataArray
     angle: xr.Dataset
+    ground: xr.Dataset
     spots: xr.Dataset
+    disturbances: str
 
     @property
     def sigma(self) -> xr.DataArray:
-        """Standard deviations of ``values``."""
-        variance = np.diagonal(self.covariance.values, axis1=-2, axis2=-1)
-        return self.values.copy(data=np.sqrt(variance)).rename("sigma")
+        """Standard deviations of the whole errors of ``values``; see ``covariance``."""
+        return self._root(self.covariance).rename("sigma")
+
+    @property
+    def sigma_noise(self) -> xr.DataArray:
+        """Of that what the noise of the images does."""
+        return self._root(self.covariance_noise).rename("sigma_noise")
+
+    @property
+    def judged(self) -> str:
+        """The estimator whose sigma and error ``compare`` tells: ``posterior`` where disturbances are stated, else
+        ``model``.
+        """
+        return judged(self.values.estimator.values.tolist())
+
+    def _root(self, covariance: xr.DataArray) -> xr.DataArray:
+        return self.values.copy(data=np.sqrt(np.diagonal(covariance.values, axis1=-2, axis2=-1)))
 
     def compare(self, truth: xr.Dataset) -> pd.DataFrame:
         """Readings beside the truth.
@@ -126,23 +149,33 @@ class Found:
             truth: of the exposure, ``shot.truth``.
 
         Returns:
-            A row for every camera and parameter, and for the angle between two cameras: what is ``true``, each
-            estimator's reading, and of the model ``sigma``, ``error`` = reading - true and ``in_sigma`` = error /
-            sigma.
+            A row for every camera and parameter, for the angle between two cameras and for errors on the ground: what
+            is ``true``, each estimator's reading, and of the ``judged`` one ``sigma`` (total), ``sigma_noise``,
+            ``error`` = reading - true and ``in_sigma`` = error / sigma.
         """
-        sigma = self.sigma
+        sigma, noise = self.sigma, self.sigma_noise
         rows = {}
         for camera in self.values.camera.values.tolist():
             for key in PARAMETERS:
                 at = {"camera": camera, "parameter": key}
-                rows[camera, key] = _row(float(truth[key].sel(camera=camera)), self.values.sel(at), sigma.sel(at))
-        if ANGLE in truth and self.angle:
-            rows["both", ANGLE] = _row(
-                float(truth[ANGLE]), self.angle["change_arcsec"], self.angle["change_arcsec_sigma"]
-            )
+                true = float(truth[key].sel(camera=camera))
+                rows[camera, key] = self._row(true, self.values.sel(at), sigma.sel(at), noise.sel(at))
+        pairs = [("both", ANGLE, self.angle, "change_arcsec")]
+        pairs += [("ground", f"ground_{axis}_m", self.ground, f"{axis}_m") for axis in AXES]
+        for where, key, found, name in pairs:
+            if key in truth and found:
+                columns = (found[name], found[f"{name}_sigma"], found[f"{name}_sigma_noise"])
+                rows[where, key] = self._row(float(truth[key]), *columns)
         table = pd.DataFrame.from_dict(rows, orient="index")
         table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "parameter"])
         return table
+
+    def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
+        own = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
+        spread, error = float(sigma.sel(estimator=self.judged)), own[self.judged] - true
+        by_noise = float(noise.sel(estimator=self.judged))
+        told = {"sigma": spread, "sigma_noise": by_noise, "error": error, "in_sigma": error / spread}
+        return {"true": true, **own, **told}
 
     def _repr_html_(self) -> str:
         return reading_frame(self).to_html(escape=True)
@@ -160,18 +193,13 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
     return out
 
 
-def _row(true: float, readings: xr.DataArray, sigma: xr.DataArray) -> dict[str, float]:
-    model, spread = float(readings.sel(estimator="model")), float(sigma.sel(estimator="model"))
-    own = {name: float(readings.sel(estimator=name)) for name in ESTIMATORS}
-    return {"true": true, **own, "sigma": spread, "error": model - true, "in_sigma": (model - true) / spread}
-
-
 def reading_frame(found: Found) -> pd.DataFrame:
-    """Readings by camera and parameter, a column for each estimator, with the model's sigma."""
+    """Readings by camera and parameter, a column for each estimator, with the judged one's sigmas."""
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
-    sigma = found.sigma.sel(estimator="model").stack(row=("camera", "parameter")).to_pandas()
-    return values.assign(sigma=sigma)
+    sigmas = {"sigma": found.sigma, "sigma_noise": found.sigma_noise}
+    own = {name: s.sel(estimator=found.judged).stack(row=("camera", "parameter")) for name, s in sigmas.items()}
+    return values.assign(**{name: column.to_pandas() for name, column in own.items()})
 
 
 def truth_frame(truth: xr.Dataset) -> pd.DataFrame:
@@ -218,22 +246,28 @@ def _truth(run: RenderRun) -> xr.Dataset:
     if "intersection_angle" in true:
         data[ANGLE] = true["intersection_angle"]["change_arcsec"]
         data["angle_nominal_deg"] = true["intersection_angle"]["nominal_deg"]
+    data |= {f"ground_{key}": value for key, value in true.get("ground", {}).items()}
     about = {"reference_frames": frames_text("truth")}
     return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=about)
 
 
-def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[str]) -> Found:
-    """What a script sees of the recovery of one state."""
-    parts = [[recovery.parameters[camera][name] for name in ESTIMATORS] for camera in cameras]
+def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[str], disturbances: str = "") -> Found:
+    """What a script sees of the recovery of one state.
+
+    Args:
+        recovery: of it.
+        cameras: their names.
+        channels: names of the monitor's channels.
+        disturbances: name of what is stated to move, empty for nothing.
+    """
+    estimators = list(recovery.parameters[cameras[0]])
+    parts = [[recovery.parameters[camera][name] for name in estimators] for camera in cameras]
     values = [[np.asarray(p.vector)[0] * PER_SI for p in row] for row in parts]
-    spread = [[np.asarray(p.covariance)[0] * np.outer(PER_SI, PER_SI) for p in row] for row in parts]
-    coords = {"camera": list(cameras), "estimator": list(ESTIMATORS), "parameter": list(PARAMETERS)}
+    per = np.outer(PER_SI, PER_SI)
+    total = [[np.asarray(p.error_covariance)[0] * per for p in row] for row in parts]
+    noise = [[np.asarray(p.covariance)[0] * per for p in row] for row in parts]
+    coords = {"camera": list(cameras), "estimator": estimators, "parameter": list(PARAMETERS)}
     dims = ("camera", "estimator", "parameter")
-    angle: dict[str, Any] = {}
-    if recovery.angle:
-        changes = [float(np.ravel(recovery.angle[name].change_rad)[0]) / ARCSEC for name in ESTIMATORS]
-        sigmas = [float(np.ravel(recovery.angle[name].sigma_rad)[0]) / ARCSEC for name in ESTIMATORS]
-        angle = {"change_arcsec": ("estimator", changes), "change_arcsec_sigma": ("estimator", sigmas)}
     spots = {
         "before": recovery.before[0],
         "after": recovery.after[0],
@@ -241,17 +275,29 @@ def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[s
         "after_sigma": recovery.sigma_after[0],
     }
     about = {"reference_frames": frames_text("recovered")}
+
+    def spread(covariance: list[list[np.ndarray]]) -> xr.DataArray:
+        both = {**coords, "parameter_2": list(PARAMETERS)}
+        return xr.DataArray(np.array(covariance), dims=(*dims, "parameter_2"), coords=both)
+
+    def by_estimator(found: Mapping[str, Any], keys: Sequence[str]) -> xr.Dataset:
+        told = [found[name].to_dict() for name in estimators] if found else []
+        names = [f"{key}{ending}" for key in keys for ending in ("", "_sigma", "_sigma_noise")]
+        data = {name: ("estimator", [float(np.ravel(one[name])[0]) for one in told]) for name in names if told}
+        return xr.Dataset(data, coords={"estimator": estimators} if told else {}, attrs=about)
+
     return Found(
         values=xr.DataArray(np.array(values), dims=dims, coords=coords, name="reading", attrs=about),
-        covariance=xr.DataArray(
-            np.array(spread), dims=(*dims, "parameter_2"), coords={**coords, "parameter_2": list(PARAMETERS)}
-        ),
-        angle=xr.Dataset(angle, coords={"estimator": list(ESTIMATORS)} if angle else {}, attrs=about),
+        covariance=spread(total),
+        covariance_noise=spread(noise),
+        angle=by_estimator(recovery.angle, ("change_arcsec",)),
+        ground=by_estimator(recovery.ground, [f"{axis}_m" for axis in AXES]),
         spots=xr.Dataset(
             {name: (("channel", "axis"), value, {"units": "px"}) for name, value in spots.items()},
             coords={"channel": list(channels), "axis": ["row", "column"]},
             attrs=about,
         ),
+        disturbances=disturbances,
     )
 
 

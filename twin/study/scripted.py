@@ -141,16 +141,17 @@ def config_text(
 
 
 def _responses(resolved: ResolvedJob) -> Tree:
-    """Of every camera what the model reads, with its sigma, and what is true."""
+    """Of every camera what is read, with its sigma, and what is true: by the estimator that a run is judged by."""
     out: Tree = {}
+    own = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:
         for key in PARAMETERS:
             short = key.rpartition("_")[0]
-            read = ["recovered", "cameras", camera, "model", key]
+            read = ["recovered", "cameras", camera, own, key]
             out[f"{camera}_{short}"] = {"key": read, "sigma": [*read[:-1], f"{key}_sigma"]}
             out[f"{camera}_{short}_true"] = {"key": ["truth", "cameras", camera, key]}
     if len(resolved.instrument.cameras) == 2:
-        read = ["recovered", "intersection_angle", "model"]
+        read = ["recovered", "intersection_angle", own]
         out["angle_change"] = {"key": [*read, "change_arcsec"], "sigma": [*read, "change_arcsec_sigma"]}
         out["angle_change_true"] = {"key": ["truth", "intersection_angle", "change_arcsec"]}
     return out
