@@ -34,7 +34,7 @@ EXAMPLE = EXAMPLES / "perturb.yaml"
 FRAMES = 2
 CAMERAS, SIDES, STATES = ("forward", "backward"), ("left", "right"), ("before", "after")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-ESTIMATORS = ("paper_single", "paper_joint", "derived", "model")
+ESTIMATORS = ("paper_single", "paper_joint", "derived", "model", "posterior")
 IMAGES = {f"images/{c}_{s}_{t}" for c in CAMERAS for s in SIDES for t in STATES}
 FILES = {
     "manifest.json",
@@ -158,12 +158,13 @@ def test_keys_of_truth(first):
 
 def test_keys_of_recovered(first):
     recovered = json.loads((first[0] / "recovered.json").read_text())
-    with_sigma = {f"{key}{ending}" for key in PARAMETERS for ending in ("", "_sigma")}
+    endings = ("", "_sigma", "_sigma_noise")
+    with_sigma = {f"{key}{ending}" for key in PARAMETERS for ending in endings}
     for camera in CAMERAS:
         assert set(recovered["cameras"][camera]) == set(ESTIMATORS)
         for values in recovered["cameras"][camera].values():
             assert set(values) == with_sigma
-            assert all(values[f"{key}_sigma"] > 0 for key in PARAMETERS)
+            assert all(values[f"{key}_sigma"] > values[f"{key}_sigma_noise"] > 0 for key in PARAMETERS)
         assert set(recovered["spots"][camera]) == set(SIDES)
         for side in SIDES:
             assert set(recovered["spots"][camera][side]) == set(STATES)
@@ -172,7 +173,18 @@ def test_keys_of_recovered(first):
                 assert 0 < spot["row"] < 95
     assert set(recovered["intersection_angle"]) == set(ESTIMATORS)
     for values in recovered["intersection_angle"].values():
-        assert set(values) == {"change_arcsec", "change_arcsec_sigma"}
+        assert set(values) == {f"change_arcsec{ending}" for ending in endings}
+    assert set(recovered["ground"]) == set(ESTIMATORS)
+    for values in recovered["ground"].values():
+        assert {f"{axis}_m{ending}" for axis in ("along", "across", "height") for ending in endings} <= set(values)
+    stated = recovered["disturbances"]
+    assert (stated["name"], stated["degrees_of_freedom"], stated["agrees"], stated["suspects"]) == (
+        "launch",
+        8,
+        True,
+        [],
+    )
+    assert stated["chi_square"] < stated["limit"]
 
 
 def test_images_are_the_frames(first):
@@ -239,9 +251,31 @@ def test_the_table_is_readable_in_a_narrow_terminal(repeated):
     for camera in CAMERAS:
         assert camera in other.stdout
         assert f"{truth['cameras'][camera]['d_alpha_arcsec']:.4f}" in other.stdout
-    table = [line for line in other.stdout.splitlines() if re.match(r" Δ(α|β|γ|θ) \[arcsec\] | Δf \[µm\] ", line)]
-    assert len(table) == 2 * 4 + 1
+    table = [
+        line
+        for line in other.stdout.splitlines()
+        if re.match(r"Δ[αβγθ] \[arcsec\] |Δf \[µm\] |(along|across|height) \[m\] ", line)
+    ]
+    assert len(table) == 2 * 4 + 1 + 3
     assert max(len(line) for line in table) <= 80
+    # what the sigmas assume stands below it
+    assert "σ: noise and the stated disturbances launch; the shifts agree with them (chi-square" in other.stdout
+
+
+def test_a_wide_terminal_also_has_the_noise_and_a_job_without_disturbances_says_so(tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    shown = run(EXAMPLE, "--out", tmp_path / "wide", "--frames", FRAMES).stdout
+    assert "noise" in shown[shown.index("poste-") : shown.index("forward  ")]
+    assert max(len(line) for line in shown.splitlines() if "[arcsec] " in line and "Δα [arcsec] " == line[:12]) <= 100
+    job = tmp_path / "job.yaml"
+    job.write_text(EXAMPLE.read_text().replace("disturbances: launch", "disturbances: none"))
+    alone = run(job, "--out", tmp_path / "alone", "--frames", FRAMES)
+    assert alone.exit_code == 0, alone.output
+    assert "No disturbances are stated: σ is that of the noise of the images alone." in alone.stdout
+    recovered = json.loads((tmp_path / "alone" / "recovered.json").read_text())
+    assert set(recovered["cameras"]["forward"]) == set(ESTIMATORS) - {"posterior"}
+    assert "disturbances" not in recovered
+    assert "No disturbances are stated" in (tmp_path / "alone" / "report.html").read_text("utf-8")
 
 
 def test_numbers_are_whole_however_narrow_the_terminal(ready, tmp_path, monkeypatch):

@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from analysis.monitor.monitoring import PER_SI
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
+from twin.main_job.assumptions import assumed, combination, shares_by_body
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, PARAMETERS
+from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS
 from twin.main_job.verdict import FALSE_ALARM, alarm_limit, judge, readings, recovered_numbers
 from twin.run.artefact import FAR
 
@@ -20,13 +22,14 @@ OUTSIDE = "a motion that the model does not know"
 
 @pytest.fixture(scope="module")
 def job(backend, tmp_path_factory):
-    """Runs a job by what it perturbs; each once."""
+    """Runs a job by what it perturbs, with no disturbances stated unless ``more`` says so; each once."""
     place, done = tmp_path_factory.mktemp("jobs"), {}
 
     def run(perturb: str, more: str = "", frames: int = 2, instrument: str = "gf7_pair") -> RenderRun:
         key = (perturb, more, frames, instrument)
         if key not in done:
             file = place / f"job{len(done)}.yaml"
+            more += "" if "disturbances" in more else "\ndisturbances: none"
             file.write_text(
                 f"instrument: {instrument}\nperturb: {perturb}\n{more}\nrender: {{frames: {frames}, seed: 3}}\n"
             )
@@ -37,12 +40,13 @@ def job(backend, tmp_path_factory):
 
 
 def good(run: RenderRun) -> tuple[int, int]:
-    """How many readings of the model are within FAR sigmas of the truth, worked out from the files' contents."""
-    recovered, truth = run.recovered_dict(), run.truth_dict()
-    pairs = [
-        (recovered["cameras"][c]["model"], truth["cameras"][c], p.key) for c in truth["cameras"] for p in PARAMETERS
-    ]
-    pairs.append((recovered["intersection_angle"]["model"], truth["intersection_angle"], ANGLE.key))
+    """How many readings that the verdict is about are within FAR sigmas of the truth, worked out from the files'
+    contents.
+    """
+    recovered, truth, own = run.recovered_dict(), run.truth_dict(), run.judged
+    pairs = [(recovered["cameras"][c][own], truth["cameras"][c], p.key) for c in truth["cameras"] for p in PARAMETERS]
+    pairs.append((recovered["intersection_angle"][own], truth["intersection_angle"], ANGLE.key))
+    pairs += [(recovered["ground"][own], truth["ground"], p.key) for p in GROUND]
     return sum(abs(r[key] - t[key]) <= FAR * r[f"{key}_sigma"] for r, t, key in pairs), len(pairs)
 
 
@@ -55,7 +59,7 @@ def one_sentence(verdict: str) -> None:
 def test_nothing_perturbed(job) -> None:
     told = judge(job("{}"))
     one_sentence(told.verdict)
-    assert told.verdict.startswith("Nothing was perturbed and nothing is read: all 9 readings")
+    assert told.verdict.startswith("Nothing was perturbed and nothing is read: all 12 readings")
     assert told.warnings == ()
     # a motion of size zero is none
     assert judge(job("{base/forward/M2: {shift: [0 um, 0 um, 0 um]}}")).verdict.startswith("Nothing was perturbed")
@@ -72,8 +76,8 @@ def test_noise_that_looks_like_a_change_is_called_noise(job) -> None:
     """Of nothing perturbed one reading is moved by 3.2 sigma, then by 9: the first happens, the second does not."""
     run = job("{}")
     small, large = (judge(moved(run, 0, sigmas)).verdict for sigmas in (3.2, 9.0))
-    assert "1 of 9 readings of the model is beyond 3 σ" in small
-    assert "which noise alone does now and then" in small
+    assert "1 of 12 readings of the model is beyond 3 σ" in small
+    assert "which is chance" in small
     assert "look at the warnings" in large
     assert any("misread" in warning for warning in judge(moved(run, 0, 9.0)).warnings)
     assert judge(moved(run, 0, 3.2)).warnings == ()
@@ -115,9 +119,11 @@ def test_recovered(job) -> None:
     run = job("{base/forward/focal_plane: {shift: [3 um, -2 um, 0 um], rotate: [0 arcsec, 0 arcsec, 5 arcsec]}}")
     told = judge(run)
     one_sentence(told.verdict)
-    assert good(run) == (9, 9)
+    assert good(run) == (12, 12)
     seen = sum(abs(r.true) > FAR * r.sigma for r in readings(run, "model"))
-    assert told.verdict.startswith(f"Recovered: all 9 readings of the model are within 3 σ of the truth, {seen} of")
+    assert told.verdict.startswith(
+        f"Recovered: all 12 readings of the model are within 3 σ of the truth (σ: noise alone), {seen} of the changes"
+    )
     # the printed formula reads it twice, which is an error as large as the change
     assert [w for w in told.warnings if w.startswith("Δγ of forward [arcsec] is misread by more than the change")]
 
@@ -241,3 +247,136 @@ def test_softer_images_are_told_where_it_matters(job) -> None:
     one_sentence(told)
     assert "the MTF at Nyquist of backward along the line, at 0.9 of half the line, falls from 0.200 to 0.100" in told
     assert "MTF" not in judge(replace(run, quality=quality(0.198))).verdict
+
+
+# --- stated disturbances ----------------------------------------------------------------------------------------------
+
+LAUNCH = "disturbances: launch"
+EXAMPLE = (
+    "{base/backward/focal_plane: {rotate: [2 arcsec, -1.5 arcsec, 10 arcsec], pivot: rear_node}, "
+    "base/forward/M2: {shift: [0 um, 0 um, 3 um]}}"
+)
+
+
+def test_what_is_stated_stands_in_the_sentence(job) -> None:
+    """No reading of the example is beyond 3 total sigma, and the reader sees which body limits the angle."""
+    run = job(EXAMPLE, LAUNCH, frames=9)
+    told = judge(run)
+    one_sentence(told.verdict)
+    assert run.judged == "posterior"
+    assert good(run) == (12, 12)
+    for estimator in run.estimators:
+        assert not any(r.far for r in readings(run, estimator))
+    assert told.warnings == ()
+    assert (
+        "all 12 readings of the posterior are within 3 σ of the truth (σ: noise and disturbances launch)"
+        in told.verdict
+    )
+    assert "noise and disturbances hide changes below" in told.verdict
+    assert "more frames do not change that" in told.verdict
+    found = re.search(
+        r"σ of Δθ, (\S+) arcsec, is limited by motions of (\S+) \((\d+) % of its variance\)", told.verdict
+    )
+    assert found is not None
+    sigma = next(r.sigma for r in readings(run, "posterior") if r.parameter == ANGLE)
+    assert float(found[1]) == pytest.approx(sigma, rel=0.06)
+    # that body taken out of what is stated takes so much of the variance
+    less = job(EXAMPLE, f"disturbances: {{file: launch, {without(run, found[2])}}}", frames=9)
+    left = next(r.sigma for r in readings(less, "posterior") if r.parameter == ANGLE)
+    assert 1.0 - (left / sigma) ** 2 >= int(found[3]) / 100.0 - 0.01
+
+
+def without(run: RenderRun, body: str) -> str:
+    """A job's words for the same disturbances with all others of a pattern of mirrors, and not this one."""
+    others = [f"base/{c}/M{k}" for c in ("forward", "backward") for k in (1, 2, 3) if f"{c}/M{k}" != body]
+    assert len(others) == 5
+    return f"causes: {{mirror_mounts: {{bodies: {others}}}, mirror_figure: {{bodies: {others}}}}}".replace("'", "")
+
+
+def test_the_share_of_a_body_is_that_of_its_errors() -> None:
+    """By the definition of a variance: over draws of the motions."""
+    rng = np.random.default_rng(3)
+    bodies, left = ("a", "b", "a", "c"), rng.standard_normal(4)
+    drawn = rng.standard_normal((200_000, 4)) * left
+    shares = shares_by_body(left, bodies)
+    for body in "abc":
+        own = drawn[:, [b == body for b in bodies]].sum(axis=1)
+        # the scatter of a variance over n draws is sqrt(2 / n): five of them
+        assert np.var(own) == pytest.approx(shares[body], rel=5.0 * np.sqrt(2.0 / 200_000))
+    assert sum(shares.values()) == pytest.approx(float(left @ left), rel=1e-12)
+
+
+def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
+    """The combination of all parameters gives, of the true ones, the true angle and errors on the ground."""
+    run = job(EXAMPLE, LAUNCH, frames=9)
+    true = np.concatenate(
+        [np.array([run.true_parameters(name)[p.key] for p in PARAMETERS]) / PER_SI for name in run.truth.cameras]
+    )
+    truth = run.truth_dict()
+    for p, values in ((ANGLE, truth["intersection_angle"]), *((p, truth["ground"]) for p in GROUND)):
+        # second order of 10 arcsec: 5e-5 of it
+        assert combination(run, "", p) @ true == pytest.approx(values[p.key], rel=2e-3)
+    for k, p in enumerate(PARAMETERS):
+        row = combination(run, "backward", p)
+        assert row @ true == pytest.approx(truth["cameras"]["backward"][p.key], rel=1e-12)
+        assert np.count_nonzero(row) == 1
+        assert row[4 + k] != 0.0
+
+
+def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
+    """A line that turns 60 times as far as `launch` says; the common reference, where mirrors stand still."""
+    still = "disturbances: {file: launch, without: [mirror_mounts, camera_mounts]}"
+    for body, motion, more in (
+        ("base/forward/focal_plane", "{rotate: [0 arcsec, 0 arcsec, 300 arcsec]}", LAUNCH),
+        ("base/central_prism", "{rotate: [8 arcsec, 0 arcsec, 0 arcsec]}", still),
+    ):
+        run = job(f"{{{body}: {motion}}}", more)
+        told = judge(run)
+        (warning,) = [text for text in told.warnings if "contradict" in text]
+        assert run.consistency is not None
+        assert "stated disturbances launch: chi-square" in warning
+        assert f"where {run.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
+        assert f"motions of {run.consistency.suspects[0].body} would explain them best" in warning
+        assert run.consistency.suspects[0].body == body
+        times = float(re.search(r"for it were (\S+) times as large", warning)[1])
+        # of a body one or two motions are measured, which tell its sigma within a factor of some
+        assert 5.0 < times < 300.0
+        assert recovered_numbers(run)["warnings"] == list(told.warnings)
+        assert not recovered_numbers(run)["disturbances"]["agrees"]
+        assert "contradict them" in assumed(run)
+
+
+def test_a_body_of_which_nothing_is_stated_is_named_as_such(job) -> None:
+    more = "disturbances: {file: launch, without: [mirror_mounts, mirror_figure, camera_mounts, moisture, heat]}"
+    run = job("{base/forward/M1: {rotate: [3 arcsec, 0 arcsec, 0 arcsec]}}", more)
+    (warning,) = [text for text in judge(run).warnings if "contradict" in text]
+    assert ", of which nothing is stated, would explain them best" in warning
+
+
+def test_a_course_is_held_against_what_is_stated_at_every_time(job) -> None:
+    """One time of three is far out, not the one that is shown."""
+    motion = "[[0 arcsec, 0 arcsec, 0 arcsec], [0 arcsec, 0 arcsec, 2 arcsec], [0 arcsec, 0 arcsec, 300 arcsec]]"
+    moves = f"{{base/forward/focal_plane: {{rotate: {motion}}}}}"
+    course = f"course: {{times: [0 min, 10 min, 20 min], detail: 10 min, motion: {moves}}}"
+    run = job("{}", f"{course}\n{LAUNCH}")
+    assert run.series is not None
+    assert run.series.shown == 1
+    (warning,) = [text for text in judge(run).warnings if "contradict" in text]
+    assert "at 20 min, the worst of 3 times" in warning
+    assert "a chance of 0.001 for the course" in warning
+    worst, found = run.worst_of_course
+    assert (worst, found.suspects[0].body) == (2, "base/forward/focal_plane")
+    assert found.limit > run.consistency.limit
+    still = job("{}", course.replace("300 arcsec", "3 arcsec") + f"\n{LAUNCH}")
+    assert not any("contradict" in text for text in judge(still).warnings)
+
+
+def test_frames_are_advised_where_they_help(job) -> None:
+    """Only the noise gets less: with what is stated small against it frames help, as without a statement; else not."""
+    others = "camera_mounts, moisture, mirror_mounts, focal_plane_mounts, prism_mounts, central_prism_mount, heat"
+    small = (
+        f"disturbances: {{file: launch, causes: {{mirror_figure: {{figure: {{Z5: 1e-5 nm}}}}}}, without: [{others}]}}"
+    )
+    perturb = "{base/forward/M1: {figure: {Z5: 4 nm}}}"
+    assert "frames do not change that" not in judge(job(perturb, small)).verdict
+    assert "frames would show it" not in judge(job(perturb, LAUNCH)).verdict

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import body_name
 from twin.main_job.report_labels import PARAMETERS
@@ -19,7 +18,7 @@ from twin.run.artefact import SAME, SYMBOLS, fixed, plain, shown_unit, significa
 WRONG = 0.1
 """A reading that departs from the truth by more than this part of it is marked ..."""
 UNSEEN = 0.01
-"""... if that is also more than this part of the run's sigma: what a hundred units would not show is not marked."""
+"""... if that is also more than this part of the run's noise: what a hundred units would not show is not marked."""
 
 
 def crosstalk_tables(run: RenderRun) -> list[dict[str, Any]]:
@@ -27,9 +26,9 @@ def crosstalk_tables(run: RenderRun) -> list[dict[str, Any]]:
     out = []
     recovered = run.recovered_dict()["cameras"]
     for name, table in run.crosstalk.items():
-        columns = [_columns(table, p) for p in range(len(PARAMETERS))]
-        model = recovered[name]["model"]
-        floors = [max(SAME, UNSEEN * model[f"{p.key}_sigma"]) for p in PARAMETERS]
+        columns = [_columns(run, table, p) for p in range(len(PARAMETERS))]
+        own = recovered[name][run.judged]
+        floors = [max(SAME, UNSEEN * own[f"{p.key}_sigma_noise"]) for p in PARAMETERS]
         groups = []
         ordered = sorted(range(len(table.motions)), key=lambda k: _first_use(table, k))
         for body, members in groupby(ordered, key=lambda k: table.motions[k].body):
@@ -47,15 +46,15 @@ def _first_use(table: CameraCrosstalk, k: int) -> int:
     return next(j for j, motion in enumerate(table.motions) if motion.body == table.motions[k].body)
 
 
-def _columns(table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
+def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
     """(heading, estimator) of one parameter; the two printed sets share a column where they are the same formula."""
     single, joint = (table.readings[e][parameter] for e in ("paper_single", "paper_joint"))
     same = np.allclose(single, joint, rtol=1e-9, atol=0.0)
     columns = []
-    for estimator in ESTIMATORS:
+    for estimator in run.estimators:
         if estimator == "paper_joint" and same:
             continue
-        heading = ESTIMATORS[estimator].title
+        heading = run.estimators[estimator].title
         if (estimator, parameter) in PRINTED:
             heading = "printed" if same else {"paper_single": "printed (7)", "paper_joint": "Table 1"}[estimator]
         columns.append((heading, estimator))

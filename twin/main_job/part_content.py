@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
@@ -48,7 +47,7 @@ def series_content(run: RenderRun) -> dict[str, Any] | None:
         "last": moment(float(series.times[-1])),
         "shown": moment(float(series.times[series.shown])),
         "tables": tables,
-        "worst": _worst(series),
+        "worst": _worst(series, run.judged),
         "smoothed": _smoothed(series),
         "files": [f"images/{c.camera}_{c.side}_course.tiff" for c in run.experiment.path.channels],
     }
@@ -60,8 +59,7 @@ def _row(
     cells = []
     finest = min(float(np.median(sigma)) for _, sigma in values.values())
     places = decimals_for(finest)
-    for estimator in ESTIMATORS:
-        value, sigma = values[estimator]
+    for estimator, (value, sigma) in values.items():
         error = float(np.sqrt(np.mean((value - true) ** 2)))
         size = float(np.sqrt(np.mean(sigma**2)))
         cells.append(
@@ -102,15 +100,15 @@ def _smoothed(series: TimeSeries) -> dict[str, str] | None:
     return {"name": together.name, "text": text}
 
 
-def _worst(series: TimeSeries) -> dict[str, str]:
-    """The camera that the model reads worst in Δα, by how much, when, and how much truly happened, in arcsec."""
+def _worst(series: TimeSeries, estimator: str) -> dict[str, str]:
+    """The camera that an estimator reads worst in Δα, by how much, when, and how much truly happened, in arcsec."""
     errors = {
-        name: (estimators["model"].vector[:, 0] - series.truth[name][0]) * PER_SI[0]
+        name: (estimators[estimator].vector[:, 0] - series.truth[name][0]) * PER_SI[0]
         for name, estimators in series.parameters.items()
     }
     name = max(errors, key=lambda n: float(np.max(np.abs(errors[n]))))
     k = int(np.argmax(np.abs(errors[name])))
-    sigma = float(series.parameters[name]["model"].sigma[k, 0]) * PER_SI[0]
+    sigma = float(series.parameters[name][estimator].sigma[k, 0]) * PER_SI[0]
     true = float(series.truth[name][0, k]) * PER_SI[0]
     places = decimals_for(sigma)
     return {

@@ -9,14 +9,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from analysis.monitor.estimators import ESTIMATORS
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
+from twin.main_job.assumptions import assumed
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
 from twin.main_job.render_report import PICTURES, write_report
 from twin.main_job.render_results import PROGRAM, RenderRun
-from twin.main_job.report_labels import ANGLE, PARAMETERS, Parameter
+from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.summary_plot import write_summary
 from twin.main_job.verdict import judge, recovered_numbers
 from twin.pictures.picture import write_pictures
@@ -34,7 +34,12 @@ from twin.targets.target_result import EdgeReading, TargetRun
 from twin.uncertainty.uncertainty_report import limits_section
 
 DECIMALS = {"d_alpha_arcsec": 4, "d_beta_arcsec": 4, "d_gamma_arcsec": 3, "d_f_um": 2, ANGLE.key: 4}
+DECIMALS |= dict.fromkeys((p.key for p in GROUND), 3)
 """Of a parameter in the terminal's table."""
+NUMBER = 7
+"""Width of most numbers there."""
+WIDE = 90
+"""Columns of a terminal from which on the table also has the noise's part of sigma."""
 
 _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
 """How the terminal names the direction in which the MTF is measured."""
@@ -106,7 +111,8 @@ def _print_result(run: RenderRun, console: Console) -> None:
     """The verdict, the result table and what to bear in mind."""
     told = judge(run)
     print_verdict(console, told.verdict)
-    print_whole(console, _table(run))
+    print_whole(console, _table(run, console.width >= WIDE))
+    console.print(f"{assumed(run)}.", markup=False, highlight=False, soft_wrap=True)
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:
@@ -148,28 +154,37 @@ def _value(edge: EdgeReading) -> str:
     return "none" if edge.nyquist is None else f"{edge.nyquist[0]:.3f}"
 
 
-def _table(run: RenderRun) -> Table:
-    """What every estimator recovered, beside the truth."""
+def _head(name: str) -> str:
+    """An estimator's name, broken where it is wider than the numbers below it."""
+    words = [
+        word if len(word) <= NUMBER else f"{word[: NUMBER - 2]}-\n{word[NUMBER - 2 :]}" for word in name.split("_")
+    ]
+    return "\n".join(words)
+
+
+def _table(run: RenderRun, wide: bool) -> Table:
+    """What every estimator recovered, beside the truth, with sigma and error of the judged one."""
     truth, recovered = run.truth_dict(), run.recovered_dict()
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
     if run.series is not None:
         title += f"\nat {moment(float(run.series.times[run.series.shown]))} of the course"
     table = result_table(title)
-    table.padding = 0
+    table.padding, table.show_edge = 0, False  # for 80 columns
     table.add_column("", no_wrap=True)
-    names = (name.replace("_", "\n") for name in ESTIMATORS)
-    heads = ("true", *names, "sigma", "model\n- true", "in\nsigma")
-    for head in heads:
+    judged = run.judged
+    sigmas = ["σ", "σ of\nnoise"] if wide else ["σ"]
+    for head in ("true", *map(_head, run.estimators), *sigmas, "error", "in σ"):
         table.add_column(head, justify="right", no_wrap=True)
 
     def add(p: Parameter, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
-        decimals = DECIMALS[p.key]
-        model, sigma = estimators["model"][p.key], estimators["model"][f"{p.key}_sigma"]
-        values = [true, *(estimators[name][p.key] for name in ESTIMATORS), sigma]
+        decimals, own = DECIMALS[p.key], estimators[judged]
+        sigma, error = own[f"{p.key}_sigma"], own[p.key] - true
+        values = [true, *(estimators[name][p.key] for name in run.estimators), sigma]
+        values += [own[f"{p.key}_sigma_noise"]] * wide
         # adding 0.0 after rounding leaves no minus before a zero
         cells = [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in values]
         label = escape(f"{p.symbol} [{p.unit}]")
-        table.add_row(label, *cells, f"{model - true:+.{decimals}f}", f"{(model - true) / sigma:+.1f}")
+        table.add_row(label, *cells, f"{error:+.{decimals}f}", f"{round(error / sigma, 1) + 0.0:+.1f}")
 
     for camera, estimators in recovered["cameras"].items():
         table.add_row(f"[bold]{escape(camera)}[/]")
@@ -178,4 +193,8 @@ def _table(run: RenderRun) -> Table:
     if "intersection_angle" in truth:
         table.add_row("[bold]both[/]")
         add(ANGLE, truth["intersection_angle"][ANGLE.key], recovered["intersection_angle"])
+    if "ground" in truth:
+        table.add_row("[bold]ground[/]")
+        for p in GROUND:
+            add(p, truth["ground"][p.key], recovered["ground"])
     return table

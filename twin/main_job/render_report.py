@@ -10,8 +10,7 @@ from typing import Any
 import cv2
 from markupsafe import Markup
 
-from analysis.monitor.estimators import ESTIMATORS
-from twin.main_job import crosstalk_content, part_content, report_content, report_labels
+from twin.main_job import assumptions, crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.motion_map import motion_map_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
@@ -37,7 +36,6 @@ PICTURES = {
 }
 """What the rendered pictures show."""
 JPEG_QUALITY = 88
-NUMBERS = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
 
 
 def write_report(
@@ -70,7 +68,7 @@ def render_report(
     paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
     tables = report_content.results(run)
     names = list(experiment.instrument.cameras)
-    titles = {name: estimator.title for name, estimator in ESTIMATORS.items()}
+    titles = {name: estimator.title for name, estimator in run.estimators.items()}
     figures = {
         "spots": {name: Markup(spots_svg(run, name)) for name in names},
         "residuals": Markup(residuals_svg(report_content.residual_panels(tables), titles)),
@@ -117,8 +115,11 @@ def render_report(
         figures=figures,
         sections=section_contents(sections),
         labels=report_labels,
-        estimators=ESTIMATORS,
-        number=NUMBERS.get(len(ESTIMATORS), str(len(ESTIMATORS))),
+        estimators=run.estimators,
+        judged=run.judged,
+        assumed=assumptions.assumed(run),
+        stated=report_content.stated(run),
+        family="; ".join(e.title for e in run.estimators.values() if not e.stated),
         far=f"{FAR:g}",
         run=run,
         pitch_um=f"{1e6 * experiment.path.pitch:g}",

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from analysis.monitor.estimators import ESTIMATORS
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.specs.channel import BASE
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, PARAMETERS
+from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import joined, systematics
 from twin.monitor.monitor_experiment import motions_of
-from twin.run.artefact import FAR, decimals_for, fixed, plain, residual, residual_text
+from twin.run.artefact import FAR, decimals_for, fixed, plain, residual, residual_text, shown_unit
 
 ZERO_CELSIUS = 273.15
+GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
 
 
 def setup(run: RenderRun) -> dict[str, Any]:
@@ -106,39 +107,78 @@ def _heat_text(field: Temperature) -> str:
     return text
 
 
+def stated(run: RenderRun) -> list[dict[str, Any]]:
+    """What is stated to move, cause by cause; nothing where nothing is."""
+    motions, spec = run.experiment.stated, run.resolved.disturbances
+    if motions is None or spec is None:
+        return []
+    out = []
+    for name, cause in spec.causes.items():
+        own = [c for c in motions.components if c.cause == name]
+        bodies = list(dict.fromkeys(c.body for c in own))
+        sizes: dict[tuple[str, str], list[str]] = {}
+        for c in own:
+            if c.body == bodies[0]:
+                size = f"{plain(c.sigma / c.unit_size)} {shown_unit(c.unit)}"
+                sizes.setdefault((c.kind, size), []).append(c.what.removeprefix(c.kind).strip())
+        what = []
+        for (kind, size), axes in sizes.items():
+            which = "" if axes in (["x", "y", "z"], [""]) else f" {', '.join(axes)}"
+            what.append(f"{kind.replace('_', ' ')}{which} {size}")
+        together = "" if cause.together is None else f"; bodies together {plain(cause.together)}"
+        together += f"; {len(cause.correlations)} correlations" * bool(cause.correlations)
+        out.append(
+            {
+                "name": name.replace("_", " "),
+                "bodies": ", ".join(cause.bodies),
+                "count": len(bodies),
+                "what": "; ".join(what) + together,
+                "time": cause.time.text,
+                "reason": cause.reason,
+            }
+        )
+    return out
+
+
 def results(run: RenderRun) -> list[dict[str, Any]]:
-    """Tables of recovered against true: one per camera, one for the angle."""
+    """Tables of recovered against true: one per camera, one for the angle, one for the ground."""
     recovered, truth = run.recovered_dict(), run.truth_dict()
     tables = []
     for name, estimators in recovered["cameras"].items():
         rows = []
         for p in PARAMETERS:
-            values = {e: (estimators[e][p.key], estimators[e][f"{p.key}_sigma"]) for e in ESTIMATORS}
-            rows.append(_row(f"{name}.{p.key}", p.symbol, p.unit, p.meaning, truth["cameras"][name][p.key], values))
+            rows.append(_row(run, f"{name}.{p.key}", p, truth["cameras"][name], estimators))
         tables.append({"title": f"Camera {name}", "rows": rows})
     if "intersection_angle" in truth:
-        angle = recovered["intersection_angle"]
-        values = {e: (angle[e]["change_arcsec"], angle[e]["change_arcsec_sigma"]) for e in ESTIMATORS}
         true = truth["intersection_angle"]
         nominal = fixed(true["nominal_deg"], 4)
-        row = _row("intersection_angle", ANGLE.symbol, ANGLE.unit, ANGLE.meaning, true[ANGLE.key], values)
+        row = _row(run, "intersection_angle", ANGLE, true, recovered["intersection_angle"])
         tables.append({"title": f"Angle between the cameras, nominally {nominal}°", "rows": [row]})
+    if "ground" in truth:
+        rows = [_row(run, f"ground.{p.key}", p, truth["ground"], recovered["ground"]) for p in GROUND]
+        tables.append({"title": GROUND_TITLE, "rows": rows})
     return tables
 
 
 def _row(
-    key: str, symbol: str, unit: str, meaning: str, true: float, values: dict[str, tuple[float, float]]
+    run: RenderRun, key: str, p: Parameter, truth: Mapping[str, float], found: Mapping[str, Mapping[str, float]]
 ) -> dict[str, Any]:
-    finest = min((s for _, s in values.values() if s > 0), default=0.0)
+    true = truth[p.key]
+    sigmas = {estimator: values[f"{p.key}_sigma"] for estimator, values in found.items()}
+    noise = found[run.judged][f"{p.key}_sigma_noise"]
+    finest = min((s for s in sigmas.values() if s > 0), default=0.0)
     cells = []
-    for estimator, (value, sigma) in values.items():
+    for estimator, values in found.items():
+        value, sigma, own = values[p.key], sigmas[estimator], values[f"{p.key}_sigma_noise"]
         places = decimals_for(sigma)
         ratio = residual(value - true, sigma)
         cells.append(
             {
                 "key": f"{key}.{estimator}",
+                "estimator": estimator,
                 "value": fixed(value, places),
                 "sigma": fixed(sigma, places),
+                "noise": fixed(own, decimals_for(own)),
                 "residual": residual_text(ratio),
                 "far": ratio is not None and abs(ratio) > FAR,
                 "ratio": ratio,
@@ -146,10 +186,11 @@ def _row(
         )
     return {
         "key": key,
-        "symbol": symbol,
-        "unit": unit,
-        "meaning": meaning,
+        "symbol": p.symbol,
+        "unit": p.unit,
+        "meaning": p.meaning,
         "true": fixed(true, decimals_for(finest)),
+        "noise": fixed(noise, decimals_for(noise)),
         "cells": cells,
     }
 
@@ -158,7 +199,7 @@ def residual_panels(tables: list[dict[str, Any]]) -> dict[str, dict[str, dict[st
     """The residuals of ``results`` for the figure."""
 
     def ratios(row: dict[str, Any]) -> dict[str, float | None]:
-        return {e: cell["ratio"] for e, cell in zip(ESTIMATORS, row["cells"], strict=True)}
+        return {cell["estimator"]: cell["ratio"] for cell in row["cells"]}
 
     return {table["title"]: {row["symbol"]: ratios(row) for row in table["rows"]} for table in tables}
 
@@ -197,18 +238,21 @@ def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
 
 
 def goodness(run: RenderRun) -> list[dict[str, Any]]:
-    """Residuals of the model against what the crosstalk table says they must be."""
+    """Residuals of the judged estimator against what the crosstalk table says they must be; what is left over is noise,
+    and judged by it alone.
+    """
     out = []
     recovered, truth = run.recovered_dict()["cameras"], run.truth_dict()["cameras"]
     for name in run.experiment.instrument.cameras:
         found = systematics(run, name)
         rows = []
         for k, p in enumerate(PARAMETERS):
-            sigma = recovered[name]["model"][f"{p.key}_sigma"]
-            error = recovered[name]["model"][p.key] - truth[name][p.key]
-            bias = float(found.bias["model"][k])
-            places = decimals_for(sigma)
-            left = residual(error - bias, sigma)
+            own = recovered[name][run.judged]
+            sigma, noise = own[f"{p.key}_sigma"], own[f"{p.key}_sigma_noise"]
+            error = own[p.key] - truth[name][p.key]
+            bias = float(found.bias[run.judged][k])
+            places = decimals_for(noise)
+            left = residual(error - bias, noise)
             rows.append(
                 {
                     "symbol": p.symbol,
@@ -227,12 +271,13 @@ def goodness(run: RenderRun) -> list[dict[str, Any]]:
 
 def summary(tables: list[dict[str, Any]]) -> dict[str, Any]:
     """How many of each estimator's readings agree with the truth."""
-    counts = {e: [0, 0] for e in ESTIMATORS}
+    counts: dict[str, list[int]] = {}
     for table in tables:
         for row in table["rows"]:
-            for estimator, cell in zip(ESTIMATORS, row["cells"], strict=True):
-                counts[estimator][1] += 1
-                counts[estimator][0] += not cell["far"]
+            for cell in row["cells"]:
+                count = counts.setdefault(cell["estimator"], [0, 0])
+                count[1] += 1
+                count[0] += not cell["far"]
     return {e: {"good": good, "all": every} for e, (good, every) in counts.items()}
 
 

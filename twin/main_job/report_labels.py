@@ -31,6 +31,13 @@ PARAMETERS = (
 ANGLE = Parameter("change_arcsec", "Δθ", "arcsec", "change of the angle between the two lines of sight")
 """Of two cameras together."""
 
+GROUND = (
+    Parameter("along_m", "along", "m", "along the track, positive in flight direction"),
+    Parameter("across_m", "across", "m", "across the track, positive to the right"),
+    Parameter("height_m", "height", "m", "positive up"),
+)
+"""Errors of a pair's points on the ground that are located as if the cameras had not changed."""
+
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",
     "gaussian": "fit of a Gaussian",

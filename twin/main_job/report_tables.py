@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, PARAMETERS
+from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import systematics
 from twin.main_job.verdict import Reading, readings
 from twin.monitor.image_quality import PLACES
@@ -24,6 +23,7 @@ SPOT_COORDINATES = ("left y", "left x", "right y", "right x")
 def report_tables(run: RenderRun) -> dict[str, Table]:
     """Name -> table, of what the run has."""
     found = [_results(run), _spots(run), _residuals(run), _factors(run), _motions(run), *_parts(run)]
+    found += [_disturbances(run)] if run.experiment.stated is not None else []
     return {table.name: table for table in found}
 
 
@@ -42,21 +42,24 @@ def _table(name: str, heads: list[str], rows: list[list[Cell]]) -> Table:
     return Table(name, name.replace("_", " "), "", heads, rows)
 
 
-def _value_and_sigma(label: str) -> list[str]:
-    return [f"{estimator.title}{said}" for estimator in ESTIMATORS.values() for said in (label, " sigma")]
+def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
+    """Of each estimator its value, the total sigma and that of the noise."""
+    said = (label, " sigma", " sigma noise")
+    return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in said]
 
 
 def _results(run: RenderRun) -> Table:
     """One row for each change; over a course root mean squares of truth and errors over its times."""
     course = run.series is not None
     heads = ["camera", "parameter", "unit", "true rms" if course else "true"]
-    heads += _value_and_sigma(" error rms" if course else "")
+    heads += _value_and_sigma(run, " error rms" if course else "")
     rows: list[list[Cell]] = []
-    for same in zip(*(readings(run, estimator) for estimator in ESTIMATORS), strict=True):
+    for same in zip(*(readings(run, estimator) for estimator in run.estimators), strict=True):
         first: Reading = same[0]
-        row: list[Cell] = [first.camera or "both", first.parameter.symbol, first.parameter.unit, first.true]
+        where = first.camera or ("ground" if first.parameter in GROUND else "both")
+        row: list[Cell] = [where, first.parameter.symbol, first.parameter.unit, first.true]
         for one in same:
-            row += [one.error if course else one.value, one.sigma]
+            row += [one.error if course else one.value, one.sigma, one.noise]
         rows.append(row)
     return _table("results", heads, rows)
 
@@ -65,19 +68,21 @@ def _shown_state(run: RenderRun) -> Table:
     """As the results, of the one state of a course that is shown in full."""
     recovered, truth = run.recovered_dict(), run.truth_dict()
     rows: list[list[Cell]] = []
+
+    def add(where: str, p: Parameter, true: Mapping[str, float], found: Mapping[str, Mapping[str, float]]) -> None:
+        row: list[Cell] = [where, p.symbol, p.unit, true[p.key]]
+        for one in found.values():
+            row += [one[p.key], one[f"{p.key}_sigma"], one[f"{p.key}_sigma_noise"]]
+        rows.append(row)
+
     for camera, estimators in recovered["cameras"].items():
         for p in PARAMETERS:
-            row: list[Cell] = [camera, p.symbol, p.unit, truth["cameras"][camera][p.key]]
-            for estimator in ESTIMATORS:
-                row += [estimators[estimator][p.key], estimators[estimator][f"{p.key}_sigma"]]
-            rows.append(row)
+            add(camera, p, truth["cameras"][camera], estimators)
     if "intersection_angle" in truth:
-        key, row = ANGLE.key, ["both", ANGLE.symbol, ANGLE.unit, truth["intersection_angle"][ANGLE.key]]
-        for estimator in ESTIMATORS:
-            found = recovered["intersection_angle"][estimator]
-            row += [found[key], found[f"{key}_sigma"]]
-        rows.append(row)
-    return _table("shown_time", ["camera", "parameter", "unit", "true", *_value_and_sigma("")], rows)
+        add("both", ANGLE, truth["intersection_angle"], recovered["intersection_angle"])
+    for p in GROUND if "ground" in truth else ():
+        add("ground", p, truth["ground"], recovered["ground"])
+    return _table("shown_time", ["camera", "parameter", "unit", "true", *_value_and_sigma(run, "")], rows)
 
 
 def _spots(run: RenderRun) -> Table:
@@ -101,13 +106,16 @@ def _residuals(run: RenderRun) -> Table:
     recovered, truth = run.recovered_dict()["cameras"], run.truth_dict()["cameras"]
     rows: list[list[Cell]] = []
     for name in run.crosstalk:
-        bias = systematics(run, name).bias["model"]
+        bias = systematics(run, name).bias[run.judged]
         for k, p in enumerate(PARAMETERS):
-            model = recovered[name]["model"]
-            error = model[p.key] - truth[name][p.key]
+            own = recovered[name][run.judged]
+            error = own[p.key] - truth[name][p.key]
             expected = float(bias[k])
-            rows.append([name, p.symbol, p.unit, error, model[f"{p.key}_sigma"], expected, error - expected])
-    heads = ["camera", "parameter", "unit", "model - true", "sigma", "expected from the crosstalk", "left over"]
+            sigmas = own[f"{p.key}_sigma"], own[f"{p.key}_sigma_noise"]
+            rows.append([name, p.symbol, p.unit, error, *sigmas, expected, error - expected])
+    title = run.estimators[run.judged].title
+    heads = ["camera", "parameter", "unit", f"{title} - true", "sigma", "sigma noise", "expected from the crosstalk"]
+    heads += ["left over"]
     return _table("residuals", heads, rows)
 
 
@@ -126,17 +134,30 @@ def _motions(run: RenderRun) -> Table:
     pitch = 1e6 * run.experiment.path.pitch
     heads = ["camera", "motion", "body", "per", *(f"{name} [µm]" for name in SPOT_COORDINATES)]
     heads += [f"{p.symbol} [{p.unit}] true" for p in PARAMETERS]
-    heads += [f"{p.symbol} [{p.unit}] {estimator.title}" for estimator in ESTIMATORS.values() for p in PARAMETERS]
+    heads += [f"{p.symbol} [{p.unit}] {estimator.title}" for estimator in run.estimators.values() for p in PARAMETERS]
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
             row: list[Cell] = [name, motion.label, motion.body, shown_unit(motion.unit)]
             row += [float(shift) * pitch for shift in table.spot_shift[:, k]]
             row += [float(true) for true in table.true[:, k]]
-            for estimator in ESTIMATORS:
+            for estimator in run.estimators:
                 row += [float(reading) for reading in table.readings[estimator][:, k]]
             rows.append(row)
     return _table("motions", heads, rows)
+
+
+def _disturbances(run: RenderRun) -> Table:
+    """Every component that is stated to move."""
+    assert run.experiment.stated is not None
+    assert run.resolved.disturbances is not None
+    causes = run.resolved.disturbances.causes
+    rows: list[list[Cell]] = [
+        [c.cause, c.body, c.what, c.sigma / c.unit_size, shown_unit(c.unit), cause.time.text, cause.reason]
+        for c in run.experiment.stated.components
+        for cause in [causes[c.cause]]
+    ]
+    return _table("disturbances", ["cause", "body", "motion", "sigma", "unit", "in time", "reason"], rows)
 
 
 def _parts(run: RenderRun) -> Iterator[Table]:
@@ -162,9 +183,10 @@ def _course(run: RenderRun) -> Table:
                 row: list[Cell] = [float(time), camera, p.symbol, p.unit]
                 row.append(float(run.series.truth[camera][k, t] * PER_SI[k]))
                 for found in estimators.values():
-                    row += [float(found.vector[t, k] * PER_SI[k]), float(found.sigma[t, k] * PER_SI[k])]
+                    columns = (found.vector, found.sigma, found.sigma_noise)
+                    row += [float(column[t, k] * PER_SI[k]) for column in columns]
                 rows.append(row)
-    return _table("course", ["time [s]", "camera", "parameter", "unit", "true", *_value_and_sigma("")], rows)
+    return _table("course", ["time [s]", "camera", "parameter", "unit", "true", *_value_and_sigma(run, "")], rows)
 
 
 def _stray(run: RenderRun) -> Iterator[Table]:

@@ -32,6 +32,8 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, INK, GREY)
 """Of the nodes; after the last one they begin again, with the next line style."""
 STYLES = ("-", "--", ":")
 """Of the first nodes, and of those whose colour has been used before."""
+BESIDE = 0.12
+"""Distance of the marks of two estimators at one time, part of the distance of two times."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
 """From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
 
@@ -202,10 +204,13 @@ def _panel(
     names: dict[str, str],
 ) -> None:
     _frame(axes, series, time)
-    for estimator, (marker, colour) in marks().items():
+    # side by side, or the bars hide each other
+    step = BESIDE * float(np.min(np.diff(time), initial=np.inf)) if len(time) > 1 else 0.0
+    for j, (estimator, (marker, colour)) in enumerate(marks(names).items()):
         value, sigma = values[estimator]
+        place = time + (j - 0.5 * (len(names) - 1)) * step
         axes.errorbar(
-            time, value, sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,
+            place, value, sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,
             label=names[estimator],
         )  # fmt: skip
     axes.plot(time, true, color=INK, lw=1.5, label="true", zorder=1.5)

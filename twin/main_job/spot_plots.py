@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import cycle
 from typing import Any
 
@@ -157,9 +158,14 @@ _MARKS = (
 )
 
 
-def marks() -> dict[str, tuple[str, str]]:
-    """Estimator -> marker and colour: told apart by shape as well as by colour, while there are at most eight."""
-    return dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
+def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Estimator -> marker and colour: told apart by shape as well as by colour, while there are at most eight.
+
+    Args:
+        names: of the estimators in a figure; each has its mark whatever others are there.
+    """
+    every = dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
+    return {name: every[name] for name in names}
 
 
 def residuals_svg(panels: dict[str, dict[str, dict[str, float | None]]], names: dict[str, str]) -> str:
@@ -199,7 +205,7 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
     axes.axvspan(-FAR, FAR, color="#eef3f8", lw=0)
     axes.axvline(0.0, color=GREY, lw=0.8)
     place = {label: k for k, label in enumerate(panel)}
-    found = marks()
+    found = marks(names)
     for j, (estimator, (marker, colour)) in enumerate(found.items()):
         points = [(r, place[label]) for label, row in panel.items() if (r := row.get(estimator)) is not None]
         offset = (j - 0.5 * (len(found) - 1)) * min(0.19, 0.76 / len(found))

@@ -8,15 +8,18 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.monitor.estimators import ESTIMATORS
+from twin.main_job.assumptions import assumed
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import results
 from twin.main_job.spot_plots import GRAY, airy_radius, core_window, cross, mean_images, stretch
+from twin.main_job.verdict import limited
 from twin.run.artefact import FAR
 from twin.run.svg import AFTER, BEFORE, BLUE, GREY, INK, LIGHT, VERMILION, look, to_png
 
 WIDTH, DPI = 14.0, 100
 """Inches and dots per inch: 1400 px wide."""
+FIRST = 0.22
+"""Where the column of the truth ends, part of the width."""
 REACH = 2.2
 """Half-width of the pictures in Airy radii around both centres."""
 
@@ -38,7 +41,7 @@ def _draw(run: RenderRun) -> Figure:
     tables = results(run)
     lines = 1 + sum(1 + len(table["rows"]) for table in tables)
     picture = WIDTH / columns
-    heights = (2.0 * picture + 0.5, 0.27 * lines + 0.5)
+    heights = (2.0 * picture + 0.5, 0.27 * lines + 0.73)
     figure = Figure(figsize=(WIDTH, sum(heights)), facecolor="white")
     top = heights[0] / sum(heights)
     before, after = mean_images(run)
@@ -79,11 +82,12 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
     count = 1 + sum(1 + len(table["rows"]) for table in tables)
-    axes.set_ylim(count + 1.2, 0.0)
-    # columns share the width that four of them take
-    step = 4 * 0.172 / len(ESTIMATORS)
-    edges = [0.30, *(0.303 + step + step * k for k in range(len(ESTIMATORS)))]
-    heads = ["true", *(estimator.title for estimator in ESTIMATORS.values())]
+    axes.set_ylim(count + 2.05, 0.0)
+    estimators = list(run.estimators.values())
+    # columns share the width that is left by the names and the truth
+    step = (0.99 - FIRST) / len(estimators)
+    edges = [FIRST, *(FIRST + step * (k + 1) for k in range(len(estimators)))]
+    heads = ["true", *(estimator.title for estimator in estimators)]
     y = 0.6
     axes.text(0.01, y, f"{run.resolved.instrument.name}, {run.frames} frames", fontsize=12.5, va="center", color=GREY)
     for x, head in zip(edges, heads, strict=True):
@@ -101,5 +105,8 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
                 axes.text(x - 0.013, y, text, fontsize=12.5, ha="right", va="center", color=INK)
                 mark, colour = ("▲", VERMILION) if cell["far"] else ("●", BLUE)
                 axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
-    note = f"● within {FAR:g} sigma of the truth, ▲ beyond: a wrong factor, or a motion that the formula does not know"
-    axes.text(0.99, count + 0.7, note, fontsize=10.5, ha="right", va="center", color=GREY)
+    y = count + 0.7
+    limit = f" {limited(run)}." if limited(run) else ""
+    for line in (f"{assumed(run)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"):
+        axes.text(0.01, y, line, fontsize=10.5, ha="left", va="center", color=GREY)
+        y += 0.85

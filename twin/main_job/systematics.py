@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitor.estimators import ESTIMATORS
+from analysis.monitor.monitoring import PER_SI
 from optics.geometry.tree import Motion
 from scenes.specs.channel import BASE, CENTRAL_PRISM
 from twin.main_job.render_results import RenderRun
@@ -16,7 +16,7 @@ from twin.monitor.motions import ElementaryMotion
 from twin.run.artefact import plain, shown_unit
 
 FAMILY = 4
-"""The first motions of a crosstalk table are the family that the estimators assume."""
+"""The first motions of a crosstalk table are the family that the estimators of paper 001 assume."""
 SHOWN = 1e-3
 """Least amount of a motion, in its table unit, that is spoken of."""
 
@@ -27,32 +27,64 @@ HEAT = "temperatures (expansion, bending, change of index)"
 
 @dataclass(frozen=True, eq=False)
 class Systematics:
-    """What the crosstalk table makes of a run's motions, for one camera.
+    """What the crosstalk tables make of a run's motions, for one camera.
 
     Attributes:
         bias: estimator -> (4,) reading minus truth, to first order, in the units of the results.
-        outside: motions of this run outside the family, as text with amounts.
-        parts: of each of these its share of the model's bias, (4,).
+        outside: motions of this camera outside the family, as text with amounts.
+        parts: motion, as text with its amount -> its share of the judged estimator's bias, (4,); also motions of other
+            cameras where that estimator takes all spots together.
         uncovered: what was moved but is in no row of the table.
     """
 
     bias: dict[str, np.ndarray]
     outside: tuple[str, ...]
-    parts: tuple[np.ndarray, ...]
+    parts: dict[str, np.ndarray]
     uncovered: tuple[str, ...]
 
 
 def systematics(run: RenderRun, camera: str) -> Systematics:
-    """Sum the crosstalk table over the motions of a run."""
+    """Sum the crosstalk tables over the motions of a run."""
+    amounts = {
+        name: np.array([_amount(run, motion) for motion in table.motions]) for name, table in run.crosstalk.items()
+    }
+    k = list(run.crosstalk).index(camera)
+    rows = slice(4 * k, 4 * k + 4)
+    moved = np.concatenate([table.spot_shift @ amounts[name] for name, table in run.crosstalk.items()])
     table = run.crosstalk[camera]
-    amounts = np.array([_amount(run, motion) for motion in table.motions])
-    bias = {e: (table.readings[e] - table.true) @ amounts for e in ESTIMATORS}
-    others = [k for k in range(FAMILY, len(amounts)) if abs(amounts[k]) > SHOWN]
-    names = [(table.motions[k], plain(float(amounts[k]), 4)) for k in others]
-    outside = tuple(f"{motion.label}, {amount} {shown_unit(motion.unit)}" for motion, amount in names)
-    wrong = table.readings["model"] - table.true
-    parts = tuple(wrong[:, k] * amounts[k] for k in others)
-    return Systematics(bias, outside, parts, _uncovered(run, camera, table))
+    true = table.true @ amounts[camera]
+    bias = {e: PER_SI * (gain[rows] @ moved) - true for e, gain in run.gains.items()}
+    others = [i for i in range(FAMILY, len(table.motions)) if abs(amounts[camera][i]) > SHOWN]
+    outside = tuple(_told(table.motions[i], amounts[camera][i]) for i in others)
+    return Systematics(bias, outside, _parts(run, camera, amounts), _uncovered(run, camera, table))
+
+
+def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Of each motion that the judged estimator does not read as it is."""
+    names = list(run.crosstalk)
+    gain = PER_SI[:, None] * run.gains[run.judged][4 * names.index(camera) : 4 * names.index(camera) + 4]
+    # what weighs all motions by what is stated takes none of them as it is
+    known = 0 if run.estimators[run.judged].stated else FAMILY
+    out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
+    for j, (name, table) in enumerate(run.crosstalk.items()):
+        for i, motion in enumerate(table.motions):
+            if i < known or abs(amounts[name][i]) <= SHOWN:
+                continue
+            read = gain[:, 4 * j : 4 * j + 4] @ table.spot_shift[:, i]
+            part = (read - (table.true[:, i] if name == camera else 0.0)) * amounts[name][i]
+            if not np.any(part):
+                continue
+            # what both cameras look at stands in both tables
+            key = (motion.body, motion.kind, motion.axis)
+            told = _told(motion, amounts[name][i])
+            told = told if name == camera or motion.body == CENTRAL_PRISM else f"{name}: {told}"
+            before = out.get(key)
+            out[key] = (told, part) if before is None else (before[0], before[1] + part)
+    return dict(out.values())
+
+
+def _told(motion: ElementaryMotion, amount: float) -> str:
+    return f"{motion.label}, {plain(float(amount), 4)} {shown_unit(motion.unit)}"
 
 
 def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.course import moment
+from twin.main_job.assumptions import NOISE, combination, contradiction, limits, share_text
 from twin.main_job.render_results import RenderRun, stated
-from twin.main_job.report_labels import ANGLE, PARAMETERS, Parameter
+from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import joined, systematics
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.time_series import TimeSeries
@@ -28,15 +28,14 @@ __all__ = [
     "Reading",
     "alarm_limit",
     "judge",
+    "limited",
     "readings",
     "recovered_numbers",
     "sharpness_lost",
 ]
 
-JUDGED = "model"
-"""Estimator that the sentence is about; warnings are about all."""
 FALSE_ALARM = 1e-3
-"""Chance that noise alone makes any warning of a misreading in a run."""
+"""Chance that noise and disturbances as stated make any warning of a misreading in a run."""
 EXPLAINED = 0.2
 """Share of an error that may be left over where it is called explained to first order."""
 SOFTER = 0.05
@@ -54,10 +53,11 @@ class Reading:
     Over a course, true, value and error are root mean squares over its times.
 
     Attributes:
-        camera: whose; empty for the angle between the cameras.
+        camera: whose; empty for the angle between the cameras and for errors on the ground.
         parameter: which of its changes.
         estimator: who reads it.
-        true, value, sigma, error: error is value minus true.
+        true, value, sigma, error: error is value minus true; sigma is the total one.
+        noise: of sigma what the noise of the images does.
     """
 
     camera: str
@@ -67,6 +67,7 @@ class Reading:
     value: float
     sigma: float
     error: float
+    noise: float
 
     @property
     def ratio(self) -> float:
@@ -83,6 +84,8 @@ class Reading:
     @property
     def name(self) -> str:
         """``Δα of forward``."""
+        if self.parameter in GROUND:
+            return f"{self.parameter.symbol} on the ground"
         return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
 
     def shown(self, value: float, sign: bool = False) -> str:
@@ -104,7 +107,9 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """All readings of an estimator: four of each camera, then the angle; over a course root mean squares."""
+    """All readings of an estimator: four of each camera, then the angle and the errors on the ground; over a course
+    root mean squares.
+    """
     return tuple(_series_readings(run.series, estimator) if run.series else _state_readings(run, estimator))
 
 
@@ -115,27 +120,36 @@ def _state_readings(run: RenderRun, estimator: str) -> Iterator[Reading]:
             yield _reading(camera, p, estimator, truth["cameras"][camera], estimators[estimator])
     if "intersection_angle" in truth:
         yield _reading("", ANGLE, estimator, truth["intersection_angle"], recovered["intersection_angle"][estimator])
+    if "ground" in truth:
+        for p in GROUND:
+            yield _reading("", p, estimator, truth["ground"], recovered["ground"][estimator])
 
 
 def _reading(
     camera: str, p: Parameter, estimator: str, truth: Mapping[str, float], found: Mapping[str, float]
 ) -> Reading:
     true, value = truth[p.key], found[p.key]
-    return Reading(camera, p, estimator, true, value, found[f"{p.key}_sigma"], value - true)
+    sigma, noise = found[f"{p.key}_sigma"], found[f"{p.key}_sigma_noise"]
+    return Reading(camera, p, estimator, true, value, sigma, value - true, noise)
 
 
 def _series_readings(series: TimeSeries, estimator: str) -> Iterator[Reading]:
     for camera, estimators in series.parameters.items():
         found = estimators[estimator]
         for k, p in enumerate(PARAMETERS):
-            true, value, sigma = (
-                PER_SI[k] * v for v in (series.truth[camera][k], found.vector[:, k], found.sigma[:, k])
-            )
-            yield Reading(camera, p, estimator, _rms(true), _rms(value), _rms(sigma), _rms(value - true))
+            both = found.sigma[:, k], found.sigma_noise[:, k]
+            columns = (PER_SI[k] * v for v in (series.truth[camera][k], found.vector[:, k], *both))
+            yield _rms_reading(camera, p, estimator, *columns)
     if series.recovered_angle:
         angle = series.recovered_angle[estimator]
-        true, value, sigma = (v / ARCSEC for v in (series.angle_change, angle.change_rad, angle.sigma_rad))
-        yield Reading("", ANGLE, estimator, _rms(true), _rms(value), _rms(sigma), _rms(value - true))
+        columns = (v / ARCSEC for v in (series.angle_change, angle.change_rad, angle.sigma_rad, angle.noise_rad))
+        yield _rms_reading("", ANGLE, estimator, *columns)
+
+
+def _rms_reading(camera: str, p: Parameter, estimator: str, *columns: np.ndarray) -> Reading:
+    """Of true values, readings, their sigmas and those of the noise over the times."""
+    true, value, sigma, noise = columns
+    return Reading(camera, p, estimator, *map(_rms, (true, value, sigma, value - true, noise)))
 
 
 def _rms(values: np.ndarray) -> float:
@@ -144,7 +158,7 @@ def _rms(values: np.ndarray) -> float:
 
 def judge(run: RenderRun) -> Judgement:
     """Judge a run by its readings, sigmas, truth and crosstalk."""
-    found = readings(run, JUDGED)
+    found = readings(run, run.judged)
     off = [r for r in found if r.far]
     if run.series is not None:
         verdict = _series_verdict(run, run.series, found, off)
@@ -154,7 +168,9 @@ def judge(run: RenderRun) -> Judgement:
         verdict = _misled(run, found, off)
     else:
         verdict = _recovered(run, found)
-    return Judgement(f"{verdict}{_dimmed(run)}{_blurred(run)}.", (*run.warnings, *_misreadings(run)))
+    warnings = (*run.warnings, *contradiction(run), *_misreadings(run))
+    limit = f"; {limited(run)}" if limited(run) else ""
+    return Judgement(f"{verdict}{limit}{_dimmed(run)}{_blurred(run)}.", warnings)
 
 
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
@@ -168,28 +184,43 @@ def _moves(motion: Motion) -> bool:
     return any(moved) or any(motion.figure.values())
 
 
-def _noise(run: RenderRun, found: tuple[Reading, ...]) -> str:
-    """The least changes that the noise lets through, of the parameters of the cameras."""
+def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
+    """The least changes that can be told from none, of the parameters of the cameras."""
     parts = []
     for p in PARAMETERS:
         worst = max((r for r in found if r.parameter == p), key=lambda r: r.sigma)
         parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
-    return f"with {run.frames} frames the noise of the images hides changes below {', '.join(parts)} ({FAR:g} σ)"
+    who = (
+        f"with {run.frames} frames the noise of the images hides" if _noise_only(run) else "noise and disturbances hide"
+    )
+    return f"{who} changes below {', '.join(parts)} ({FAR:g} σ)"
 
 
-def _within(found: tuple[Reading, ...]) -> str:
-    return f"all {len(found)} readings of the model are within {FAR:g} σ of"
+def _noise_only(run: RenderRun) -> bool:
+    return run.experiment.disturbances is None
+
+
+def _told(run: RenderRun) -> str:
+    return run.estimators[run.judged].title
+
+
+def _within(run: RenderRun, found: tuple[Reading, ...], of: str, how: str = "") -> str:
+    """``all 12 readings ... are within 3 σ of the truth``, and what σ is of."""
+    stated = run.experiment.disturbances
+    basis = "noise alone" if stated is None else f"noise and disturbances {stated.name}"
+    return f"all {len(found)} readings of the {_told(run)} are within {FAR:g} σ of {of} ({how}σ: {basis})"
 
 
 def _nothing(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> str:
     if not off:
-        return f"Nothing was perturbed and nothing is read: {_within(found)} zero; {_noise(run, found)}"
+        return f"Nothing was perturbed and nothing is read: {_within(run, found, 'zero')}; {_hidden(run, found)}"
     worst = max(off, key=lambda r: abs(r.ratio))
     chance = _chance(worst.ratio, len(found))
-    why = "look at the warnings and at the spots" if chance < FALSE_ALARM else "which noise alone does now and then"
+    why = "look at the warnings and at the spots" if chance < FALSE_ALARM else "which is chance"
     return (
-        f"Nothing was perturbed, but {len(off)} of {len(found)} readings of the model {_are(off)} beyond {FAR:g} σ, "
-        f"the worst {worst.name}, {worst.read}; noise reaches that in {100.0 * chance:.2g} % of such runs: {why}"
+        f"Nothing was perturbed, but {len(off)} of {len(found)} readings of the {_told(run)} {_are(off)} beyond "
+        f"{FAR:g} σ, the worst {worst.name}, {worst.read}; by chance that happens in {100.0 * chance:.2g} % of such "
+        f"runs: {why}"
     )
 
 
@@ -202,31 +233,68 @@ def _are(what: list[Reading]) -> str:
     return "is" if len(what) == 1 else "are"
 
 
+def _changes(found: tuple[Reading, ...]) -> list[Reading]:
+    """Without the errors on the ground, which follow from them."""
+    return [r for r in found if r.parameter not in GROUND]
+
+
 def _recovered(run: RenderRun, found: tuple[Reading, ...]) -> str:
     seen = [r for r in found if abs(r.true) > FAR * r.sigma]
-    largest = max(found, key=lambda r: abs(r.true) / r.sigma if r.sigma else abs(r.true))
+    clear = _changes(found)
+    largest = max(clear, key=lambda r: abs(r.true) / r.sigma if r.sigma else abs(r.true))
     if seen:
         hidden = len(found) - len(seen)
-        others = f" and {hidden} hide{'s' * (hidden == 1)} in it" if hidden else ""
+        others = f" and {hidden} {'do' if hidden > 1 else 'does'} not" if hidden else ""
         return (
-            f"Recovered: {_within(found)} the truth, {len(seen)} of the changes stand{'s' * (len(seen) == 1)} out of "
-            f"the noise{others}; the clearest, {largest.name}, is read as {largest.read} and is "
-            f"{largest.shown(largest.true)}; {_noise(run, found)}, more frames or light would show more"
+            f"Recovered: {_within(run, found, 'the truth')}, {len(seen)} of the changes stand{'s' * (len(seen) == 1)} "
+            f"out of σ{others}; the clearest, {largest.name}, is read as {largest.read} and is "
+            f"{largest.shown(largest.true)}; {_hidden(run, found)}{_frames(run, found)}"
         )
     if not any(abs(r.true) > SAME * r.sigma for r in found):
-        return f"What was perturbed changes no camera, and nothing is read: {_within(found)} zero; {_noise(run, found)}"
+        nothing = "What was perturbed changes no camera, and nothing is read"
+        return f"{nothing}: {_within(run, found, 'zero')}; {_hidden(run, found)}"
     times = abs(largest.true) / largest.sigma if largest.sigma else 0.0
-    need = math.ceil(run.frames * (FAR / times) ** 2) if times > 0.0 else math.inf
-    advice = f"; about {need} frames would show it" if need <= MOST_FRAMES else ""
     size = f"{significant(abs(largest.true), 2)} {largest.parameter.unit}, {significant(times, 2)} σ"
+    beneath = "the noise" if _noise_only(run) else "what noise and disturbances do"
     return (
-        f"The perturbation stays beneath the noise: no true change reaches {FAR:g} σ, the clearest is that of "
-        f"{largest.name} ({size}), and {_within(found)} the truth; {_noise(run, found)}{advice}"
+        f"The perturbation stays beneath {beneath}: no true change reaches {FAR:g} σ, the clearest is that of "
+        f"{largest.name} ({size}), and {_within(run, found, 'the truth')}; {_hidden(run, found)}"
+        f"{_needed(run, largest)}"
+    )
+
+
+def _frames(run: RenderRun, found: tuple[Reading, ...]) -> str:
+    """Whether more frames help: they do against the noise alone."""
+    if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(found)):
+        return ", more frames or light would show more"
+    return ", and more frames do not change that"
+
+
+def _needed(run: RenderRun, clearest: Reading) -> str:
+    """How many frames would show a change, where any number does: they lower the noise and nothing else."""
+    allowed = (clearest.true / FAR) ** 2 - (clearest.sigma**2 - clearest.noise**2)
+    need = math.ceil(run.frames * clearest.noise**2 / allowed) if allowed > 0.0 else math.inf
+    return f"; about {need} frames would show it" if need <= MOST_FRAMES else ""
+
+
+def limited(run: RenderRun) -> str:
+    """Which body limits what a pair is for, the angle; of other instruments the reading that is farthest off. Empty
+    where nothing is stated.
+    """
+    if _noise_only(run):
+        return ""
+    found = readings(run, run.judged)
+    about = next((r for r in found if r.parameter == ANGLE), max(found, key=lambda r: abs(r.ratio)))
+    body, share = limits(run, about.camera, about.parameter)
+    what = body if body == NOISE else f"motions of {body}"
+    return (
+        f"σ of {about.name}, {significant(about.sigma, 2)} {about.parameter.unit}, is limited by {what} "
+        f"({share_text(share)} of its variance)"
     )
 
 
 def _misled(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> str:
-    own = [r for r in off if r.camera] or off
+    own = [r for r in off if r.camera] or _changes(tuple(off)) or off
     worst = max(own, key=lambda r: abs(r.ratio))
     return (
         f"{_score(found, off)}: the worst, {worst.name}, is read as {worst.read} and is {worst.shown(worst.true)}, "
@@ -248,51 +316,80 @@ def _share(worst: Reading) -> str:
     return f" or {significant(100.0 * abs(worst.error / worst.true), 2, floor=0.0)} % of the change"
 
 
+def _unknown(run: RenderRun) -> str:
+    """What is wrong with a motion that an estimator takes for something else."""
+    if run.estimators[run.judged].stated:
+        return "larger than stated"
+    return f"that the {_told(run)} does not know"
+
+
 def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     """What makes an error, as far as the crosstalk table knows, and where to look; ``count``: of all readings."""
-    cameras = [worst.camera] if worst.camera else list(run.crosstalk)
-    # the angle is made of the cameras' rotations about Y
-    k = PARAMETERS.index(worst.parameter) if worst.camera else 0
-    found = [systematics(run, name) for name in cameras]
-    bias = sum(float(one.bias[JUDGED][k]) for one in found)
+    cameras = list(run.crosstalk)
+    found = {name: systematics(run, name) for name in cameras}
+    # a change of one camera, or what the angle and the ground are made of, per unit of the results
+    weights = combination(run, worst.camera, worst.parameter).reshape(-1, 4) / PER_SI
+    used = [name for name, weight in zip(cameras, weights, strict=True) if np.any(weight)]
+    bias = sum(float(w @ found[name].bias[run.judged]) for name, w in zip(cameras, weights, strict=True))
     chance = _chance(worst.ratio, count)
     if chance > FALSE_ALARM and abs(bias) < 0.5 * abs(worst.error):
-        return f"noise alone does as much in {100.0 * chance:.2g} % of such runs, so look at more frames"
-    parts = [(text, float(part[k])) for one in found for text, part in zip(one.outside, one.parts, strict=True)]
-    names = joined([text for text, _ in parts])
-    explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.sigma, EXPLAINED * abs(worst.error))
+        advice = "look at more frames" if _noise_only(run) else "look at more measurements"
+        return f"chance alone does as much in {100.0 * chance:.2g} % of such runs, so {advice}"
+    parts: dict[str, float] = {}
+    for name in used:
+        for text, vector in found[name].parts.items():
+            parts[text] = parts.get(text, 0.0) + float(weights[cameras.index(name)] @ vector)
+    explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.noise, EXPLAINED * abs(worst.error))
     if parts and explained:
-        text, part = max(parts, key=lambda pair: pair[1] / worst.error)
+        text, part = max(parts.items(), key=lambda pair: pair[1] / worst.error)
         share = part / worst.error
         if share > 0.5:
             most = "the cause is" if share > 1.0 - EXPLAINED else "most of it is"
             return (
-                f"{most} a motion that the model does not know ({text}), read as {worst.parameter.symbol} by "
+                f"{most} a motion {_unknown(run)} ({text}), read as {worst.parameter.symbol} by "
                 f"{worst.shown(part, sign=True)} {worst.parameter.unit}, which more frames do not cure: see Crosstalk"
             )
-        return f"motions that the model does not know add up to it ({names}): see Crosstalk"
-    uncovered = joined([name for one in found for name in one.uncovered])
+        return f"motions {_unknown(run)} add up to it ({_largest(parts)}): see Crosstalk"
+    uncovered = joined([name for camera in used for name in found[camera].uncovered])
+    if uncovered and run.estimators[run.judged].stated:
+        return f"{uncovered} take part, of which the crosstalk table knows nothing: see Residuals"
     if uncovered:
         return (
-            f"the model knows nothing of {uncovered}, nor does the crosstalk table, and more frames do not cure it: "
-            "see Residuals"
+            f"{_ignores(run, uncovered)}, nor does the crosstalk table, and more frames do not cure it: see Residuals"
         )
     if parts:
-        return f"motions that the model does not know take part ({names}): see Crosstalk and Residuals"
+        return f"motions {_unknown(run)} take part ({_largest(parts)}): see Crosstalk and Residuals"
     return "first-order crosstalk does not explain it, motions may be too large for it: see Residuals"
+
+
+NAMED = 4
+"""Motions that a sentence names at most."""
+
+
+def _largest(parts: Mapping[str, float]) -> str:
+    """The motions with the largest parts."""
+    return joined(sorted(parts, key=lambda text: -abs(parts[text]))[:NAMED])
+
+
+def _ignores(run: RenderRun, uncovered: str) -> str:
+    return f"the {_told(run)} knows nothing of {uncovered}"
 
 
 def _series_verdict(run: RenderRun, series: TimeSeries, found: tuple[Reading, ...], off: list[Reading]) -> str:
     span = f"over {len(series.times)} times from {moment(float(series.times[0]))} to {moment(float(series.times[-1]))}"
     if not off:
-        return f"Followed {span}: {_within(found)} the truth (RMS); {_noise(run, found)}"
+        return f"Followed {span}: {_within(run, found, 'the truth', 'RMS; ')}; {_hidden(run, found)}"
     worst = max([r for r in off if r.camera] or off, key=lambda r: abs(r.ratio))
     unit = worst.parameter.unit
     uncovered = joined([name for camera in run.crosstalk for name in systematics(run, camera).uncovered])
-    why = f"the model knows nothing of {uncovered}" if uncovered else "motions that the model does not know take part"
+    if run.estimators[run.judged].stated:
+        why = f"motions {_unknown(run)} take part"
+    else:
+        why = _ignores(run, uncovered) if uncovered else f"motions {_unknown(run)} take part"
+    size = "the noise is" if _noise_only(run) else "σ is"
     return (
         f"{_score(found, off, ' (RMS)')}, {span}: the worst, {worst.name}, is wrong by {worst.shown(worst.error)} "
-        f"{unit} RMS where it truly changes by {worst.shown(worst.true)} {unit} RMS and the noise is "
+        f"{unit} RMS where it truly changes by {worst.shown(worst.true)} {unit} RMS and {size} "
         f"{worst.shown(worst.sigma)} {unit}; {why}, which more frames do not cure: see Time course"
     )
 
@@ -332,13 +429,13 @@ def _blurred(run: RenderRun) -> str:
 
 
 def alarm_limit(count: int) -> float:
-    """Sigmas that noise alone exceeds in any of ``count`` readings with a chance of FALSE_ALARM at most."""
+    """Sigmas that a normal error exceeds in any of ``count`` readings with a chance of FALSE_ALARM at most."""
     return -float(ndtri(0.5 * FALSE_ALARM / count))
 
 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:
-    """A warning for every change whose reading is wrong by more than the change, and by more than noise can be."""
-    table = {estimator: readings(run, estimator) for estimator in ESTIMATORS}
+    """A warning for every change whose reading is wrong by more than the change, and by more than chance can do."""
+    table = {estimator: readings(run, estimator) for estimator in run.estimators}
     limit = alarm_limit(sum(map(len, table.values())))
     out = []
     for same in zip(*table.values(), strict=True):
@@ -349,7 +446,7 @@ def _misreadings(run: RenderRun) -> tuple[str, ...]:
         how = "over the course (RMS) " if run.series is not None else ""
         who: dict[str, list[str]] = {}
         for r in wrong:
-            who.setdefault(f"{r.shown(r.value)} ± {r.shown(r.sigma)}", []).append(ESTIMATORS[r.estimator].title)
+            who.setdefault(f"{r.shown(r.value)} ± {r.shown(r.sigma)}", []).append(run.estimators[r.estimator].title)
         said = ", ".join(f"{value} ({'; '.join(titles)})" for value, titles in who.items())
         out.append(
             f"{first.name} [{first.parameter.unit}] is misread by more than the change itself: {how}it is "
