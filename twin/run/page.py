@@ -115,6 +115,7 @@ def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
     return [
         {
             "title": section.title,
+            "folded": section.folded,
             "text": section.text,
             "artefacts": [artefact_content(a, place(a)) for a in section.artefacts],
         }

@@ -21,11 +21,13 @@ class Section:
         title: heading.
         text: paragraphs, plain text.
         artefacts: figures, tables and data in the order in which they are shown; their names are unique in a report.
+        folded: number of the last of them that a reader has to ask for.
     """
 
     title: str
     text: tuple[str, ...] = ()
     artefacts: tuple[Artefact, ...] = ()
+    folded: int = 0
 
 
 def one_sentence(*parts: str) -> str:

@@ -23,12 +23,13 @@ RARE = 1e-3
 """Chance that a spot leaves its CCD of which a reader need not know."""
 
 
-def limits_section(limits: MonitorLimits | None, lines: int = FEW) -> Section:
+def limits_section(limits: MonitorLimits | None, lines: int = FEW, folded: int = 3) -> Section:
     """What limits the readings: the figure and the tables.
 
     Args:
         limits: of the instrument, None where nothing is stated to move.
         lines: motions that are named of each quantity.
+        folded: how many of its three tables a reader has to ask for.
     """
     title = "What limits the readings"
     if limits is None:
@@ -49,13 +50,13 @@ def limits_section(limits: MonitorLimits | None, lines: int = FEW) -> Section:
     text = [_verdict(limits)]
     if limits.outside > RARE:
         text.append(f"{_lost(limits)}.")
-    return Section(title, tuple(text), (figure, _remedies(limits), _hidden(limits), _ledger(limits, lines)))
+    return Section(title, tuple(text), (figure, _remedies(limits), _hidden(limits), _ledger(limits, lines)), folded)
 
 
 def uncertainty_report(run: UncertaintyRun) -> Report:
     """Report of the command."""
     limits, coverage = run.limits, run.coverage
-    sections = [limits_section(limits, LINES), _before(limits)]
+    sections = [limits_section(limits, LINES, 0), _before(limits)]
     if coverage is not None:
         sections.append(_states(coverage))
     warnings = [_lost(limits)] if limits.outside > RARE else []

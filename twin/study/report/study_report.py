@@ -81,6 +81,7 @@ def write_study_report(
             sections=[
                 {
                     "title": section.title,
+                    "folded": section.folded,
                     "text": section.text,
                     "artefacts": [_shown(a) for a in section.artefacts],
                 }
