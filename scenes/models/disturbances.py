@@ -172,9 +172,9 @@ def motions_of_spec(
     components: list[Component] = []
     laws: list[TimeLawSpec] = []
     blocks: list[np.ndarray] = []
-    issues = _strangers(spec, instrument, where)
+    issues, nodes = _strangers(spec, instrument, where), instrument.nodes
     for name, cause in spec.causes.items():
-        bodies = [path for pattern in cause.bodies for path in instrument.nodes if _matches(pattern, path)]
+        bodies = [path for pattern in cause.bodies for path in nodes if _matches(pattern, path, instrument.cameras)]
         own, faults = _of_cause(spec, name, cause, list(dict.fromkeys(bodies)), instrument, glass, where)
         matrix, more = _correlation(name, cause, own, where)
         # a correlation with what is not the same quantity tells nothing where the quantity itself was refused
@@ -269,10 +269,15 @@ def _motion(values: Mapping[tuple[str, int], float], pivot: str) -> Motion | Non
     )
 
 
-def _matches(pattern: str, path: str) -> bool:
-    """Whether a path is of a pattern in which ``*`` and ``?`` stand for anything but ``/``."""
-    text = "".join({"*": "[^/]*", "?": "[^/]"}.get(c, re.escape(c)) for c in pattern)
-    return re.fullmatch(text, path) is not None
+CAMERA = "<camera>"
+"""Stands in a pattern for the name of any camera of the instrument, whatever they are called there."""
+
+
+def _matches(pattern: str, path: str, cameras: Iterable[str]) -> bool:
+    """Whether a path is of a pattern in which ``*`` and ``?`` stand for anything but ``/``, and CAMERA for a camera."""
+    any_of = {"*": "[^/]*", "?": "[^/]", CAMERA: f"(?:{'|'.join(map(re.escape, cameras))})"}
+    parts = re.split(f"({CAMERA}|[*?])", pattern)
+    return re.fullmatch("".join(any_of.get(part, re.escape(part)) for part in parts), path) is not None
 
 
 def _issue_of(spec: DisturbancesSpec, key: KeyPath) -> IssueAt:
@@ -301,7 +306,7 @@ def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: Callable[[
     causes: dict[str, list[str]] = {}
     for name, cause in spec.causes.items():
         for k, pattern in enumerate(cause.bodies):
-            if not any(_matches(pattern, path) for path in instrument.nodes):
+            if not any(_matches(pattern, path, instrument.cameras) for path in instrument.nodes):
                 first.setdefault(pattern, (name, k))
                 causes.setdefault(pattern, []).append(name)
     out = []

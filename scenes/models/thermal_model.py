@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose, triple
@@ -228,9 +229,8 @@ class ThermalModel:
         middle, half = corners.mean(axis=0), 0.5 * (high - low)
         # three points around the middle, 120 deg apart in the plane of the two longest sides
         a, b = np.argsort(half)[:0:-1][:2]
-        support = middle + np.array(
-            [0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE]
-        )
+        arms = np.array([0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE])
+        support = middle + _within(corners, middle, arms) * arms
         faces = {
             element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
             for element in self.instrument.assembly.elements.values()
@@ -275,6 +275,14 @@ class ThermalModel:
 
 
 _THREE = tuple((float(np.cos(t)), float(np.sin(t))) for t in np.radians([90.0, 210.0, 330.0]))
+
+
+def _within(corners: np.ndarray, middle: np.ndarray, arms: np.ndarray) -> float:
+    """By how much arms (N, 3) from the middle have to be shortened to end in a convex body, 1 where they do."""
+    sides = ConvexHull(corners).equations
+    room, reach = -(sides[:, :3] @ middle + sides[:, 3]), arms @ sides[:, :3].T
+    longest = np.min(np.where(reach > 0.0, room / np.where(reach > 0.0, reach, 1.0), np.inf))
+    return 1.0 if longest > 1.0 else 0.5 * float(longest)
 
 
 def _mount(body: Body) -> str:

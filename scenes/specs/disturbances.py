@@ -173,7 +173,8 @@ class CauseSpec(Spec):
     are independent of each other unless it says otherwise.
 
     Attributes:
-        bodies: node paths; `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors).
+        bodies: node paths; `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors),
+            `<camera>` for the name of a camera (`base/<camera>`).
         shift: of the bodies in their own frames, metres.
         rotate: about the pivot, radians.
         scale: relative growth of a camera and all in it.

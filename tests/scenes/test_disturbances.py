@@ -12,7 +12,15 @@ from scenes.models.disturbances import StatedMotions, motions_of_spec, state_of,
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.load import DISTURBANCES, INSTRUMENTS, LIBRARY, library_names, load_disturbances
+from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.load import (
+    DISTURBANCES,
+    INSTRUMENTS,
+    LIBRARY,
+    library_names,
+    load_camera,
+    load_disturbances,
+)
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
@@ -390,14 +398,17 @@ def test_what_a_job_says_wrong(tmp_path, case) -> None:
 
 
 def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(tmp_path) -> None:
-    """Cameras of other names: the file that the instrument names is of another one."""
+    """Cameras of other names: the file is of another instrument, while those of the library are of any camera."""
     instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
     instrument = instrument.replace("backward", "nadir")
-    code, text = command(tmp_path, "instrument: ./other.yaml\n", "", instrument)
+    named = "{bodies: base/backward, rotate: 1 arcsec, reason: r}"
+    own = f"{HEAD}  camera_heat: {named}\n  camera_mounts: {named}\n"
+    code, text = command(tmp_path, "instrument: ./other.yaml\ndisturbances: ./own.yaml\n", own, instrument)
     assert code == 2
-    assert text.count("orbit.yaml:") == 1
+    assert text.count("own.yaml:") == 1
     assert "gf7_pair has no body of this name, nor for camera_mounts" in text
     assert "'base/backward'" in text
+    assert command(tmp_path, "instrument: ./other.yaml\n", "", instrument)[0] == -1
     assert command(tmp_path, "instrument: ./other.yaml\ndisturbances: none\n", "", instrument)[0] == -1
 
 
@@ -417,3 +428,19 @@ def test_a_name_that_no_file_can_have(tmp_path) -> None:
     assert code == 2
     assert "job.yaml:3: disturbances" in text
     assert "no such file" in text
+
+
+def test_a_camera_of_any_name(backend):
+    """The shipped files are of cameras, whatever they are called."""
+    plain = yaml.safe_load((LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8"))
+    plain["cameras"] = {"one": plain["cameras"]["forward"]}
+    del plain["baffles"]
+    spec = validate(InstrumentSpec, parse_yaml(yaml.safe_dump(plain)))
+    instrument = build_instrument(spec, {"gf7": load_camera("gf7")}, backend)
+    for name in ("orbit", "launch"):
+        found = motions_of_spec(load_disturbances(name), instrument)
+        whole = {c.body for c in found.components if c.cause == "camera_mounts"}
+        assert whole == {"base/one"}
+    # half of the central prism's facets: its middle is not in the middle of the box around it
+    bent = ThermalModel(instrument).state({"base/central_prism": Temperature(0.0, (0.0, 0.0, 1.0))})
+    assert any(bent["base/central_prism/one_left"].rotate)

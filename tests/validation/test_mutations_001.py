@@ -265,9 +265,9 @@ MUTATIONS = (
         )
     ),
     Mutation("001.fig4", "forward and aft swapped", "joint", "001.fig4.angle",
-             formula(recovery.intersection_angle, "exact", lambda sound: lambda f, b, lf, lb: sound(b, f, lf, lb))),
+             formula(recovery.intersection_angle, "exact", lambda sound: lambda f, b, *given: sound(b, f, *given))),
     Mutation("001.fig4", "twice", "joint", "001.fig4.angle",
-             formula(intersection_angle, "exact", lambda sound: lambda f, b, lf, lb: twice_the(sound(f, b, lf, lb)))),
+             formula(intersection_angle, "exact", lambda sound: lambda *given: twice_the(sound(*given)))),
     Mutation("001.eq12", "frames not averaged", "budget_checks", "001.eq12.frames 001.table4.printed_lines",
              formula(budget, "frame_mean", lambda sound: lambda error, frames=9: error)),
     Mutation("001.eq12", "divided by 9", "budget_checks", "001.eq12.frames 001.table4.printed_lines",

@@ -26,7 +26,7 @@ from twin.monitor.time_series import TimeSeries
 from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
 from twin.targets.target_result import TargetRun
-from twin.uncertainty.monitor_limits import MonitorLimits, find_limits
+from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits
 
 PROGRAM = "twin.render"
 
@@ -168,8 +168,12 @@ class RenderRun:
 
     @cached_property
     def limits(self) -> MonitorLimits | None:
-        """What limits the readings; None where nothing is stated to move."""
-        return find_limits(self.experiment, self.recovery.joint_covariance[0], self.frames)
+        """What limits the readings; None where nothing is stated to move. Of the instrument and its light, not of these
+        images: the same for every seed.
+        """
+        if self.experiment.disturbances is None:
+            return None
+        return find_limits(self.experiment, expected_covariance(self.experiment, self.frames), self.frames)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""
