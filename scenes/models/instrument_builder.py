@@ -23,9 +23,16 @@ from scenes.models.camera_assembly import camera_bodies, camera_elements, camera
 from scenes.models.camera_model import CameraModel, derive_camera
 from scenes.models.clearance import check_clearance, check_solids
 from scenes.models.instrument_model import Instrument, MisplacedError
-from scenes.models.monitor_chain import MonitorChain, check_prisms, leaving_beams, monitor_chain, square_facets
+from scenes.models.monitor_chain import (
+    MonitorChain,
+    check_prisms,
+    facet_places,
+    leaving_beams,
+    monitor_chain,
+    square_facets,
+)
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE, CENTRAL_PRISM, SIDES, Channel
+from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
 from scenes.specs.job import NodeInfo
 from scenes.yaml.errors import names_text, nearest
 
@@ -72,9 +79,12 @@ def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Ba
         elements.update({**camera_elements(name, root, model), **_ccd_elements(own)})
         sequences.update(camera_sequences(name, model))
         bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.side}") for channel in own)]
-        beams = leaving_beams(spec.monitor, model, own, np.array(site.pupil_offset), to_base, backend)
-        for channel, beam in zip(own, beams, strict=True):
-            chain = monitor_chain(spec, channel, beam, to_base)
+        given = spec.channels_of(name)
+        distances = {channel: given[channel.side].prism_180.distance for channel in own}
+        beams = leaving_beams(model, distances, to_base, backend)
+        facets = facet_places(spec, beams)
+        for channel in own:
+            chain = monitor_chain(spec, channel, given[channel.side], beams[channel], facets[channel], to_base)
             bodies += chain.bodies
             elements.update({e.name: e for e in chain.elements})
             way = tuple(e.name for e in chain.elements)
@@ -90,9 +100,11 @@ def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Ba
             chains[channel.key] = chain
         channels += own
     solids = tuple(solid for chain in chains.values() for solid in chain.solids)
-    facets = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
+    mirrors = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
     block = spec.central_prism
-    solids = (*solids, facet_block(CENTRAL_PRISM, block.material, facets, block.spread, block.height))
+    farthest = [one.spread for name in spec.cameras for one in spec.channels_of(name).values()]
+    spread = max(x for x, _ in farthest), max(y for _, y in farthest)
+    solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
     index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
     cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
@@ -127,13 +139,14 @@ def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
 
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
-    """Where the reticles and area CCDs stand: at +-f tan(field) along the line."""
-    half = model.line_focal_length * float(np.tan(spec.monitor.field))
+    """Where the reticles and area CCDs stand: at f tan(field) along the line."""
     dx, dy = spec.monitor.area_ccd.offset
-    return [
-        Channel(camera, side, pinhole=(-dx, sign * half - dy), ccd=(0.0, sign * half))
-        for side, sign in zip(SIDES, (1.0, -1.0), strict=True)
-    ]
+    out = []
+    for name, one in spec.channels_of(camera).items():
+        place = model.line_focal_length * float(np.tan(one.field))
+        beam = one.pupil_offset, one.return_face.aperture, one.photons_per_frame
+        out.append(Channel(camera, name, (-dx, place - dy), (0.0, place), *beam))
+    return out
 
 
 def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:

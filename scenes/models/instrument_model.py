@@ -56,12 +56,16 @@ class Instrument:
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Camera -> distance of its two area CCDs (the papers' L), metres."""
+        """Camera -> distance of its two area CCDs (the papers' L), metres; of more than two the largest."""
         out = {}
         for name in self.cameras:
-            left, right = (c for c in self.channels if c.camera == name)
-            out[name] = abs(left.ccd[1] - right.ccd[1])
+            places = [c.ccd[1] for c in self.channels if c.camera == name]
+            out[name] = abs(max(places) - min(places))
         return out
+
+    def channels_of(self, camera: str) -> tuple[int, ...]:
+        """Numbers of a camera's channels among ``channels``."""
+        return tuple(i for i, channel in enumerate(self.channels) if channel.camera == camera)
 
 
 class MisplacedError(ValueError):

@@ -35,7 +35,7 @@ from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRIS
 from scenes.yaml.errors import KeyPath
 
 if TYPE_CHECKING:
-    from scenes.specs.instrument import InstrumentSpec, MonitorSpec
+    from scenes.specs.instrument import ChannelParts, InstrumentSpec
 
 
 _OUTLINE = 2000  # points of a clear aperture's edge: a few millimetres apart at most
@@ -73,22 +73,34 @@ class MonitorChain:
 
 
 def leaving_beams(
-    spec: MonitorSpec,
-    model: CameraModel,
-    channels: Sequence[Channel],
-    pupil_offset: np.ndarray,
-    to_base: Pose,
-    backend: Backend,
-) -> list[LeavingBeam]:
+    model: CameraModel, distances: Mapping[Channel, float], to_base: Pose, backend: Backend
+) -> dict[Channel, LeavingBeam]:
     """Trace the channels' beams out of a camera.
 
     The beam's middle is where the pinhole's chief ray passes, displaced by the sub-aperture's offset in the pupil.
 
+    Args:
+        model: the camera.
+        distances: channel -> from the camera's origin to its 180-deg prism's window, metres.
+        to_base: the camera's pose in the base.
+        backend: where to trace.
+
     Raises:
         MisplacedError: light from the pinholes or the area CCDs misses a mirror's surface.
     """
+    out: dict[Channel, LeavingBeam] = {}
+    for distance in dict.fromkeys(distances.values()):
+        own = [channel for channel, at in distances.items() if at == distance]
+        out.update(zip(own, _leaving(model, own, distance, to_base, backend), strict=True))
+    return {channel: out[channel] for channel in distances}
+
+
+def _leaving(
+    model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
+) -> list[LeavingBeam]:
+    """Beams of channels whose windows stand at one distance, metres."""
     frame = model.camera_frame
-    reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, spec.prism_180.distance])))
+    reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
     bare = model.bare_assembly(apertures=False)
     tree = RigidTree((*bare.tree.bodies, Body(REFERENCE, reference)))
     element = Element(REFERENCE, REFERENCE, plane(), Interaction.PASS)
@@ -108,7 +120,7 @@ def leaving_beams(
     chief = trace(backend, outgoing, make_rays(backend, position, direction)).numpy()
     if not chief[3].all():
         raise MisplacedError(f"light of the monitor channels {where} misses a mirror", ("monitor", "field"))
-    centres = chief[0][0, 0::2, :2] + pupil_offset
+    centres = chief[0][0, 0::2, :2] + np.array([c.pupil_offset for c in channels])
     q = _aimed(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], where, ("monitor", "field"), start=q)
     position, direction = fan.at(q)
     traced = trace(backend, outgoing, make_rays(backend, position, direction), world=True)
@@ -123,34 +135,76 @@ def leaving_beams(
     return beams
 
 
-def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_base: Pose) -> MonitorChain:
+def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> dict[Channel, np.ndarray]:
+    """Middles of the facets that a camera's beams meet, base frame, metres.
+
+    The first facet of each corner of the block leans to where its beam comes from and contains the apex, so that it is
+    the lowest of all such planes there. Further facets of the same corner, whose beams come from nearly the same
+    direction, meet it halfway between the middles of both.
+
+    Args:
+        spec: the instrument.
+        beams: of one camera.
+
+    Raises:
+        InputError: a facet would lie under its neighbour: of two in one corner the one that leans more has to stand
+            farther out.
+    """
+    apex = np.array(spec.central_prism.position)
+    corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
+    out = {}
+    for channel, beam in beams.items():
+        up, given = beam.direction, spec.channels_of(channel.camera)[channel.side]
+        side = np.sign(up[:2])
+        offset = side * np.array(given.spread)
+        lean, height = up[:2] / up[2], 0.0
+        for n, (other, place, slope, top) in enumerate(corners.setdefault((side[0], side[1]), [])):
+            across = float(inner(lean - slope, offset - place))
+            if across < 0.0:
+                raise spec.error(
+                    f"the facets of {channel.key} and {other.key} hide one another: the one that leans more has to "
+                    "stand farther out",
+                    ("cameras", channel.camera, "channels", channel.side, "spread"),
+                    allowed=f"a place on the other side of that of {other.key}",
+                )
+            level = top + float(inner(lean - slope, 0.5 * (offset + place)))
+            height = level if n == 0 else min(height, level)
+        corners[side[0], side[1]].append((channel, offset, lean, height))
+        out[channel] = apex + np.array([*offset, height - inner(offset, up[:2]) / up[2]])
+    return out
+
+
+def monitor_chain(
+    spec: InstrumentSpec,
+    channel: Channel,
+    given: ChannelParts,
+    beam: LeavingBeam,
+    centre: np.ndarray,
+    to_base: Pose,
+) -> MonitorChain:
     """Place both prisms and the facet of a channel.
 
     Args:
         spec: the instrument.
         channel: which.
+        given: what the file says of it, with nothing left out.
         beam: as it leaves the camera.
+        centre: of its facet, base frame, metres.
         to_base: the camera's pose in the base.
 
     Raises:
         InputError: the central prism is too near the camera's beam for the rhomboid's displacement, or that is too
             small for the rhomboid's width.
     """
-    monitor, up = spec.monitor, beam.direction
+    up, made, small = beam.direction, given.prism_180, given.prism_0
     apex = np.array(spec.central_prism.position)
-    spread = np.array(spec.central_prism.spread)
-    # facets lean to where their beams come from, so that each is the lowest of all planes through the apex there
-    side = np.sign(up[:2])
-    offset = side * spread
-    centre = apex + np.array([*offset, -inner(offset, up[:2]) / up[2]])
     across = centre - beam.middle
     across = across - inner(across, up) * up
     whole = float(norm(across))
     toward = across / whole
-    transfer = whole - monitor.prism_0.shift
-    made = monitor.prism_180
+    transfer = whole - small.shift
     off = made.reflector.sideways(made.width)
-    shortest = 2.0 * off + monitor.prism_180.width
+    shortest = 2.0 * off + made.width
     if transfer < shortest:
         raise spec.error(
             f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism; less the "
@@ -169,7 +223,6 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
     names = channel.prism_body(PRISM_180), channel.prism_elements(PRISM_180)
     mount = Mount(names[0], into_camera @ pose, names[1], made.material, length, made.width, hand, made.angle_errors)
     first = _made(spec, PRISM_180, "width", made.reflector, mount)
-    small = monitor.prism_0
     pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
     pose = pose @ _turn(small.tilt, small.reflector.null_point(small.shift, small.width))
     names = channel.prism_body(PRISM_0), channel.prism_elements(PRISM_0)
@@ -182,7 +235,7 @@ def monitor_chain(spec: InstrumentSpec, channel: Channel, beam: LeavingBeam, to_
         channel.face_body,
         plane(),
         Interaction.REFLECT,
-        Circle(0.5 * monitor.return_face.aperture),
+        Circle(0.5 * channel.aperture),
     )
     facet = Body(channel.face_body, Pose(_facet_axes(up), centre - apex))
     return MonitorChain(
@@ -213,25 +266,30 @@ def check_prisms(spec: InstrumentSpec) -> None:
     Raises:
         InputError: one of them does not.
     """
-    monitor, face = spec.monitor, spec.monitor.return_face.aperture
-    for name, prism in monitor.prisms.items():
-        known = glass(prism.material)
-        if prism.reflector.transparent and not known.shortest <= monitor.wavelength <= known.longest:
-            raise spec.error(
-                f"the index of {prism.material} is not known at the monitor's wavelength of "
-                f"{1e9 * monitor.wavelength:.6g} nm",
-                ("monitor", name, "material"),
-                found=prism.material,
-                allowed=f"a glass for that wavelength, or a wavelength from {1e9 * known.shortest:.6g} to "
-                f"{1e9 * known.longest:.6g} nm",
-            )
-        if prism.width < face:
-            raise spec.error(
-                f"the prism is narrower than the beam: {1e3 * prism.width:.4g} mm for a return face of "
-                f"{1e3 * face:.4g} mm",
-                ("monitor", name, "width"),
-                allowed=f"at least {1e3 * face:.4g} mm",
-            )
+    wavelength = spec.monitor.wavelength
+    for camera, site in spec.cameras.items():
+        for side, given in spec.channels_of(camera).items():
+            face = given.return_face.aperture
+            for name, prism in given.prisms.items():
+                own = site.channels is not None and getattr(site.channels[side], name) is not None
+                key: KeyPath = ("cameras", camera, "channels", side, name) if own else ("monitor", name)
+                known = glass(prism.material)
+                if prism.reflector.transparent and not known.shortest <= wavelength <= known.longest:
+                    raise spec.error(
+                        f"the index of {prism.material} is not known at the monitor's wavelength of "
+                        f"{1e9 * wavelength:.6g} nm",
+                        (*key, "material"),
+                        found=prism.material,
+                        allowed=f"a glass for that wavelength, or a wavelength from {1e9 * known.shortest:.6g} to "
+                        f"{1e9 * known.longest:.6g} nm",
+                    )
+                if prism.width < face:
+                    raise spec.error(
+                        f"the prism is narrower than the beam: {1e3 * prism.width:.4g} mm for a return face of "
+                        f"{1e3 * face:.4g} mm",
+                        (*key, "width"),
+                        allowed=f"at least {1e3 * face:.4g} mm",
+                    )
 
 
 def square_facets(

@@ -26,14 +26,21 @@ class Channel:
     """One monitor channel of one camera.
 
     Attributes:
-        camera, side: e.g. ``forward``, ``left`` (left = the +Y end of the line).
+        camera, side: e.g. ``forward``, ``left``: the camera's and the channel's name; those of a plain pair are
+            ``left`` (the +Y end of the line) and ``right``.
         pinhole, ccd: positions in the focal plane's X, Y, metres.
+        pupil_offset: of its beam's middle in the entrance pupil, X and Y, metres.
+        aperture: diameter of its return face, metres.
+        photons: that its spot gets in a frame.
     """
 
     camera: str
     side: str
     pinhole: tuple[float, float]
     ccd: tuple[float, float]
+    pupil_offset: tuple[float, float]
+    aperture: float
+    photons: float
 
     @property
     def key(self) -> str:

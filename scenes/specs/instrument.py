@@ -3,6 +3,7 @@ error budget of its monitor.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
@@ -12,7 +13,7 @@ from optics.materials.material import MATERIALS, material
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
-from scenes.specs.channel import PRISM_0, PRISM_180
+from scenes.specs.channel import PRISM_0, PRISM_180, SIDES
 from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
@@ -107,6 +108,9 @@ class Prism0Spec(Spec):
         return self
 
 
+Spread = Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True, largest="10 m"), 2)]
+
+
 class CentralPrismSpec(Spec):
     """The central prism, the common reference of all cameras: a block with one mirror facet per channel, which meet in
     its apex.
@@ -120,7 +124,7 @@ class CentralPrismSpec(Spec):
 
     position: Vector3
     material: GlassName
-    spread: Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True, largest="10 m"), 2)]
+    spread: Spread
     height: PositiveLength
 
 
@@ -128,24 +132,10 @@ MaterialName = Annotated[str, Field(strict=True), name_in("material", MATERIALS,
 Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
 MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
+FieldPlace = Annotated[float, Quantity(ANGLE, largest="45 deg")]
+Photons = Annotated[Number, Field(gt=0.0, le=1e12)]
 MOST_FRAMES = 10_000
 Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
-
-
-class MountedCameraSpec(Spec):
-    """A camera in its place on the base.
-
-    Attributes:
-        camera: which camera, by name or path.
-        look: angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
-        position: of the camera's origin in the base frame, metres.
-        pupil_offset: centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
-    """
-
-    camera: Reference
-    look: LookAngle
-    position: Vector3
-    pupil_offset: Vector2
 
 
 class ReticleSpec(Spec):
@@ -157,7 +147,7 @@ class ReticleSpec(Spec):
     """
 
     pinhole: PositiveLength
-    photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
+    photons_per_frame: Photons
 
 
 class AreaCcdSpec(Spec):
@@ -186,6 +176,74 @@ class ReturnFaceSpec(Spec):
     """
 
     aperture: PositiveLength
+
+
+class ChannelSpec(Spec):
+    """One channel of a camera's monitor, where a camera has others than the plain pair; what is left out is the
+    monitor's.
+
+    Attributes:
+        field: angle from the visual axis at which its area CCD stands, positive at the +Y end of the line, radians.
+        pupil_offset: centre (X, Y) of its beam in the entrance pupil, metres.
+        return_face: the mirror that returns its beam, and limits it.
+        spread: how far from the central prism's apex its beam meets its facet, along the base's X and Y, metres.
+        photons_per_frame: of its spot.
+        prism_180: its lateral-transfer prism.
+        prism_0: its rhomboid.
+    """
+
+    field: FieldPlace
+    pupil_offset: Vector2
+    return_face: ReturnFaceSpec | None = None
+    spread: Spread | None = None
+    photons_per_frame: Photons | None = None
+    prism_180: Prism180Spec | None = None
+    prism_0: Prism0Spec | None = None
+
+
+@dataclass(frozen=True)
+class ChannelParts:
+    """What a channel has, its own or the monitor's; see `ChannelSpec`."""
+
+    field: float
+    pupil_offset: tuple[float, float]
+    return_face: ReturnFaceSpec
+    spread: tuple[float, float]
+    photons_per_frame: float
+    prism_180: Prism180Spec
+    prism_0: Prism0Spec
+
+    @property
+    def prisms(self) -> dict[str, Prism180Spec | Prism0Spec]:
+        """Both by their keys, in the order of the light."""
+        return {PRISM_180: self.prism_180, PRISM_0: self.prism_0}
+
+
+class MountedCameraSpec(Spec):
+    """A camera in its place on the base, with the channels of its monitor: a plain pair at both ends of the line,
+    through the same part of the pupil, or any number of channels.
+
+    Attributes:
+        camera: which camera, by name or path.
+        look: angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+        position: of the camera's origin in the base frame, metres.
+        pupil_offset: centre (X, Y) of a plain pair's sub-aperture in the entrance pupil, metres.
+        channels: by name, in place of a plain pair. The printed formulas are about a pair at opposite fields called
+            left and right; a camera without such a pair is measured by the estimators that take all spots.
+    """
+
+    camera: Reference
+    look: LookAngle
+    position: Vector3
+    pupil_offset: Vector2 | None = None
+    channels: Annotated[Named[ChannelSpec], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "MountedCameraSpec":
+        if (self.pupil_offset is None) == (self.channels is None):
+            found = "both" if self.channels else "neither"
+            raise Problem("which channels does its monitor have?", found, "one of pupil_offset and channels")
+        return self
 
 
 class MaterialsSpec(Spec):
@@ -263,6 +321,31 @@ class InstrumentSpec(Spec):
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
     disturbances: Reference | None = None
+
+    def channels_of(self, camera: str) -> dict[str, ChannelParts]:
+        """All channels of a camera's monitor, by name.
+
+        Args:
+            camera: its name.
+        """
+        site, monitor = self.cameras[camera], self.monitor
+        given = site.channels
+        if given is None:
+            assert site.pupil_offset is not None
+            pair = zip(SIDES, (monitor.field, -monitor.field), strict=True)
+            given = {name: ChannelSpec.model_construct(field=f, pupil_offset=site.pupil_offset) for name, f in pair}
+        return {
+            name: ChannelParts(
+                one.field,
+                one.pupil_offset,
+                one.return_face or monitor.return_face,
+                one.spread or self.central_prism.spread,
+                one.photons_per_frame or monitor.reticle.photons_per_frame,
+                one.prism_180 or monitor.prism_180,
+                one.prism_0 or monitor.prism_0,
+            )
+            for name, one in given.items()
+        }
 
 
 AngleErrors = Annotated[

@@ -75,7 +75,7 @@ def airy_radius(run: RenderRun) -> float:
     path = run.experiment.path
     camera = next(iter(run.experiment.instrument.cameras.values()))
     focal = float(camera.first_order.focal_length[0])
-    return float(1.2197 * path.wavelength * focal / (2.0 * path.face_radius) / path.pitch)
+    return float(1.2197 * path.wavelength * focal / (2.0 * float(np.min(path.face_radius))) / path.pitch)
 
 
 def spots_svg(run: RenderRun, camera: str) -> str:

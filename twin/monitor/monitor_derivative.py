@@ -50,7 +50,7 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tupl
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
     faces = size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
-    q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.target - drift)
+    q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.targets(m) - drift)
     sizes = size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
@@ -137,5 +137,6 @@ def photon_derivative(path: MonitorPath, motions: Sequence[ElementaryMotion]) ->
     reach = path.response.reach
     y, x = (path.grid(axis, reach) for axis in (0, 1))
     derivative = image_derivative(field.repeated(count), step, x, y)
-    photons = path.light_per_pixel * path.response.apply(derivative)
-    return np.asarray(photons.reshape(len(path.channels), count, *photons.shape[1:]).swapaxes(0, 1))
+    photons = path.response.apply(derivative)
+    photons = path.light_per_pixel[:, None, None, None] * photons.reshape(len(path.channels), count, *photons.shape[1:])
+    return np.asarray(photons.swapaxes(0, 1))

@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 
 from optics.geometry import zernike
-from optics.geometry.aperture import Circle
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.array_math import inverse, product
@@ -142,9 +141,7 @@ class MonitorPath:
         self.shape = (ccd.rows, ccd.columns)
         self.pitch: float = ccd.pitch
         self.wavelength: float = instrument.spec.monitor.wavelength
-        face = instrument.assembly.elements[f"{self.channels[0].key}/return_face"].aperture
-        assert isinstance(face, Circle)
-        self.face_radius = face.radius
+        self.face_radius = np.array([0.5 * channel.aperture for channel in self.channels])
         self._sized = nodes is None
         self.nodes = self._nodes_for(SPOT_RANGES[-1]) if nodes is None else nodes
 
@@ -177,7 +174,7 @@ class MonitorPath:
     def numerical_aperture(self) -> float:
         """Of the returned beam at the CCD, the largest among the cameras."""
         scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
-        return self.face_radius / float(np.min(scales))
+        return float(np.max(self.face_radius)) / float(np.min(scales))
 
     @cached_property
     def coarse(self) -> MonitorPath:
@@ -224,14 +221,18 @@ class MonitorPath:
 
     @cached_property
     def target(self) -> np.ndarray:
-        """Nodes on the return face, (N, 2), metres of its nominal size."""
-        return self.face_radius * np.stack([self.nodes.x, self.nodes.y], axis=-1)
+        """Nodes on the return faces, (C, N, 2), metres of their nominal sizes."""
+        return self.face_radius[:, None, None] * np.stack([self.nodes.x, self.nodes.y], axis=-1)
+
+    def targets(self, states: int) -> np.ndarray:
+        """The same for as many states, channel-major, (C*S, N, 2)."""
+        return np.repeat(self.target, states, axis=0)
 
     def _aim_nominal(self) -> Aimed:
         """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
         middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
-        near = middle + np.einsum("bnij,pj->bpi", inverse(slope), self.target)
+        near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
         q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, AIM_TOLERANCE)
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
@@ -249,7 +250,7 @@ class MonitorPath:
         back = assemble(self.instrument.assembly, names, states, placed=placed)
         nominal = scout.nominal
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
-        q, _ = aim(self.backend, outgoing, fan, scout.target, start, slope, AIM_TOLERANCE)
+        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, AIM_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
         pitch = self.pitch * back.size[:, None]
@@ -274,9 +275,10 @@ class MonitorPath:
         uploaded = known.back.upload(self.backend)
         face = len(known.outgoing.structure) - 1
         traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
-        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * self.target)) <= AIM_TOLERANCE:
+        goal = self.targets(len(states))
+        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
             # a change that is not smooth enough for its few terms
-            q, _ = aim(self.backend, known.outgoing, known.fan, self.target, q, slope, AIM_TOLERANCE)
+            q, _ = aim(self.backend, known.outgoing, known.fan, goal, q, slope, AIM_TOLERANCE)
             launch = known.fan.at(q)
             traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
         position, direction, length, valid = traced.numpy()
@@ -400,14 +402,17 @@ class MonitorPath:
             path, known = self.classes[number], coarse.take(own)
             field = path.field_of(path.rays([states[s] for s in own.tolist()], known))
             photons = response.apply(image(field, x, y, single))
-            photons *= self.light_per_pixel
-            out[own] = np.swapaxes(photons.reshape(channels, len(own), *photons.shape[1:]), 0, 1)
+            photons = photons.reshape(channels, len(own), *photons.shape[1:])
+            photons *= self.light_per_pixel[:, None, None, None]
+            out[own] = np.swapaxes(photons, 0, 1)
         return out
 
     @property
-    def light_per_pixel(self) -> float:
-        """Photons per frame times the pixel's area, m^2: what turns an image of unit power into photons per pixel."""
-        return float(self.instrument.spec.monitor.reticle.photons_per_frame * self.pitch**2)
+    def light_per_pixel(self) -> np.ndarray:
+        """Photons per frame times the pixel's area, m^2, (C,): what turns an image of unit power into photons per
+        pixel.
+        """
+        return np.array([channel.photons * self.pitch**2 for channel in self.channels])
 
     def grid(self, axis: int, margin: int = 0) -> Grid:
         """Pixel centres of the rows (0) or columns (1) on the chip, from the CCD's centre, in nominal metres."""

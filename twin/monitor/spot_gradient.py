@@ -102,7 +102,8 @@ def spot_gradient(
         out += monitor_steps.dot(there.values) + outgoing_steps.dot(node.values)
         out += np.einsum("ckx,cmx->ckm", pinhole, source)
         # nodes ride on the return face as it grows, and places are counted in pixels, which grow with the chip
-        ridden = np.einsum("bnx,nx->b", back, path.target[piece]).reshape(-1, 2)
+        goal = np.repeat(path.target[:, piece], 2, axis=0)
+        ridden = np.einsum("bnx,bnx->b", back, goal).reshape(-1, 2)
         out -= ridden[:, :, None] * face_steps[:, None]
         start_rays = make_rays(path.backend, launch[:, piece], launched[:, piece])
         hit = trace(path.backend, monitor.take(once), start_rays).place()[..., ::-1]

@@ -164,7 +164,7 @@ def trace_stray(
                 "the perturbation moves the beam off"
             )
         runs[channel.key] = run
-        scale[channel.key] = instrument.spec.monitor.reticle.photons_per_frame / found[0].energy
+        scale[channel.key] = channel.photons / found[0].energy
         for name, image in photons.items():
             every = run.images[name]
             image += scale[channel.key] * (every.sum(axis=0) - every[NOMINAL])
