@@ -18,6 +18,8 @@ from analysis.spots.spot_template import SpotTemplate
 __all__ = ["CameraCalibration", "MonitorCalibration"]
 
 Array = NDArray[np.float64]
+PAIR = ("left", "right")
+"""Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +28,10 @@ class CameraCalibration:
 
     geometry: what the formulas of paper 001 need.
     look_rad: nominal look angle about the base's Y, rad.
-    spot_jacobian: (4, P) px per unit of motion, rows [left row, left column, right row, right column].
+    spot_jacobian: (2 n, P) px per unit of motion for the camera's n spots, row and column of one after the other.
     parameter_jacobian: (4, P) d_alpha, d_beta, d_gamma (rad), d_f (m) per unit of motion.
     motions: names of the P motions that the `model` estimator assumes.
+    channels: names of the camera's channels, in the order of its spots.
     """
 
     geometry: MonitorGeometry
@@ -36,13 +39,24 @@ class CameraCalibration:
     spot_jacobian: Array
     parameter_jacobian: Array
     motions: tuple[str, ...]
+    channels: tuple[str, ...] = PAIR
+
+    @property
+    def pair(self) -> tuple[int, int] | None:
+        """Numbers of the left and of the right spot among the camera's own, which the printed formulas are about; None
+        where it has no such pair.
+        """
+        if not set(PAIR) <= set(self.channels):
+            return None
+        left, right = (self.channels.index(name) for name in PAIR)
+        return left, right
 
 
 @dataclass(frozen=True, eq=False)
 class MonitorCalibration:
     """Calibration of an instrument's monitor.
 
-    cameras: name -> calibration, in the order of the spots: each camera has two spots, left before right.
+    cameras: name -> calibration, in the order of the spots, camera by camera.
     template: calibrated shapes of all spots, in that order.
     noise: of the area CCDs.
     ground: of a pair whose altitude is known, else None.
@@ -55,5 +69,5 @@ class MonitorCalibration:
 
     @property
     def spots(self) -> int:
-        """Number of spots, C = 2 x cameras."""
-        return 2 * len(self.cameras)
+        """Number of spots, C."""
+        return sum(len(camera.channels) for camera in self.cameras.values())

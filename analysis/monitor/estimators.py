@@ -36,17 +36,17 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-COORDINATES = 4
-"""Spot coordinates of one camera, and its parameters."""
+PARAMETERS_EACH = 4
+"""Parameters of one camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """What an estimator is given: S states of K cameras.
+    """What an estimator is given: S states of K cameras with C spots together.
 
     Attributes:
-        before, after: (S, 2 K, 2) spot positions (row, column), px.
-        covariance: (S, 4 K, 4 K) px^2 of after - before; zeros without noise.
+        before, after: (S, C, 2) spot positions (row, column), px, one camera's after the other's.
+        covariance: (S, 2 C, 2 C) px^2 of after - before; zeros without noise.
         cameras: what is calibrated of each.
         disturbances: what is stated to move, None for nothing.
     """
@@ -59,8 +59,19 @@ class Shifts:
 
     @property
     def vector(self) -> Array:
-        """(S, 4 K) after - before, px."""
+        """(S, 2 C) after - before, px."""
         return (self.after - self.before).reshape(len(self.after), -1)
+
+    @property
+    def spots(self) -> dict[str, slice]:
+        """Camera -> its spots among all."""
+        ends = np.cumsum([0, *(len(camera.channels) for camera in self.cameras.values())]).tolist()
+        return {name: slice(a, b) for name, a, b in zip(self.cameras, ends[:-1], ends[1:], strict=True)}
+
+    @property
+    def coordinates(self) -> dict[str, slice]:
+        """Camera -> the coordinates of its spots among all."""
+        return {name: slice(2 * own.start, 2 * own.stop) for name, own in self.spots.items()}
 
 
 class Estimator(ABC):
@@ -76,9 +87,18 @@ class Estimator(ABC):
     note: str
     stated: bool = False
 
+    def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
+        """Whether it can be used with these cameras and with what is stated.
+
+        Args:
+            cameras: what is calibrated of each.
+            disturbances: what is stated to move, None for nothing.
+        """
+        return disturbances is not None or not self.stated
+
     @abstractmethod
     def gain(self, shifts: Shifts) -> Array:
-        """Parameters per pixel of shift, (S, 4 K, 4 K).
+        """Parameters per pixel of shift, (S, 4 K, 2 C).
 
         Args:
             shifts: what was measured.
@@ -98,19 +118,20 @@ class OfEachCamera(Estimator):
 
     @abstractmethod
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """(4, 4) or (S, 4, 4) parameters of one camera per pixel.
+        """(4, 2 n) or (S, 4, 2 n) parameters of one camera per pixel.
 
         Args:
             camera: its calibration.
-            covariance: (S, 4, 4) of its shifts, px^2.
+            covariance: (S, 2 n, 2 n) of its shifts, px^2.
         """
 
     def gain(self, shifts: Shifts) -> Array:
         """Block by block, camera by camera."""
-        out = np.zeros_like(shifts.covariance)
-        for k, camera in enumerate(shifts.cameras.values()):
-            own = slice(COORDINATES * k, COORDINATES * (k + 1))
-            out[:, own, own] = self.camera_gain(camera, shifts.covariance[:, own, own])
+        count = PARAMETERS_EACH * len(shifts.cameras)
+        out = np.zeros((len(shifts.covariance), count, shifts.covariance.shape[-1]))
+        for k, (name, own) in enumerate(shifts.coordinates.items()):
+            rows = slice(PARAMETERS_EACH * k, PARAMETERS_EACH * (k + 1))
+            out[:, rows, own] = self.camera_gain(shifts.cameras[name], shifts.covariance[:, own, own])
         return out
 
 
@@ -132,20 +153,42 @@ class Formula(OfEachCamera):
     note: str
     exact: Exact | None = None
 
+    def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
+        """To cameras with a left and a right spot.
+
+        Args:
+            cameras: what is calibrated of each.
+            disturbances: of no matter.
+        """
+        return all(camera.pair is not None for camera in cameras.values())
+
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """The formulas' coefficients."""
-        return monitoring.coefficients(self.name, camera.geometry)
+        """The formulas' coefficients; further spots have no say."""
+        out = np.zeros((PARAMETERS_EACH, 2 * len(camera.channels)))
+        out[:, [2 * k + axis for k in _pair(camera) for axis in (0, 1)]] = monitoring.coefficients(
+            self.name, camera.geometry
+        )
+        return out
 
     def read(self, shifts: Shifts) -> Array:
         """By the exact formulas where there are such."""
         if self.exact is None:
             return super().read(shifts)
         parts = []
-        for k, camera in enumerate(shifts.cameras.values()):
-            pair, own = slice(2 * k, 2 * k + 2), slice(COORDINATES * k, COORDINATES * (k + 1))
-            seen = (shifts.before[:, pair], shifts.after[:, pair], shifts.covariance[:, own, own])
+        for name, own in shifts.spots.items():
+            camera = shifts.cameras[name]
+            at = [own.start + k for k in _pair(camera)]
+            rows = [2 * k + axis for k in at for axis in (0, 1)]
+            covariance = shifts.covariance[:, rows][:, :, rows]
+            seen = (shifts.before[:, at], shifts.after[:, at], covariance)
             parts.append(self.exact(*seen, camera.geometry).vector)
         return np.concatenate(parts, axis=-1)
+
+
+def _pair(camera: CameraCalibration) -> tuple[int, int]:
+    if camera.pair is None:
+        raise ValueError(f"the formulas need spots called left and right, found {', '.join(camera.channels)}")
+    return camera.pair
 
 
 @dataclass(frozen=True)
@@ -224,6 +267,11 @@ def judged(names: Iterable[str]) -> str:
     raise ValueError(f"results without {' or '.join(JUDGED)}: there are {', '.join(known)}")
 
 
-def applicable(disturbances: Disturbances | None) -> dict[str, Estimator]:
-    """The estimators that can be used with what is stated."""
-    return {name: one for name, one in ESTIMATORS.items() if disturbances is not None or not one.stated}
+def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
+    """The estimators that can be used with these cameras and with what is stated.
+
+    Args:
+        cameras: what is calibrated of each.
+        disturbances: what is stated to move, None for nothing.
+    """
+    return {name: one for name, one in ESTIMATORS.items() if one.applies(cameras, disturbances)}

@@ -5,7 +5,8 @@ camera's parameters p = B m, for P motions m. `fit` estimates m from s (Gauss-Ma
 covariance. It can tell apart only the family of motions that it assumes; `observability` says, with numbers, what
 happens to all others.
 
-Order of spot coordinates: [left row, left column, right row, right column], px, after - before. Order of parameters:
+Order of spot coordinates: row and column of one spot after the other, [left row, left column, right row, right column]
+of a plain pair, px, after - before. Order of parameters:
 d_alpha, d_beta, d_gamma (rad), d_f (m).
 """
 
@@ -61,18 +62,18 @@ def fit(
     Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
 
     Args:
-        shift: (..., 4) px.
-        covariance: (..., 4, 4) px^2, positive definite, or all zero (no noise: equal weights, zero sigma).
-        spot_jacobian: (4, P) px per unit of motion.
-        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to 4.
+        shift: (..., D) px, of D coordinates of spots.
+        covariance: (..., D, D) px^2, positive definite, or all zero (no noise: equal weights, zero sigma).
+        spot_jacobian: (D, P) px per unit of motion.
+        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to D.
         motion_names: of the P motions, for messages.
         rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     """
     data, spread = np.asarray(shift, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-    if data.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
-        raise ValueError(
-            f"model fit: shift must be (..., 4), covariance (..., 4, 4), found {data.shape}, {spread.shape}"
-        )
+    count = np.shape(spot_jacobian)[0] if np.ndim(spot_jacobian) else 0
+    if data.shape[-1:] != (count,) or spread.shape[-2:] != (count, count):
+        wanted = f"shift must be (..., {count}), covariance (..., {count}, {count})"
+        raise ValueError(f"model fit: {wanted}, found {data.shape}, {spread.shape}")
     if not (np.all(np.isfinite(data)) and np.all(np.isfinite(spread))):
         raise ValueError("model fit: shift and covariance must be finite")
     weights = gain(spread, spot_jacobian, parameter_jacobian, motion_names, rank_tolerance)
@@ -88,14 +89,14 @@ def gain(
     motion_names: Sequence[str] | None = None,
     rank_tolerance: float = 1e-8,
 ) -> Array:
-    """Parameters per pixel of shift, (..., 4, 4), of `fit`.
+    """Parameters per pixel of shift, (..., 4, D), of `fit`.
 
     Raises RankError and ValueError as `fit`.
 
     Args:
-        covariance: (..., 4, 4) px^2, positive definite, or all zero (no noise: equal weights).
-        spot_jacobian: (4, P) px per unit of motion.
-        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to 4.
+        covariance: (..., D, D) px^2, positive definite, or all zero (no noise: equal weights).
+        spot_jacobian: (D, P) px per unit of motion.
+        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to D.
         motion_names: of the P motions, for messages.
         rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     """
@@ -105,7 +106,7 @@ def gain(
     noiseless = not np.any(spread)
     try:
         # whitening: solve(L, x) has unit covariance
-        root = np.linalg.cholesky(np.eye(4) if noiseless else spread)
+        root = np.linalg.cholesky(np.eye(len(spots)) if noiseless else spread)
     except np.linalg.LinAlgError as error:
         raise ValueError("model fit: covariance of the shifts is not positive definite") from error
     white = np.linalg.solve(root, np.broadcast_to(spots, (*root.shape[:-2], *spots.shape)))
@@ -119,7 +120,7 @@ def gain(
 class MotionReport:
     """What the spots and the model make of one unit (scale) of one motion.
 
-    name, scale: the motion and the size of its unit, SI. signature_px: (4,) spot shifts.
+    name, scale: the motion and the size of its unit, SI. signature_px: (D,) spot shifts.
     explained: fraction [0, 1] of the signature, weighted by its noise, that the family's motions can imitate.
     imitation: (F,) the amounts of the family's motions (in their units) that the fit puts in its place.
     reported, true: (4,) parameters that the model reports, and the true change; rad and m.
@@ -180,22 +181,23 @@ def observability(
 
     Args:
         motion_names: M names.
-        spot_jacobian: (4, M), px per SI unit of motion.
+        spot_jacobian: (D, M), px per SI unit of motion.
         parameter_jacobian: (4, M), rad and m per SI unit of motion.
         scales: (M,) size of one unit of each motion in SI (1e-6 for one micrometre).
-        covariance: (4, 4) px^2 of the shifts, positive definite.
+        covariance: (D, D) px^2 of the shifts, positive definite.
         family: indices of the motions that the model fits.
         rank_tolerance: least ratio of singular values of the family's spot Jacobian with its columns scaled to length
             one.
     """
-    spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limit=None)
+    spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limited=False)
     names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)
     count = spots.shape[1]
     chosen = [int(k) for k in family]
     if len(names) != count or size.shape != (count,) or not np.all(size > 0):
         raise ValueError(f"observability: {count} motions need {count} names and positive scales")
-    if not 1 <= len(set(chosen)) == len(chosen) <= 4 or not all(0 <= k < count for k in chosen):
-        raise ValueError(f"observability: family must be 1 to 4 different indices below {count}, found {chosen}")
+    if not 1 <= len(set(chosen)) == len(chosen) <= len(spots) or not all(0 <= k < count for k in chosen):
+        allowed = f"1 to {len(spots)} different indices below {count}"
+        raise ValueError(f"observability: family must be {allowed}, found {chosen}")
     try:
         root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
     except np.linalg.LinAlgError as error:
@@ -238,15 +240,16 @@ def observability(
         family_rank=int(np.sum(own_values > rank_tolerance * own_values[0])),
         family_singular_values=np.asarray(own_values, dtype=np.float64),
         motions=tuple(reports),
-        statements=tuple(_statements(reports, own, rank)),
+        statements=tuple(_statements(reports, own, rank, len(spots))),
     )
 
 
-def _statements(reports: list[MotionReport], family: list[str], rank: int) -> list[str]:
+def _statements(reports: list[MotionReport], family: list[str], rank: int, coordinates: int) -> list[str]:
     """Sentences on the family as a whole, then on each motion that is not reported as what it is."""
+    seen = "Four" if coordinates == 4 else str(coordinates)
     lines = [
-        f"Four spot coordinates see {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} motions;"
-        f" the model fits {len(family)}: {', '.join(family)}."
+        f"{seen} spot coordinates see {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} "
+        f"motions; the model fits {len(family)}: {', '.join(family)}."
     ]
     reach = {report.name: float(np.max(np.abs(report.signature_px))) for report in reports}
     for report in reports:
@@ -323,12 +326,14 @@ def _check_rank(spots: Array, names: Sequence[str] | None, tolerance: float) -> 
     )
 
 
-def _jacobians(spots: ArrayLike, parameters: ArrayLike, limit: int | None = 4) -> tuple[Array, Array]:
+def _jacobians(spots: ArrayLike, parameters: ArrayLike, limited: bool = True) -> tuple[Array, Array]:
     one, two = np.asarray(spots, dtype=np.float64), np.asarray(parameters, dtype=np.float64)
-    if one.ndim != 2 or one.shape[0] != 4 or one.shape != two.shape or one.shape[1] < 1:
-        raise ValueError(f"model fit: both Jacobians must be (4, P), found {one.shape} and {two.shape}")
-    if limit is not None and one.shape[1] > limit:
-        raise ValueError(f"model fit: four spot coordinates cannot fix {one.shape[1]} motions; choose at most {limit}")
+    shapes = one.ndim == 2 and two.shape == (4, one.shape[1]) and one.shape[0] > 0
+    if not shapes or one.shape[0] % 2 or one.shape[1] < 1:
+        raise ValueError(f"model fit: the Jacobians must be (2 n, P) and (4, P), found {one.shape} and {two.shape}")
+    if limited and one.shape[1] > one.shape[0]:
+        text = f"{one.shape[0]} spot coordinates cannot fix {one.shape[1]} motions; choose at most {one.shape[0]}"
+        raise ValueError(f"model fit: {text}")
     if not (np.all(np.isfinite(one)) and np.all(np.isfinite(two))):
         raise ValueError("model fit: Jacobians must be finite")
     return one, two

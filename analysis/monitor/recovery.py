@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from analysis.monitor import intersection_angle
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
-from analysis.monitor.estimators import COORDINATES, Shifts, applicable
+from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
 from analysis.monitor.ground_error import GroundError, GroundGeometry
 from analysis.monitor.intersection_angle import IntersectionAngleChange
-from analysis.monitor.monitoring import CameraParameters, shift_covariance
+from analysis.monitor.monitoring import CameraParameters
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
@@ -53,7 +53,7 @@ class Recovery:
     """What the images say, for S states.
 
     before, after: (S, C, 2) spot positions (row, column), px; sigma_before, sigma_after: their standard deviations.
-    shift_covariance: (S, cameras, 4, 4) px^2 of after - before.
+    shift_covariance: (S, 2 C, 2 C) px^2 of ``shift``; spots are independent of each other.
     parameters: camera -> estimator -> changes with arrays of shape (S,).
     angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
     ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
@@ -89,13 +89,8 @@ class Recovery:
 
     @property
     def shift(self) -> Array:
-        """(S, 4 x cameras) after - before in the order of the spots, px."""
+        """(S, 2 C) after - before in the order of the spots, row and column, px."""
         return (self.after - self.before).reshape(len(self.after), -1)
-
-    @property
-    def joint_covariance(self) -> Array:
-        """(S, 4 x cameras, 4 x cameras) of ``shift``, px^2; spots are independent of each other."""
-        return joint(self.shift_covariance)
 
     def consistency(
         self, disturbances: Disturbances, state: int = 0, others: Mapping[str, Array] | None = None
@@ -107,7 +102,7 @@ class Recovery:
             state: its number.
             others: see `analysis.monitor.disturbances.consistency`.
         """
-        return consistency(self.shift[state], self.joint_covariance[state], disturbances, others)
+        return consistency(self.shift[state], self.shift_covariance[state], disturbances, others)
 
 
 def measure_spots(
@@ -159,17 +154,16 @@ def recover(
         raise ValueError(f"recovery: the calibration has {calibration.spots} spots, the images {spots}")
     first = measure_spots(_flat(mean_frames(before)), before.shape[-3], calibration, centroid, threads)
     second = measure_spots(_flat(mean_frames(after)), frames, calibration, centroid, threads)
-    spread = difference_covariance(first, second, calibration.noise).reshape(states, len(calibration.cameras), 2, 2, 2)
-    each = shift_covariance(spread[:, :, 0], spread[:, :, 1])
+    spread = joint(difference_covariance(first, second, calibration.noise).reshape(states, spots, 2, 2))
     start = np.broadcast_to(first.position.reshape(-1, spots, 2), (states, spots, 2))
     end = second.position.reshape(states, spots, 2)
-    found = estimates(start, end, each, calibration.cameras, disturbances, calibration.ground)
+    found = estimates(start, end, spread, calibration.cameras, disturbances, calibration.ground)
     return Recovery(
         before=start,
         after=end,
         sigma_before=np.broadcast_to(_sigma(first).reshape(-1, spots, 2), (states, spots, 2)),
         sigma_after=_sigma(second).reshape(states, spots, 2),
-        shift_covariance=each,
+        shift_covariance=spread,
         parameters=found.parameters,
         angle=found.angle,
         ground=found.ground,
@@ -188,16 +182,16 @@ def estimates(
     """All estimators on spot positions.
 
     Args:
-        start: (S, C, 2) spot positions (row, column) before, px, two of each camera in their order.
+        start: (S, C, 2) spot positions (row, column) before, px, one camera's after the other's.
         end: those after, likewise.
-        covariance: (S, cameras, 4, 4) covariance of after - before, px^2; all zero for positions without noise.
+        covariance: (S, 2 C, 2 C) of after - before, px^2; all zero for positions without noise.
         cameras: what is calibrated of each.
         disturbances: what is stated to move, None for nothing.
         ground: of a pair whose altitude is known.
     """
-    shifts = Shifts(start, end, joint(covariance), cameras, disturbances)
+    shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}
-    for title, estimator in applicable(disturbances).items():
+    for title, estimator in applicable(cameras, disturbances).items():
         gain, values = estimator.gain(shifts), estimator.read(shifts)
         noise = gain @ shifts.covariance @ np.swapaxes(gain, -1, -2)
         found[title] = values, noise, None if disturbances is None else noise + disturbances.misfit(gain)
@@ -220,7 +214,7 @@ def estimates_of(
     parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
     angle: dict[str, IntersectionAngleChange] = {}
     errors: dict[str, GroundError] = {}
-    own = [slice(COORDINATES * k, COORDINATES * (k + 1)) for k in range(len(cameras))]
+    own = [slice(PARAMETERS_EACH * k, PARAMETERS_EACH * (k + 1)) for k in range(len(cameras))]
     for title, (values, noise, total) in found.items():
         for name, part in zip(cameras, own, strict=True):
             whole = None if total is None else total[..., part, part]
@@ -240,16 +234,16 @@ def estimates_of(
 
 
 def joint(covariance: Array) -> Array:
-    """(S, 4 K, 4 K) from the covariances (S, K, 4, 4) of K cameras' shifts, which are independent of each other.
+    """(S, 2 C, 2 C) from the covariances (S, C, 2, 2) of C spots, which are independent of each other.
 
     Args:
         covariance: px^2.
     """
-    states, cameras = covariance.shape[:2]
-    out = np.zeros((states, cameras, COORDINATES, cameras, COORDINATES))
-    for k in range(cameras):
-        out[:, k, :, k, :] = covariance[:, k]
-    return out.reshape(states, cameras * COORDINATES, cameras * COORDINATES)
+    states, spots = covariance.shape[:2]
+    out = np.zeros((states, spots, 2, spots, 2))
+    for i in range(spots):
+        out[:, i, :, i] = covariance[:, i]
+    return out.reshape(states, 2 * spots, 2 * spots)
 
 
 def _flat(mean: Array) -> Array:

@@ -67,6 +67,10 @@ class Instrument:
         """Numbers of a camera's channels among ``channels``."""
         return tuple(i for i, channel in enumerate(self.channels) if channel.camera == camera)
 
+    def coordinates_of(self, camera: str) -> list[int]:
+        """Numbers of the rows and columns of a camera's spots among the coordinates of all."""
+        return [2 * i + axis for i in self.channels_of(camera) for axis in (0, 1)]
+
 
 class MisplacedError(ValueError):
     """A part of the monitor cannot stand as the instrument's file says.

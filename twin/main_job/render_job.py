@@ -13,6 +13,7 @@ from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import find_obstructions
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
@@ -137,7 +138,7 @@ def render_job(
         reasons = "; ".join(f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items())
         raise _too_large(resolved, f"a spot cannot be measured ({reasons})") from error
     stage.begin(7)
-    tables = crosstalk(experiment, _covariances(recovery))
+    tables = crosstalk(experiment, _covariances(experiment.instrument, recovery))
     stage.end()
     targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
     instrument = experiment.instrument
@@ -242,8 +243,10 @@ def _second_half(advance: Advance, first: int, done: int, _: int) -> None:
     advance(STRAY, first + done, 2 * first)
 
 
-def _covariances(recovery: Recovery) -> dict[str, np.ndarray]:
-    return {name: recovery.shift_covariance[0, k] for k, name in enumerate(recovery.parameters)}
+def _covariances(instrument: Instrument, recovery: Recovery) -> dict[str, np.ndarray]:
+    spread = recovery.shift_covariance[0]
+    parts = {name: instrument.coordinates_of(name) for name in recovery.parameters}
+    return {name: spread[np.ix_(own, own)] for name, own in parts.items()}
 
 
 def _too_large(resolved: ResolvedJob, reason: str) -> InputError:

@@ -115,7 +115,7 @@ class RenderRun:
     @property
     def estimators(self) -> dict[str, Estimator]:
         """Those that stand in the results, by their names there: all but those that need what is not stated."""
-        return applicable(self.experiment.disturbances)
+        return applicable(self.experiment.cameras, self.experiment.disturbances)
 
     @property
     def judged(self) -> str:
@@ -124,9 +124,10 @@ class RenderRun:
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> (4 x cameras, 4 x cameras) parameters (rad, m) per pixel of shift, at this measurement."""
-        covariance = {name: self.recovery.shift_covariance[0, k] for k, name in enumerate(self.recovery.parameters)}
-        return estimator_gains(self.experiment, covariance)
+        """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, at this measurement."""
+        spread, instrument = self.recovery.shift_covariance[0], self.experiment.instrument
+        own = {name: instrument.coordinates_of(name) for name in instrument.cameras}
+        return estimator_gains(self.experiment, {name: spread[np.ix_(at, at)] for name, at in own.items()})
 
     @cached_property
     def consistency(self) -> Consistency | None:
@@ -147,7 +148,7 @@ class RenderRun:
         stated, series = self.experiment.disturbances, self.series
         if stated is None or series is None:
             return None
-        noise, false_alarm = joint(series.shift_covariance), FALSE_ALARM / len(series.times)
+        noise, false_alarm = series.shift_covariance, FALSE_ALARM / len(series.times)
         # suspects are looked for at one time only
         found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(series.shift, noise, strict=True)]
         worst = int(np.argmax(found))
@@ -158,11 +159,12 @@ class RenderRun:
     def _any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
         """Body -> what its motions do to all spots, px per table unit, stated or not."""
         columns: dict[tuple[str, str, int], np.ndarray] = {}
-        for k, table in enumerate(self.crosstalk.values()):
+        for name, table in self.crosstalk.items():
+            own = self.experiment.instrument.coordinates_of(name)
             for motion, moved in zip(table.motions, table.spot_shift.T, strict=True):
                 # what both cameras look at stands in both tables
                 key = (motion.body, motion.kind, motion.axis)
-                columns.setdefault(key, np.zeros(len(stated.spots)))[4 * k : 4 * k + 4] = moved
+                columns.setdefault(key, np.zeros(len(stated.spots)))[own] = moved
         bodies = dict.fromkeys(body for body, _, _ in columns)
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 

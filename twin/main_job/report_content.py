@@ -211,11 +211,11 @@ def spots(run: RenderRun) -> list[dict[str, Any]]:
     measured = run.recovered_dict()["spots"]
     for i, channel in enumerate(run.experiment.path.channels):
         one = measured[channel.camera][channel.side]
-        covariance = run.recovery.shift_covariance[0, i // 2]
+        covariance = run.recovery.shift_covariance[0]
         for j, axis in enumerate(("row", "column")):
             start, end = one["before"], one["after"]
             shift = end[axis] - start[axis]
-            k = 2 * (i % 2) + j
+            k = 2 * i + j
             sigma = float(np.sqrt(covariance[k, k]))
             rows.append(
                 {

@@ -16,9 +16,6 @@ from twin.run.artefact import Cell, Table, shown_unit
 from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_result import EdgeReading
 
-SPOT_COORDINATES = ("left y", "left x", "right y", "right x")
-"""Of a spot shift, in the order of the results: rows lie along the line, the camera's Y, columns along X."""
-
 
 def report_tables(run: RenderRun) -> dict[str, Table]:
     """Name -> table, of what the run has."""
@@ -92,9 +89,7 @@ def _spots(run: RenderRun) -> Table:
     for i, channel in enumerate(run.experiment.path.channels):
         for k, axis in enumerate(("row", "column")):
             before, after = float(r.before[0, i, k]), float(r.after[0, i, k])
-            camera = list(run.experiment.instrument.cameras).index(channel.camera)
-            place = 2 * (channel.side == "right") + k
-            sigma = float(r.shift_covariance[0, camera, place, place]) ** 0.5
+            sigma = float(r.shift_covariance[0, 2 * i + k, 2 * i + k]) ** 0.5
             start, end = float(r.sigma_before[0, i, k]), float(r.sigma_after[0, i, k])
             row: list[Cell] = [channel.key, axis, before, start, after, end, after - before, sigma]
             rows.append([*row, (after - before) * pitch, sigma * pitch])
@@ -132,14 +127,16 @@ def _factors(run: RenderRun) -> Table:
 def _motions(run: RenderRun) -> Table:
     """Per unit of each motion: where the spots go, the true change, and every estimator's reading."""
     pitch = 1e6 * run.experiment.path.pitch
-    heads = ["camera", "motion", "body", "per", *(f"{name} [µm]" for name in SPOT_COORDINATES)]
+    places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
+    heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
     heads += [f"{p.symbol} [{p.unit}] true" for p in PARAMETERS]
     heads += [f"{p.symbol} [{p.unit}] {estimator.title}" for estimator in run.estimators.values() for p in PARAMETERS]
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
             row: list[Cell] = [name, motion.label, motion.body, shown_unit(motion.unit)]
-            row += [float(shift) * pitch for shift in table.spot_shift[:, k]]
+            moved = dict(zip(table.coordinates, table.spot_shift[:, k], strict=True))
+            row += [float(moved[place]) * pitch if place in moved else None for place in places]
             row += [float(true) for true in table.true[:, k]]
             for estimator in run.estimators:
                 row += [float(reading) for reading in table.readings[estimator][:, k]]

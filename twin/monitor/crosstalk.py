@@ -12,7 +12,6 @@ from analysis.monitor import model_fit
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.model_fit import ObservabilityReport
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import joint
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family, other_motions
@@ -59,11 +58,12 @@ class CameraCrosstalk:
 
     Attributes:
         motions: the four of the paper's own family first.
-        spot_shift: (4, M) px, rows [left row, left column, right row, right column].
+        spot_shift: (2 n, M) px, row and column of one spot after the other.
         true: (4, M) true change in the units of PARAMETERS.
         readings: estimator -> (4, M), what it says.
         factors: of the printed formulas.
-        observability: what the four coordinates can and cannot separate.
+        observability: what the spots' coordinates can and cannot separate.
+        channels: names of the camera's channels.
     """
 
     motions: tuple[ElementaryMotion, ...]
@@ -72,6 +72,12 @@ class CameraCrosstalk:
     readings: Mapping[str, np.ndarray]
     factors: tuple[FormulaFactor, ...]
     observability: ObservabilityReport
+    channels: tuple[str, ...]
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the rows of ``spot_shift``, ``left y`` and so on: rows count along y, columns along x."""
+        return tuple(f"{channel} {axis}" for channel in self.channels for axis in ("y", "x"))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for crosstalk.json."""
@@ -121,19 +127,19 @@ class CameraCrosstalk:
 def estimator_gains(
     experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """Estimator -> (4 x cameras, 4 x cameras) parameters (rad, m) per pixel of shift, to first order.
+    """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, to first order.
 
     Args:
         experiment: the instrument, with what its job states to move.
-        covariance: camera -> (4, 4) px^2 of the spot shifts, which weighs them; None for no noise.
+        covariance: camera -> (2 n, 2 n) px^2 of its n spots' shifts, which weighs them; None for no noise.
     """
-    names = list(experiment.instrument.cameras)
-    spread = np.zeros((1, len(names), 4, 4))
-    if covariance is not None:
-        spread[0] = [covariance[name] for name in names]
-    still = np.zeros((1, 2 * len(names), 2))
-    shifts = Shifts(still, still, joint(spread), experiment.cameras, experiment.disturbances)
-    return {name: one.gain(shifts)[0] for name, one in applicable(experiment.disturbances).items()}
+    spots = len(experiment.path.channels)
+    still, spread = np.zeros((1, spots, 2)), np.zeros((1, 2 * spots, 2 * spots))
+    shifts = Shifts(still, still, spread, experiment.cameras, experiment.disturbances)
+    for name, own in shifts.coordinates.items():
+        spread[0, own, own] = 0.0 if covariance is None else covariance[name]
+    used = applicable(experiment.cameras, experiment.disturbances)
+    return {name: one.gain(shifts)[0] for name, one in used.items()}
 
 
 def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray]) -> dict[str, CameraCrosstalk]:
@@ -141,7 +147,7 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
 
     Args:
         experiment: the instrument.
-        covariance: camera -> (4, 4) px^2 of the spot shifts of a measurement, by which is told what it can separate.
+        covariance: camera -> (2 n, 2 n) px^2 of its n spots' shifts, by which is told what they can separate.
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
@@ -152,7 +158,7 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
     out = {}
     for k, (name, motions) in enumerate(sets.items()):
         own = slice(len(motions) * k, len(motions) * (k + 1))
-        spots = all_spots[2 * k : 2 * k + 2, :, own].reshape(4, -1)
+        spots = all_spots[list(instrument.channels_of(name))][:, :, own].reshape(-1, len(motions))
         truth = all_truth[name][:, own]
         geometry = experiment.geometry(name)
         size = np.array([motion.unit_size for motion in motions])
@@ -167,8 +173,10 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
                 where, e, PARAMETERS[p], motions[p].label, readings[e][p, p] / ideal[p], readings[e][p, p] / true[p, p]
             )
             for (e, p), where in PRINTED.items()
+            if e in readings
         )
         labels = [f"{m.label} [{m.unit}]" for m in motions]
         report = model_fit.observability(labels, spots, truth, size, covariance[name], family=(0, 1, 2, 3))
-        out[name] = CameraCrosstalk(motions, spots * size, true, readings, factors, report)
+        channels = experiment.cameras[name].channels
+        out[name] = CameraCrosstalk(motions, spots * size, true, readings, factors, report, channels)
     return out

@@ -136,12 +136,14 @@ class MonitorExperiment:
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
         for k, (name, family) in enumerate(families.items()):
+            own = list(self.instrument.channels_of(name))
             cameras[name] = CameraCalibration(
                 geometry=self.geometry(name),
                 look_rad=self.instrument.spec.cameras[name].look,
-                spot_jacobian=spots[2 * k : 2 * k + 2, :, 4 * k : 4 * k + 4].reshape(4, 4),
+                spot_jacobian=spots[own, :, 4 * k : 4 * k + 4].reshape(2 * len(own), 4),
                 parameter_jacobian=self._truth_by_family[name],
                 motions=tuple(motion.label for motion in family),
+                channels=tuple(self.path.channels[i].side for i in own),
             )
         return cameras
 

@@ -113,7 +113,7 @@ class Chain:
         """``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3)."""
         start, end = self.nominal[0], spots[None]
         cameras = self.experiment.cameras
-        joint = np.zeros((1, len(cameras), 4, 4))
+        joint = np.zeros((1, 2 * end.shape[1], 2 * end.shape[1]))
         found = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
         none = np.zeros_like(end)
         recovery = Recovery(start, end, none, none, joint, found.parameters, found.angle, found.ground)

@@ -372,7 +372,7 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
     geometry = bench.geometry(camera)
     f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
     show.defocus_shown(context, slope, curves, constant, pupil, (f_x, f), data)
-    offset = resolved.instrument.cameras[camera].pupil_offset[0]
+    offset = next(iter(resolved.instrument.channels_of(camera).values())).pupil_offset[0]
     theory = {"d_alpha": abs(offset) / f_x**2 / ARCSEC}
     gradient = pupil.gradient[NAMES.index("d_alpha"), 0] * ARCSEC * f_x**2
     across = pupil.gradient[NAMES.index("d_beta"), 1] * ARCSEC * f**2
