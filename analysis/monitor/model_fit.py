@@ -70,7 +70,7 @@ def fit(
         rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     """
     data, spread = np.asarray(shift, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-    count = np.shape(spot_jacobian)[0] if np.ndim(spot_jacobian) else 0
+    count = len(_jacobians(spot_jacobian, parameter_jacobian)[0])
     if data.shape[-1:] != (count,) or spread.shape[-2:] != (count, count):
         wanted = f"shift must be (..., {count}), covariance (..., {count}, {count})"
         raise ValueError(f"model fit: {wanted}, found {data.shape}, {spread.shape}")

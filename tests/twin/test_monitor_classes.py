@@ -59,7 +59,7 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     assert np.max(np.abs(single - want) / peak) < ACCURACY + SINGLE
     # one and the same state in both classes: no step where they meet
     steps = [
-        path.light_per_pixel
+        path.light_per_pixel[:, None, None]
         * path.response.apply(
             monitor_path.image(one.fields([inner]), *(path.grid(axis, path.response.reach) for axis in (1, 0)))
         )
@@ -113,7 +113,7 @@ def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
     aimed = path.rays(states, replace(known, turn=np.zeros_like(known.turn)))
     assert len(calls) == 1
     # a nanometre off its node on the face, a ray is off by that part of the aperture in direction
-    limit = 2.0 * monitor_path.AIM_TOLERANCE / path.face_radius * path.numerical_aperture
+    limit = 2.0 * monitor_path.AIM_TOLERANCE / path.face_radius.min() * path.numerical_aperture
     assert np.max(np.abs(predicted.direction - aimed.direction)) < limit
     assert np.max(np.abs(predicted.position - aimed.position)) < 2.0 * monitor_path.AIM_TOLERANCE
 
