@@ -43,7 +43,6 @@ __all__ = [
     "linear",
     "paper_joint",
     "paper_single",
-    "shift_covariance",
 ]
 
 Array = NDArray[np.float64]
@@ -165,18 +164,6 @@ class CameraParameters:
             out[f"{key}_sigma"] = (sigma[..., k] * scale).tolist()
             out[f"{key}_sigma_noise"] = (noise[..., k] * scale).tolist()
         return out
-
-
-def shift_covariance(left: ArrayLike, right: ArrayLike) -> Array:
-    """(..., 4, 4) covariance of [left row, left column, right row, right column] from two independent (..., 2, 2),
-    px^2.
-    """
-    one, two = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
-    if one.shape[-2:] != (2, 2) or two.shape != one.shape:
-        raise ValueError(f"shift covariance: need two (..., 2, 2) of one shape, found {one.shape} and {two.shape}")
-    out = np.zeros((*one.shape[:-2], 4, 4))
-    out[..., :2, :2], out[..., 2:, 2:] = one, two
-    return out
 
 
 def coefficients(name: str, geometry: MonitorGeometry) -> Array:

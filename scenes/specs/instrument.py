@@ -245,6 +245,19 @@ class MountedCameraSpec(Spec):
             raise Problem("which channels does its monitor have?", found, "one of pupil_offset and channels")
         return self
 
+    @property
+    def mirrored(self) -> "MountedCameraSpec":
+        """The same with every beam through the opposite part of the pupil."""
+        if self.channels is None:
+            assert self.pupil_offset is not None
+            x, y = self.pupil_offset
+            return self.model_copy(update={"pupil_offset": (-x, -y)})
+        turned = {
+            name: one.model_copy(update={"pupil_offset": (-one.pupil_offset[0], -one.pupil_offset[1])})
+            for name, one in self.channels.items()
+        }
+        return self.model_copy(update={"channels": FrozenMap(turned)})
+
 
 class MaterialsSpec(Spec):
     """What the parts are made of, by name in the catalogue of optics/materials/material.py; prisms name their own

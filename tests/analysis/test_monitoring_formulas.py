@@ -14,8 +14,8 @@ from analysis.monitor.monitoring import (
     derived,
     paper_joint,
     paper_single,
-    shift_covariance,
 )
+from analysis.monitor.recovery import joint
 from analysis.units import ARCSEC
 
 # Field angles far larger than real ones, so that a forgotten cos^2 cannot hide.
@@ -162,9 +162,11 @@ def test_geometry_options_and_errors():
         derived(np.full((2, 2), np.nan), np.zeros((2, 2)), ZERO, other)
 
 
-def test_shift_covariance_blocks():
+def test_covariances_of_spots_stand_by_themselves():
     left, right = np.array([[1.0, 0.5], [0.5, 2.0]]), np.array([[3.0, 0.0], [0.0, 4.0]])
-    out = shift_covariance(left, right)
+    out = joint(np.array([[left, right, 2 * left]]))[0]
+    assert out.shape == (6, 6)
     assert np.array_equal(out[:2, :2], left)
-    assert np.array_equal(out[2:, 2:], right)
-    assert not out[:2, 2:].any()
+    assert np.array_equal(out[2:4, 2:4], right)
+    assert np.array_equal(out[4:, 4:], 2 * left)
+    assert out.sum() == 3 * left.sum() + right.sum()

@@ -234,7 +234,7 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
     """Estimator -> (levels, N, Q) chance that an interval holds the truth, given the shifts: against the posterior,
     whose errors do not go with them, the reading is off by (gain - posterior's gain) times the shifts.
     """
-    stated, noise = experiment.disturbances, found.joint_covariance
+    stated, noise = experiment.disturbances, found.shift_covariance
     assert stated is not None
     rows, best = np.stack([quantity.row for quantity in quantities]), stated.best_gain(noise)
     shifts = Shifts(found.before, found.after, noise, experiment.cameras, stated)
@@ -244,7 +244,7 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
         return np.sqrt(np.einsum("qi,nij,qj->nq", rows, total, rows))
 
     left, out = spread(best), {}
-    for name, estimator in applicable(stated).items():
+    for name, estimator in applicable(experiment.cameras, stated).items():
         gain = estimator.gain(shifts)
         off, sigma = np.einsum("qi,nid,nd->nq", rows, gain - best, found.shift), spread(gain)
         out[name] = np.stack(

@@ -12,7 +12,6 @@ from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.limits import LeastSeen, Quantity, Split
-from analysis.monitor.monitoring import shift_covariance
 from analysis.monitor.recovery import joint, measure_spots
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import difference_covariance
@@ -117,8 +116,7 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
     mean = experiment.expected_frames(experiment.nominal_photons)
     centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
     spots = measure_spots(mean, frames, calibration, centroid)
-    each = difference_covariance(spots, spots, calibration.noise).reshape(1, len(calibration.cameras), 2, 2, 2)
-    return np.asarray(joint(shift_covariance(each[:, :, 0], each[:, :, 1]))[0])
+    return np.asarray(joint(difference_covariance(spots, spots, calibration.noise)[None])[0])
 
 
 def find_limits(
@@ -141,11 +139,11 @@ def find_limits(
     cameras = experiment.cameras
     found = limits.quantities(cameras, experiment.ground)
     rows = np.stack([quantity.row for quantity in found])
-    still = np.zeros((1, 2 * len(cameras), 2))
+    still = np.zeros((1, len(experiment.path.channels), 2))
     shifts = Shifts(still, still, noise[None], cameras, stated)
     splits = {
         name: limits.split(rows, stated, noise, estimator.gain(shifts)[0])
-        for name, estimator in applicable(stated).items()
+        for name, estimator in applicable(cameras, stated).items()
     }
     remedies = [
         Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
@@ -196,10 +194,7 @@ def _own(stated: Disturbances) -> list[bool]:
 def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
     """The same motions seen by a monitor whose sub-aperture is on the other side of every pupil."""
     resolved = experiment.resolved
-    mirrored = {
-        name: mounted.model_copy(update={"pupil_offset": (-mounted.pupil_offset[0], -mounted.pupil_offset[1])})
-        for name, mounted in resolved.instrument.cameras.items()
-    }
+    mirrored = {name: mounted.mirrored for name, mounted in resolved.instrument.cameras.items()}
     instrument = resolved.instrument.model_copy(update={"cameras": mirrored})
     other = MonitorExperiment(resolved.model_copy(update={"instrument": instrument}), experiment.backend)
     assert experiment.stated is not None

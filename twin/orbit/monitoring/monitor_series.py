@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
-from analysis.monitor.monitoring import CameraParameters, shift_covariance
+from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.recovery import joint, measure_spots
 from analysis.monitor.series_smoother import smooth, window_of
 from analysis.spots.centroid import mean_frames
@@ -125,8 +125,8 @@ class _Collected:
             self.noise = SeriesNoise(noise_parts(before, self.detector), window_of(2 * self.spots))
 
     def add(self, after: SpotPositions) -> None:
-        spread = difference_covariance(self.before, after, self.detector).reshape(-1, self.spots // 2, 2, 2, 2)
-        self.spread.append(joint(shift_covariance(spread[:, :, 0], spread[:, :, 1])))
+        spread = difference_covariance(self.before, after, self.detector)
+        self.spread.append(joint(spread.reshape(-1, self.spots, 2, 2)))
         self.end.append(after.position.reshape(-1, self.spots, 2))
         if self.noise is not None:
             self.noise.add(noise_parts(after, self.detector))
