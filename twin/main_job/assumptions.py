@@ -101,7 +101,7 @@ def limits(run: RenderRun, camera: str, parameter: Parameter) -> tuple[str, floa
     row = combination(run, camera, parameter)
     gain = run.gains[run.judged]
     seen = row @ gain
-    shares = {NOISE: float(seen @ run.recovery.joint_covariance[0] @ seen)}
+    shares = {NOISE: float(seen @ run.recovery.shift_covariance[0] @ seen)}
     stated = run.experiment.disturbances
     if stated is not None:
         shares |= shares_by_body(row @ stated.error_root(gain), stated.bodies)

@@ -14,7 +14,7 @@ from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import Recovery, joint
+from analysis.monitor.recovery import Recovery
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
