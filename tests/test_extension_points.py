@@ -61,7 +61,7 @@ from scenes.specs.study import DesignSpec, Sampler
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
-from tests.scenes.mirror_reflectors import HOLLOW, PERISCOPE
+from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
 from tests.twin import test_path_figure as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
@@ -703,8 +703,8 @@ PRISM_0 = "{material: fused silica, distance: 0.5 m, shift: 100 mm, width: 60 mm
 def with_mirrors(folder: Path, *changes: tuple[str, str]) -> Path:
     """The library's pair with mirrors in place of its prisms, as files, and a job for it."""
     text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8")
-    made = "{kind: hollow, material: fused silica, distance: 2.4 m, width: 60 mm}"
-    onward = "{kind: periscope, material: fused silica, distance: 0.5 m, shift: 130 mm, width: 60 mm}"
+    made = "{kind: corner, material: fused silica, distance: 2.4 m, width: 60 mm}"
+    onward = "{kind: two_plates, material: fused silica, distance: 0.5 m, shift: 130 mm, width: 60 mm}"
     for old, new in (("name: gf7_pair", "name: mirrors"), (PRISM_180, made), (PRISM_0, onward), *changes):
         assert text.count(old) == 1
         text = text.replace(old, new)
@@ -725,16 +725,19 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """Plane mirrors in place of both prisms: named by a file, seen in the images of the monitor, followed by the path
     tracer, deformed by heat.
     """
-    with pytest.raises(InputError, match=r"prism_180.kind: not one of the choices; found 'hollow', allowed: lateral_"):
+    with pytest.raises(InputError, match=r"prism_180.kind: not one of the choices; found 'corner', allowed: lateral_"):
         resolve(with_mirrors(tmp_path))
-    add(monkeypatch, REFLECTORS, "hollow", HOLLOW)
-    add(monkeypatch, REFLECTORS, "periscope", PERISCOPE)
+    add(monkeypatch, REFLECTORS, "corner", CORNER)
+    add(monkeypatch, REFLECTORS, "two_plates", TWO_PLATES)
     schema = json_schema("instrument")["$defs"]
-    for prism, kinds in (("Prism180Spec", ["lateral_transfer", "hollow"]), ("Prism0Spec", ["rhomboid", "periscope"])):
-        assert schema[prism]["properties"]["kind"]["anyOf"][0]["enum"] == kinds
+    for prism, kinds in (("Prism180Spec", ["hollow_transfer", "corner"]), ("Prism0Spec", ["periscope", "two_plates"])):
+        assert schema[prism]["properties"]["kind"]["anyOf"][0]["enum"][-2:] == kinds
     for change, said in (
-        (("hollow, ", "hollow, angle_errors: {window: [0 rad, 0 rad]}, "), "no such face; found 'window', allowed: mi"),
-        (("kind: periscope", "kind: hollow"), "prism_0.kind: not one of the choices; found 'hollow', allowed: rhomboi"),
+        (("corner, ", "corner, angle_errors: {window: [0 rad, 0 rad]}, "), "no such face; found 'window', allowed: mi"),
+        (
+            ("kind: two_plates", "kind: corner"),
+            "prism_0.kind: not one of the choices; found 'corner', allowed: rhombo",
+        ),
         (("shift: 130 mm", "shift: 110 mm"), "monitor.prism_0.shift: base/forward/monitor/left/prism_0: the mirrors"),
     ):
         with pytest.raises(InputError, match=re.escape(said)):
@@ -798,8 +801,8 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.slow
 def test_a_job_with_a_reflector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The main job's command with stray light, pictures and report."""
-    add(monkeypatch, REFLECTORS, "hollow", HOLLOW)
-    add(monkeypatch, REFLECTORS, "periscope", PERISCOPE)
+    add(monkeypatch, REFLECTORS, "corner", CORNER)
+    add(monkeypatch, REFLECTORS, "two_plates", TWO_PLATES)
     job = with_mirrors(tmp_path)
     job.write_text(
         "instrument: mirrors.yaml\n"
@@ -809,7 +812,7 @@ def test_a_job_with_a_reflector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     )
     done = invoke(twin.render.app, job, "--out", tmp_path / "run")
     assert done.exit_code == 0, done.output
-    assert "hollow" in (tmp_path / "run" / "config.yaml").read_text("utf-8")
+    assert "corner" in (tmp_path / "run" / "config.yaml").read_text("utf-8")
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------

@@ -13,13 +13,16 @@ A ray that enters at (x, y) leaves at (-x, -y), antiparallel: the point reflecti
 the prism's attitude. The beam passes at a distance ``roof_offset`` from the ridge: all of it meets roof_a first.
 
 The 0-deg prism is a rhomboid, its frame's z along the beam, x along the displacement, the origin in its middle.
+
+Both have a hollow twin without glass in the beam: plane mirrors on plates, held by a bar of the same material. Bar and
+plates are one body for heat; the bar is the reflector's own body, the plates stand on it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, product
 from math import sqrt
 
 import numpy as np
@@ -34,7 +37,9 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
 
 EDGE = 0.003
-"""How far the glass reaches beyond its clear apertures, metres."""
+"""How far glass and mirrors reach beyond their clear apertures, metres."""
+BOND = 1e-4
+"""Between the plate of a mirror and the frame that holds it, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +70,7 @@ class Mount:
         path: of its body; all other bodies stand below it.
         pose: of that body in the one that carries it.
         key: prefix of its elements' names.
-        material: of its glass, or of what its mirrors are ground from.
+        material: of its glass, or of the frame and the mirrors that it holds.
         length: from the middle of the entering to that of the leaving beam along x, metres.
         width: of the clear apertures, metres.
         hand: of a reflector that returns the beam, +1: the beam enters at +y of the middle; -1: the mirror image.
@@ -89,7 +94,7 @@ class ReflectorParts:
     Attributes:
         bodies: its own and its faces'; the first has the pivots ``apex`` and ``centre``.
         elements: in the order in which the beam that leaves the camera meets them, with clear apertures.
-        solids: its glass, and what carries its mirrors.
+        solids: its glass, or its frame and mirrors: those whose bodies another one's carries are one piece with it.
         path_length: of the beam's middle inside the glass, metres.
         apex: of a reflector that returns the beam the point about which it may turn, else its middle, in its frame,
             metres.
@@ -121,7 +126,7 @@ class Reflector:
         parts: makes it; ValueError where it cannot be made for its mount.
         sideways: width -> how far from the middle along y the beam passes, metres.
         null_point: length and width -> where it may turn without turning the beam, in its frame, metres.
-        transparent: it is made of glass that the beam goes through, whose index has to be known.
+        transparent: it is made of glass that the beam goes through, whose index has to be known; else of any material.
     """
 
     returns: bool
@@ -217,6 +222,122 @@ def prism_0(mount: Mount) -> ReflectorParts:
     return _parts(mount, planes, passages, (0.0, 0.0, 0.0), {})
 
 
+def hollow_transfer(mount: Mount) -> ReflectorParts:
+    """Three mirrors square to each other: a slice of a hollow corner cube.
+
+    Raises:
+        ValueError: they stand so near to each other that one is in the other's beam.
+    """
+    length, width, hand = mount.length, mount.width, mount.hand
+    off, half, apex = hollow_offset(width), 0.5 * width, hollow_null_point(length, width)
+    x, y, height = 0.5 * length, hand * off, apex[2] - 0.5 * length
+    # how far roof_a reaches back along the transfer, over the ridge's side, and the mirror toward it
+    least = sqrt(2.0) * off + (sqrt(3.0) + 1.0) * half + 3.0 * (EDGE + _thickness(width))
+    if length < least:
+        raise ValueError(
+            f"{mount.path}: mirrors of width {1e3 * width:.4g} mm cannot transfer the beam by only "
+            f"{1e3 * length:.4g} mm; at least {1e3 * least:.4g} mm"
+        )
+    up, along, turned = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
+    mirrors = [
+        (Passage("mirror", "mirror", Interaction.REFLECT, np.array([-x, y, height]), up), (1, 0, -1)),
+        (
+            Passage("roof_a", "roof_a", Interaction.REFLECT, np.array([x - sqrt(2.0) * off, y, height]), along),
+            (-_S, -hand, -_S),
+        ),
+        (
+            Passage("roof_b", "roof_b", Interaction.REFLECT, np.array([x, -y, height - sqrt(2.0) * off]), turned),
+            (-_S, hand, -_S),
+        ),
+    ]
+    return _on_frame(mount, mirrors, apex, 2)
+
+
+def hollow_offset(width: float) -> float:
+    """How far from the ridge the beam passes the hollow transfer, metres: the plates of the roof do not meet there."""
+    return roof_offset(width) + 2.0 * EDGE + _thickness(width)
+
+
+def hollow_null_point(length: float, width: float) -> tuple[float, float, float]:
+    """Where the planes of the three mirrors meet, in the frame of the hollow transfer, metres; no mirror reaches below
+    z = 0.
+    """
+    height = sqrt(2.0) * hollow_offset(width) + sqrt(3.0) * 0.5 * width + 3.0 * EDGE
+    return (0.0, 0.0, height + 0.5 * length)
+
+
+def periscope(mount: Mount) -> ReflectorParts:
+    """Two parallel mirrors.
+
+    Raises:
+        ValueError: the displacement is so small that one stands in the other's beam.
+    """
+    shift, width = mount.length, mount.width
+    least = width + 2.0 * (EDGE + _thickness(width))
+    if shift < least:
+        raise ValueError(
+            f"{mount.path}: mirrors of width {1e3 * width:.4g} mm cannot displace the beam by only "
+            f"{1e3 * shift:.4g} mm; at least {1e3 * least:.4g} mm"
+        )
+    x, along_z, along_x = 0.5 * shift, np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
+    mirrors = [
+        (Passage("mirror_a", "mirror_a", Interaction.REFLECT, -x * along_x, along_z), (1, 0, -1)),
+        (Passage("mirror_b", "mirror_b", Interaction.REFLECT, x * along_x, along_x), (-1, 0, 1)),
+    ]
+    return _on_frame(mount, mirrors, (0.0, 0.0, 0.0), 1)
+
+
+def _thickness(width: float) -> float:
+    """Of a mirror's plate, metres: an eighth of its length, which is sqrt(2) times the beam's width."""
+    return 0.18 * width
+
+
+def _on_frame(
+    mount: Mount,
+    mirrors: list[tuple[Passage, tuple[float, float, float]]],
+    apex: tuple[float, float, float],
+    axis: int,
+) -> ReflectorParts:
+    """Each mirror, given with its normal toward the light, on a plate of its own; a bar beyond them all along ``axis``
+    that holds them.
+    """
+    passages = [passage for passage, _ in mirrors]
+    planes: list[Plane] = [
+        (p.face, normal, (p.place[0], p.place[1], p.place[2]), Coating.MIRROR) for p, normal in mirrors
+    ]
+    bodies, elements, _ = _faces(mount, planes, passages, apex, {}, None)
+    plates, corners = [], []
+    for body, element in zip(bodies[1:], elements, strict=True):
+        assert isinstance(element.aperture, Ellipse)
+        high = np.array([element.aperture.half_x + EDGE, element.aperture.half_y + EDGE, 0.0])
+        low = np.array([-high[0], -high[1], -_thickness(mount.width)])
+        faces = _box(body.path, low, high, Coating.MIRROR)
+        plates.append(Solid(body.path, mount.material, faces, transparent=False))
+        corners += [body.pose.apply(np.where(np.array(c) == 1, high, low)) for c in product((0, 1), repeat=3)]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    middle, half = 0.5 * (low + high), 0.5 * mount.width
+    other = 3 - axis  # the bar lies along x
+    low[other], high[other] = middle[other] - half, middle[other] + half
+    low[axis] = high[axis] + BOND
+    high[axis] = low[axis] + _thickness(mount.width)
+    frame = Solid(mount.path, mount.material, _box(mount.path, low, high), transparent=False)
+    return ReflectorParts(bodies, elements, (frame, *plates), 0.0, apex)
+
+
+def _box(body: str, low: np.ndarray, high: np.ndarray, front: Coating = Coating.GROUND) -> tuple[Face, ...]:
+    """Faces of a box between two corners in a body's frame, metres; ``front`` is the one toward +z."""
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    out = []
+    for name, axis, sign in (("front", 2, 1.0), ("back", 2, -1.0), *_SIDES):
+        normal = sign * np.eye(3)[axis]
+        coating = front if name == "front" else Coating.GROUND
+        out.append(Face(name, body, coating, Pose(_axes(normal, None), middle + half * normal)))
+    return tuple(out)
+
+
+_SIDES = (("end_a", 0, -1.0), ("end_b", 0, 1.0), ("side_a", 1, 1.0), ("side_b", 1, -1.0))
+
+
 def _parts(
     mount: Mount,
     planes: list[Plane],
@@ -227,6 +348,20 @@ def _parts(
     """Bodies, elements and solid from planes and passages; ``origins`` places the frame of a face that two passages
     share.
     """
+    bodies, elements, faces = _faces(mount, planes, passages, apex, origins, mount.path)
+    inside = sum(float(norm(b.place - a.place)) for a, b in pairwise(passages))
+    return ReflectorParts(bodies, elements, (Solid(mount.path, mount.material, faces),), inside, apex)
+
+
+def _faces(
+    mount: Mount,
+    planes: list[Plane],
+    passages: list[Passage],
+    apex: tuple[float, float, float],
+    origins: Mapping[str, tuple[float, float, float]],
+    solid: str | None,
+) -> tuple[tuple[Body, ...], tuple[Element, ...], tuple[Face, ...]]:
+    """Bodies and elements from planes and passages, and all faces; ``solid`` is the glass that light goes through."""
     path, width, errors = mount.path, mount.width, mount.errors
     used = {p.face: p for p in reversed(passages)}
     shared = {face for face in used if sum(p.face == face for p in passages) > 1}
@@ -265,11 +400,10 @@ def _parts(
                 plane(),
                 passage.interaction,
                 aperture,
-                solid=path,
+                solid=solid,
             )
         )
-    inside = sum(float(norm(b.place - a.place)) for a, b in pairwise(passages))
-    return ReflectorParts(tuple(bodies), tuple(elements), (Solid(path, mount.material, tuple(faces)),), inside, apex)
+    return tuple(bodies), tuple(elements), tuple(faces)
 
 
 def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
@@ -318,6 +452,10 @@ def facet_block(
 REFLECTORS: dict[str, Reflector] = {
     "lateral_transfer": Reflector(True, ("window", "mirror", "roof_a", "roof_b"), prism_180, roof_offset, null_point),
     "rhomboid": Reflector(False, ("entry", "mirror_a", "mirror_b", "exit"), prism_0),
+    "hollow_transfer": Reflector(
+        True, ("mirror", "roof_a", "roof_b"), hollow_transfer, hollow_offset, hollow_null_point, transparent=False
+    ),
+    "periscope": Reflector(False, ("mirror_a", "mirror_b"), periscope, transparent=False),
 }
 """Name that an instrument's file may write as ``kind`` of ``monitor.prism_180``, if it returns the beam, or of
 ``monitor.prism_0`` -> kind. A new one is added here: the reader of files, the instrument, its images, heat, stray light

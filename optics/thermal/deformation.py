@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, assert_never
+from typing import Any, Protocol, assert_never
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -47,6 +47,29 @@ class Displacement:
         """
         dofs, shape = self.finder.shapes(np.asarray(points, np.float64))
         return np.asarray(np.einsum("pi,pix->px", shape, self.values[dofs]))
+
+
+class Displaced(Protocol):
+    """A body of which every point's displacement is known."""
+
+    def at(self, points: Any) -> np.ndarray:
+        """Displacement at points (P, 3) of the body, metres, (P, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """A displacement that a formula gives everywhere.
+
+    Attributes:
+        field: points (P, 3) in metres -> displacements (P, 3) in metres.
+    """
+
+    field: Callable[[np.ndarray], np.ndarray]
+
+    def at(self, points: Any) -> np.ndarray:
+        """Displacement at points (P, 3), metres, (P, 3)."""
+        return self.field(np.asarray(points, np.float64))
 
 
 class Finder:
@@ -141,7 +164,7 @@ class FaceChange:
 
 
 def face_change(
-    displacement: Displacement, surface: Surface, aperture: Aperture, pose: Pose, terms: int = 15
+    displacement: Displaced, surface: Surface, aperture: Aperture, pose: Pose, terms: int = 15
 ) -> FaceChange:
     """Rigid motion and change of figure of a face, by least squares over its aperture.
 

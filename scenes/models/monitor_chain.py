@@ -273,8 +273,8 @@ def check_prisms(spec: InstrumentSpec) -> None:
             for name, prism in given.prisms.items():
                 own = site.channels is not None and getattr(site.channels[side], name) is not None
                 key: KeyPath = ("cameras", camera, "channels", side, name) if own else ("monitor", name)
-                known = glass(prism.material)
-                if prism.reflector.transparent and not known.shortest <= wavelength <= known.longest:
+                known = glass(prism.material) if prism.reflector.transparent else None
+                if known is not None and not known.shortest <= wavelength <= known.longest:
                     raise spec.error(
                         f"the index of {prism.material} is not known at the monitor's wavelength of "
                         f"{1e9 * wavelength:.6g} nm",

@@ -3,13 +3,13 @@
 A body without a temperature of its own has the field of the body that carries it. Every body is held at its mount
 (the pivot ``centre`` if there is one, else the origin) and expands freely about it; structures carry the mounts of
 what stands on them. Mirrors and prisms deform by a finite-element solution for a unit gradient along each axis, held
-at three points; the solution is linear, so that one factorisation serves all temperatures. Glass changes its index by
-dn/dT.
+at three points; the solution is linear, so that one factorisation serves all temperatures. Mirrors on a frame of the
+same material are one free body with it, whose exact deformation is known. Glass changes its index by dn/dT.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -21,10 +21,10 @@ from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
 from optics.materials.glass import glass
 from optics.materials.material import Material, material
-from optics.thermal.deformation import FaceChange, face_change
+from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, carried_motion
-from optics.thermal.thermo_elastic import ElasticBody, Kinematic
+from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import THICKNESS, behind
 from scenes.specs.channel import BASE
@@ -99,12 +99,12 @@ class ThermalModel:
         return out
 
     def _owner(self, path: str) -> str | None:
-        """The solid that a body belongs to, itself or a parent."""
-        while path:
-            if path in self._solids:
-                return path
-            path = path.rpartition("/")[0]
-        return None
+        """The solid that a body belongs to, itself or a parent: the outermost, whose pieces the others are."""
+        return next((p for p in reversed(list(_upward(path))) if p in self._solids), None)
+
+    def _pieces(self, path: str) -> list[Solid]:
+        """A solid and those that are pieces of it."""
+        return [solid for piece, solid in self._solids.items() if self._owner(piece) == path]
 
     def fields(self, temperatures: Mapping[str, Temperature]) -> dict[str, Temperature]:
         """Every warmed body's field in its own frame, its own or inherited."""
@@ -148,7 +148,9 @@ class ThermalModel:
         """Points of a body between which its temperature lies, (P, 3), metres; kept, since a series asks often."""
         if path not in self._extents:
             if path in self._solids:
-                points = solid_mesh(self._solids[path], self._placed).mesh.vertices
+                own = self._placed.pose(path).inverse()
+                meshes = ((p.path, solid_mesh(p, self._placed).mesh.vertices) for p in self._pieces(path))
+                points = np.concatenate([own.apply(self._placed.pose(name).apply(mesh)) for name, mesh in meshes])
             elif path in self._mirrors:
                 points = self._mirror_outline(path)
             else:
@@ -223,19 +225,20 @@ class ThermalModel:
         return self._responses[path]
 
     def _solid_response(self, path: str) -> Response:
-        solid: Solid = self._solids[path]
-        corners = solid_mesh(solid, self._placed).mesh.vertices
+        faces = {
+            element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
+            for element in self.instrument.assembly.elements.values()
+            if self._owner(element.body) == path and element.aperture is not None
+        }
+        if len(self._pieces(path)) > 1:
+            return self._face_changes(path, [self._free(path, axis) for axis in range(3)], faces)
+        corners = solid_mesh(self._solids[path], self._placed).mesh.vertices
         low, high = corners.min(axis=0), corners.max(axis=0)
         middle, half = corners.mean(axis=0), 0.5 * (high - low)
         # three points around the middle, 120 deg apart in the plane of the two longest sides
         a, b = np.argsort(half)[:0:-1][:2]
         arms = np.array([0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE])
         support = middle + _within(corners, middle, arms) * arms
-        faces = {
-            element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
-            for element in self.instrument.assembly.elements.values()
-            if self._owner(element.body) == path and element.aperture is not None
-        }
         elastic = ElasticBody(polyhedron_mesh(corners, SPACING), self.materials[path])
         return self._unit_gradients(path, elastic, support, faces)
 
@@ -259,7 +262,17 @@ class ThermalModel:
     ) -> Response:
         about = self._bodies[path].pivots.get("centre", (0.0, 0.0, 0.0))
         loads = [_unit_load(a, np.array(about)) for a in range(3)]
-        solved = elastic.solve_many(loads, Kinematic(support))
+        return self._face_changes(path, elastic.solve_many(loads, Kinematic(support)), faces)
+
+    def _free(self, path: str, axis: int) -> Formula:
+        """A body that nothing holds, in a gradient of 1 K/m: it stays and does not turn where its mount is."""
+        about = self._bodies[path].pivots[_mount(self._bodies[path])]
+        return Formula(free_linear_field(self.materials[path].expansion, 0.0, np.eye(3)[axis], about))
+
+    def _face_changes(
+        self, path: str, solved: Sequence[Displaced], faces: Mapping[str, tuple[Aperture, Pose]]
+    ) -> Response:
+        """What displacements by unit gradients along x, y, z do to a body's faces."""
         surfaces = {e.body: e.surface for e in self.instrument.assembly.elements.values()}
         out = {}
         for body, (aperture, pose) in faces.items():

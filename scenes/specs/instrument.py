@@ -17,7 +17,19 @@ from scenes.specs.channel import PRISM_0, PRISM_180, SIDES
 from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
-from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Spec, Text, Whole, name_in
+from scenes.yaml.spec import (
+    Catalogued,
+    Name,
+    Named,
+    NothingIsEmpty,
+    Number,
+    OneOf,
+    Reference,
+    Spec,
+    Text,
+    Whole,
+    name_in,
+)
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
 
 Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]
@@ -25,6 +37,18 @@ Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2
 
 GlassName = Annotated[str, Field(strict=True), name_in("glass", GLASSES, glass)]
 """A glass of the catalogue in optics/materials/glass.py."""
+
+
+MadeOf = Annotated[str, Field(strict=True), Catalogued(lambda name: _spelt(name), MATERIALS)]
+"""A glass, or what a frame of mirrors is made of; see ``_check_made``."""
+
+
+def _spelt(name: str) -> str:
+    """A material's name in the catalogue's own spelling; another name as it is."""
+    try:
+        return material(name).name
+    except KeyError:
+        return name
 
 
 FaceErrors = Annotated[dict[Name, Tilt], NothingIsEmpty, AfterValidator(FrozenMap)]
@@ -44,21 +68,32 @@ def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector
             raise Problem("no such face", shown(name), names_text(known), nearest(name, known), within)
 
 
+def _check_made(made_of: str, reflector: Reflector) -> None:
+    """Refuse what a reflector cannot be made of."""
+    if made_of not in (GLASSES if reflector.transparent else MATERIALS):
+        names = GLASSES if reflector.transparent else MATERIALS
+        what = "no such glass" if reflector.transparent else "no such material"
+        if made_of in MATERIALS:
+            what += ": light goes through this kind; of other materials are the kinds without glass"
+        raise Problem(what, shown(made_of), names_text(names), nearest(made_of, names), ("material",))
+
+
 class Prism180Spec(Spec):
     """The lateral-transfer prism: three mutually perpendicular faces send the beam back parallel to itself.
 
     Attributes:
-        material: its glass.
+        material: its glass; of a kind without glass the material of its frame and mirrors.
         distance: from the camera's origin to its window, along the line of sight, metres.
         width: of the clear apertures across the beam, metres; somewhat more than the return face's.
         tilt: turn about its own x and y from where its faces stand square to the beam, about its null point, radians.
             It leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
         angle_errors: face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a,
-            roof_b.
-        kind: what stands in its place, by its name among ``REFLECTORS``; the prism when nothing is said.
+            roof_b; of the hollow kind mirror, roof_a, roof_b.
+        kind: what stands in its place, by its name among ``REFLECTORS``: the prism (lateral_transfer) when nothing is
+            said, or three mirrors on a frame (hollow_transfer).
     """
 
-    material: GlassName
+    material: MadeOf
     distance: PositiveLength
     width: PositiveLength
     tilt: Tilt = (0.0, 0.0)
@@ -71,7 +106,8 @@ class Prism180Spec(Spec):
         return REFLECTORS[self.kind or "lateral_transfer"]
 
     @model_validator(mode="after")
-    def _has_these_faces(self) -> "Prism180Spec":
+    def _can_be_made(self) -> "Prism180Spec":
+        _check_made(self.material, self.reflector)
         _check_faces(self.angle_errors, self.reflector)
         return self
 
@@ -80,16 +116,18 @@ class Prism0Spec(Spec):
     """The rhomboid: two parallel reflecting faces displace the beam and keep its direction.
 
     Attributes:
-        material: its glass.
+        material: its glass; of a kind without glass the material of its frame and mirrors.
         distance: from the return face to its centre, along the beam, metres.
         shift: by how much it displaces the beam, toward the central prism, metres.
         width: of the clear apertures across the beam, metres.
         tilt: turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
-        angle_errors: face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit.
-        kind: what stands in its place, by its name among ``REFLECTORS``; the prism when nothing is said.
+        angle_errors: face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit; of the periscope
+            mirror_a, mirror_b.
+        kind: what stands in its place, by its name among ``REFLECTORS``: the prism (rhomboid) when nothing is said, or
+            two mirrors on a frame (periscope).
     """
 
-    material: GlassName
+    material: MadeOf
     distance: PositiveLength
     shift: PositiveLength
     width: PositiveLength
@@ -103,7 +141,8 @@ class Prism0Spec(Spec):
         return REFLECTORS[self.kind or "rhomboid"]
 
     @model_validator(mode="after")
-    def _has_these_faces(self) -> "Prism0Spec":
+    def _can_be_made(self) -> "Prism0Spec":
+        _check_made(self.material, self.reflector)
         _check_faces(self.angle_errors, self.reflector)
         return self
 

@@ -1,5 +1,5 @@
-"""Reflectors of a monitor without glass: plane mirrors on plates, as a hollow lateral-transfer retro-reflector and as a
-periscope. They are toys from outside, registered by a test.
+"""Reflectors of a monitor whose mirrors stand each on its own, without a frame: three square to each other and two
+parallel ones. They are toys from outside, registered by a test.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ def plate(body: str, aperture: Ellipse) -> tuple[Face, ...]:
     return (Face("front", body, Coating.MIRROR), *ground)
 
 
-def periscope(mount: Mount) -> ReflectorParts:
+def two_plates(mount: Mount) -> ReflectorParts:
     """Two parallel mirrors at 45 deg: the beam goes on, displaced."""
     half = 0.5 * mount.length
     if mount.length < 2.0 * mount.width:
-        raise ValueError(f"{mount.path}: the mirrors of a periscope stand in each other's beams")
+        raise ValueError(f"{mount.path}: the mirrors stand in each other's beams")
     z, x = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
     return of_plates(mount, [("first", x - z, -half * x, z), ("second", z - x, half * x, x)], (0.0, 0.0, 0.0))
 
@@ -81,7 +81,7 @@ def corner(length: float, width: float) -> tuple[float, float, float]:
     return (0.0, 0.0, 0.5 * length + 2.0 * width)
 
 
-def hollow(mount: Mount) -> ReflectorParts:
+def three_plates(mount: Mount) -> ReflectorParts:
     """Three mirrors square to each other, far apart: a slice of a hollow corner cube."""
     x, y = 0.5 * mount.length, mount.hand * aside(mount.width)
     apex = corner(mount.length, mount.width)
@@ -95,5 +95,5 @@ def hollow(mount: Mount) -> ReflectorParts:
     return of_plates(mount, mirrors, apex)
 
 
-PERISCOPE = Reflector(False, ("first", "second"), periscope, transparent=False)
-HOLLOW = Reflector(True, ("mirror", "roof_a", "roof_b"), hollow, aside, corner, transparent=False)
+TWO_PLATES = Reflector(False, ("first", "second"), two_plates, transparent=False)
+CORNER = Reflector(True, ("mirror", "roof_a", "roof_b"), three_plates, aside, corner, transparent=False)
