@@ -18,7 +18,7 @@ from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly, Element
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, prism_of
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, channel_of, prism_of
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 LEAST_GAP = 20e-6
@@ -114,13 +114,21 @@ def check_clearance(instrument: Instrument) -> None:
 
 
 def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
-    ranks = [_remedy(path) for path in (overlap.second, overlap.first)]  # of equals the later one: first cameras lead
-    _, key, remedy = min(ranks, key=lambda rank: rank[0])
+    # of equals the later one: first cameras lead
+    path = min((overlap.second, overlap.first), key=lambda path: _remedy(path)[0])
+    key, allowed = remedy(instrument, path)
     mm = 1e3 * overlap.depth
     how = f"reaches {mm:.3g} mm into" if mm > 0.0 else f"is only {-1e3 * mm:.2g} um from"
     problem = f"{overlap.first} {how} {overlap.second}"
-    allowed = f"{remedy} that leaves at least {1e6 * LEAST_GAP:.3g} um of room"
+    allowed = f"{allowed} that leaves at least {1e6 * LEAST_GAP:.3g} um of room"
     return instrument.spec.issue(problem, key, allowed=allowed)
+
+
+def remedy(instrument: Instrument, path: str) -> tuple[KeyPath, str]:
+    """Which key of the file moves a body, and what to choose there."""
+    _, key, choice = _remedy(path)
+    channel = channel_of(path)
+    return key if channel is None else instrument.spec.key_of(*channel, key), choice
 
 
 def _remedy(path: str) -> tuple[int, KeyPath, str]:
@@ -151,7 +159,7 @@ def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
         try:
             solid_mesh(solid, placed)
         except SolidError as error:
-            raise MisplacedError(str(error), key_of(solid.path)) from error
+            raise MisplacedError(str(error), key_of(solid.path), channel_of(solid.path)) from error
         for face in solid.faces:
             for element in assembly.elements.values():
                 if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
@@ -177,7 +185,8 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
             over, across = beyond, other.name
     if over > 0.0:
         what = f"the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face"
-        raise MisplacedError(f"{solid.path}: {what}, beyond {across}", _key_of_edge(solid.path, across))
+        camera, side = element.name.split("/")[:2]
+        raise MisplacedError(f"{solid.path}: {what}, beyond {across}", _key_of_edge(solid.path, across), (camera, side))
 
 
 def _key_of_edge(path: str, across: str) -> KeyPath:

@@ -5,6 +5,7 @@ faces.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import combinations, permutations
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,7 @@ from scenes.models.monitor_chain import (
     monitor_chain,
     square_facets,
 )
+from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
 from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
 from scenes.specs.job import NodeInfo
@@ -56,7 +58,8 @@ def build_instrument(spec: InstrumentSpec, camera_specs: Mapping[str, object], b
     try:
         return _build(spec, camera_specs, backend)
     except MisplacedError as error:
-        raise spec.error(str(error), error.key) from error
+        key = error.key if error.channel is None else spec.key_of(*error.channel, error.key)
+        raise spec.error(str(error), key) from error
 
 
 def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend) -> Instrument:
@@ -124,6 +127,7 @@ def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Ba
     )
     check_solids(instrument.assembly, solids)
     check_clearance(instrument)
+    check_beams(instrument, backend)
     return instrument
 
 
@@ -139,13 +143,30 @@ def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
 
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
-    """Where the reticles and area CCDs stand: at f tan(field) along the line."""
-    dx, dy = spec.monitor.area_ccd.offset
+    """Where the reticles and area CCDs stand: at f tan(field) along the line.
+
+    Raises:
+        InputError: two of them would stand in each other.
+    """
+    ccd = spec.monitor.area_ccd
+    dx, dy = ccd.offset
     out = []
     for name, one in spec.channels_of(camera).items():
         place = model.line_focal_length * float(np.tan(one.field))
         beam = one.pupil_offset, one.return_face.aperture, one.photons_per_frame
         out.append(Channel(camera, name, (-dx, place - dy), (0.0, place), *beam))
+    half = 0.5 * ccd.pitch * np.array([ccd.columns, ccd.rows])
+    edge = 0.5 * spec.monitor.reticle.pinhole
+    for first, second in combinations(out, 2):
+        chips = np.abs(np.subtract(first.ccd, second.ccd)) < 2.0 * half
+        pinholes = [np.abs(np.subtract(a.pinhole, b.ccd)) < half + edge for a, b in permutations((first, second))]
+        if np.all(chips) or np.any(np.all(pinholes, axis=-1)):
+            apart = 1e3 * abs(second.ccd[1] - first.ccd[1])
+            raise spec.error(
+                f"the boards of {first.key} and {second.key} stand in each other: their CCDs are {apart:.4g} mm apart",
+                spec.key_of(camera, second.side, ("monitor", "field")),
+                allowed=f"field places at which CCDs of {2e3 * half[1]:.4g} mm, and pinholes beside them, have room",
+            )
     return out
 
 

@@ -76,16 +76,17 @@ class MisplacedError(ValueError):
     """A part of the monitor cannot stand as the instrument's file says.
 
     Attributes:
-        key: of the file, what to change.
+        key: of the file, what to change, as it is for all channels.
+        channel: camera and name of the channel that it is about, which may say it itself; None for none.
     """
 
-    def __init__(self, problem: str, key: KeyPath) -> None:
+    def __init__(self, problem: str, key: KeyPath, channel: tuple[str, str] | None = None) -> None:
         super().__init__(problem)
-        self.key = key
+        self.key, self.channel = key, channel
 
 
 def key_of(path: str) -> KeyPath:
-    """Key of the instrument's file that a body comes from."""
+    """Key of the instrument's file that a body comes from, as it is for all channels."""
     if path.startswith(CENTRAL_PRISM):
         return (CENTRAL_KEY,)
     prism = prism_of(path)

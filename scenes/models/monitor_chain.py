@@ -98,7 +98,22 @@ def leaving_beams(
 def _leaving(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Beams of channels whose windows stand at one distance, metres."""
+    """Beams of channels whose windows stand at one distance, metres; an error is about the first that has none."""
+    try:
+        return _traced_out(model, channels, distance, to_base, backend)
+    except MisplacedError:
+        for channel in channels:
+            try:
+                _traced_out(model, [channel], distance, to_base, backend)
+            except MisplacedError as error:
+                raise MisplacedError(str(error), error.key, (channel.camera, channel.side)) from error
+        raise
+
+
+def _traced_out(
+    model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
+) -> list[LeavingBeam]:
+    """As ``_leaving``; an error is about all channels."""
     frame = model.camera_frame
     reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
     bare = model.bare_assembly(apertures=False)
@@ -147,8 +162,8 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
         beams: of one camera.
 
     Raises:
-        InputError: a facet would lie under its neighbour: of two in one corner the one that leans more has to stand
-            farther out.
+        InputError: two beams share a facet, or a facet would lie under its neighbour: of two in one corner the one that
+            leans more has to stand farther out.
     """
     apex = np.array(spec.central_prism.position)
     corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
@@ -159,12 +174,20 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
         offset = side * np.array(given.spread)
         lean, height = up[:2] / up[2], 0.0
         for n, (other, place, slope, top) in enumerate(corners.setdefault((side[0], side[1]), [])):
+            apart, least = float(norm(offset - place)), 0.5 * float(up[2]) * (channel.aperture + other.aperture)
+            if apart < least:
+                raise spec.error(
+                    f"the facets of {channel.key} and {other.key} overlap: their beams meet the block only "
+                    f"{1e3 * apart:.4g} mm from each other",
+                    spec.key_of(channel.camera, channel.side, (CENTRAL_KEY, "spread")),
+                    allowed=f"a place at least {1e3 * least:.4g} mm from that of {other.key}",
+                )
             across = float(inner(lean - slope, offset - place))
             if across < 0.0:
                 raise spec.error(
                     f"the facets of {channel.key} and {other.key} hide one another: the one that leans more has to "
                     "stand farther out",
-                    ("cameras", channel.camera, "channels", channel.side, "spread"),
+                    spec.key_of(channel.camera, channel.side, (CENTRAL_KEY, "spread")),
                     allowed=f"a place on the other side of that of {other.key}",
                 )
             level = top + float(inner(lean - slope, 0.5 * (offset + place)))
@@ -222,14 +245,14 @@ def monitor_chain(
     pose = pose @ _turn(made.tilt, made.reflector.null_point(length, made.width))
     names = channel.prism_body(PRISM_180), channel.prism_elements(PRISM_180)
     mount = Mount(names[0], into_camera @ pose, names[1], made.material, length, made.width, hand, made.angle_errors)
-    first = _made(spec, PRISM_180, "width", made.reflector, mount)
+    first = _made(spec, channel, PRISM_180, "width", made.reflector, mount)
     pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
     pose = pose @ _turn(small.tilt, small.reflector.null_point(small.shift, small.width))
     names = channel.prism_body(PRISM_0), channel.prism_elements(PRISM_0)
     mount = Mount(
         names[0], into_camera @ pose, names[1], small.material, small.shift, small.width, errors=small.angle_errors
     )
-    second = _made(spec, PRISM_0, "shift", small.reflector, mount)
+    second = _made(spec, channel, PRISM_0, "shift", small.reflector, mount)
     face = Element(
         f"{channel.key}/return_face",
         channel.face_body,
@@ -246,12 +269,14 @@ def monitor_chain(
     )
 
 
-def _made(spec: InstrumentSpec, prism: str, key: str, reflector: Reflector, mount: Mount) -> ReflectorParts:
+def _made(
+    spec: InstrumentSpec, channel: Channel, prism: str, key: str, reflector: Reflector, mount: Mount
+) -> ReflectorParts:
     """A reflector; InputError at a key of the prism where it cannot be made."""
     try:
         return reflector.parts(mount)
     except ValueError as error:
-        raise spec.error(str(error), ("monitor", prism, key)) from error
+        raise spec.error(str(error), spec.key_of(channel.camera, channel.side, ("monitor", prism, key))) from error
 
 
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
@@ -267,12 +292,11 @@ def check_prisms(spec: InstrumentSpec) -> None:
         InputError: one of them does not.
     """
     wavelength = spec.monitor.wavelength
-    for camera, site in spec.cameras.items():
+    for camera in spec.cameras:
         for side, given in spec.channels_of(camera).items():
             face = given.return_face.aperture
             for name, prism in given.prisms.items():
-                own = site.channels is not None and getattr(site.channels[side], name) is not None
-                key: KeyPath = ("cameras", camera, "channels", side, name) if own else ("monitor", name)
+                key = spec.key_of(camera, side, ("monitor", name))
                 known = glass(prism.material) if prism.reflector.transparent else None
                 if known is not None and not known.shortest <= wavelength <= known.longest:
                     raise spec.error(
@@ -356,17 +380,44 @@ def _missed(
         if alive.all():
             continue
         what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
-        bare = assembly.with_element(replace(element, aperture=None))
-        traced = trace(backend, assemble(bare, [names[:count]]), make_rays(backend, position, direction))
-        if element.aperture is not None and traced.numpy()[3].all():
-            gap = element.aperture.outline(_OUTLINE)[:, None] - traced.place()[0][~alive]
-            off = float(np.max(np.min(np.linalg.norm(gap, axis=-1), axis=0)))
+        off = beside(assembly, backend, names[:count], position, direction, ~alive)
+        if off is not None:
             what += f": it passes {1e3 * off:.3g} mm beside the clear aperture"
         elif element.interaction is Interaction.TOTAL:
             what += ", or is not totally reflected there"
         what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
-        return MisplacedError(what, key_of(element.body))
+        return MisplacedError(what, key_of(element.body), (channel.camera, channel.side))
     return MisplacedError(f"the middle of the beam {channel.key} misses its facet", (CENTRAL_KEY, "position"))
+
+
+def beside(
+    assembly: Assembly,
+    backend: Backend,
+    names: Sequence[str],
+    position: np.ndarray,
+    direction: np.ndarray,
+    lost: np.ndarray,
+) -> float | None:
+    """How far beside the clear aperture of the last of some elements lost rays pass at most, metres.
+
+    Args:
+        assembly: with the elements.
+        backend: where to trace.
+        names: of the elements, in the order of the light.
+        position: of rays, world, metres, broadcastable to (1, N, 3).
+        direction: unit vectors, likewise.
+        lost: which of them get lost at the last element, (N,).
+
+    Returns:
+        None where they do not meet its surface, or where it has no edge.
+    """
+    element = assembly.elements[names[-1]]
+    bare = assembly.with_element(replace(element, aperture=None))
+    traced = trace(backend, assemble(bare, [tuple(names)]), make_rays(backend, position, direction))
+    if element.aperture is None or not traced.numpy()[3][0][lost].all():
+        return None
+    gap = element.aperture.outline(_OUTLINE)[:, None] - traced.place()[0][lost]
+    return float(np.max(np.min(np.linalg.norm(gap, axis=-1), axis=0)))
 
 
 def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:

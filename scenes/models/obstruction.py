@@ -1,7 +1,8 @@
 """Which prisms stand in the way of light: of the imaging beams, and of monitor beams that are not their own.
 
 A 180-deg prism has to stand before its camera, since its channel uses a part of the pupil; what it takes of the imaging
-beam is reported, and how much of that its channel uses.
+beam is reported, and how much of that its channel uses. A monitor beam has to get to its area CCD whole: an instrument
+in which a body or the edge of a clear aperture takes a part of one is refused.
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from optics.geometry.aperture import Circle
 from optics.geometry.solid import solid_mesh
 from optics.numerics.backend import Backend
-from optics.raytrace.aim import RayFan, aim, transverse_axes
+from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.system import assemble, media_along
+from optics.raytrace.system import SystemBatch, assemble, media_along
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_assembly import line_body
-from scenes.specs.channel import BASE, PRISM_180
+from scenes.models.clearance import convex_bodies, remedy
+from scenes.models.instrument_model import MisplacedError, key_of
+from scenes.models.monitor_chain import beside
+from scenes.specs.channel import BASE, PRISM_180, Channel
+from scenes.yaml.errors import InputError, Issue
 
 if TYPE_CHECKING:
     from scenes.models.instrument_model import Instrument
@@ -30,6 +34,7 @@ RAYS = 400
 
 _TOUCHING = 1e-6  # length inside a body below which a ray only touches it, metres
 _AIM = 1e-6  # how well rays meet their places on a stop or face, metres
+_RINGS, _AROUND = 6, 24
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -71,12 +76,11 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
                 new = Obstruction(path, f"{camera}/imaging", float(np.mean(taken)), used)
                 if (new.beam, path) not in found or found[new.beam, path].share < new.share:
                     found[new.beam, path] = new
-    for key, segments, inside in _monitor(instrument, backend):
+    for beam in monitor_beams(instrument, backend, _disk(1.0)):
         for path, planes in solids.items():
-            outside = segments[:, [medium != path for medium in inside]]
-            taken = rays_taken(outside, planes)
+            taken = rays_taken(beam.outside(path), planes)
             if taken.any():
-                found[key, path] = Obstruction(path, key, float(np.mean(taken)))
+                found[beam.channel.key, path] = Obstruction(path, beam.channel.key, float(np.mean(taken)))
     return tuple(found[name] for name in sorted(found))
 
 
@@ -99,6 +103,16 @@ def _disk(radius: float) -> np.ndarray:
     k = np.arange(RAYS)
     r = radius * np.sqrt((k + 0.5) / RAYS)
     return np.stack([r * np.cos(_GOLDEN * k), r * np.sin(_GOLDEN * k)], axis=-1)
+
+
+def _whole() -> np.ndarray:
+    """Points over a unit disk out to its edge, but for what aiming leaves open, (N, 2)."""
+    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * (1.0 - 1e-3) * ring for k in range(_RINGS))])
+
+
+_WHOLE = _whole()
 
 
 def imaging_segments(instrument: Instrument, backend: Backend, camera: str) -> list[np.ndarray]:
@@ -127,25 +141,114 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str) -> l
     return np.split(_segments(places), 3)
 
 
-def _monitor(instrument: Instrument, backend: Backend) -> list[tuple[str, np.ndarray, list[str | None]]]:
-    """For every channel its key, its rays (N, K, 2, 3) from pinhole to area CCD, and the solid around each segment."""
-    assembly, placed, out = instrument.assembly, instrument.assembly.place(), []
-    for channel in instrument.channels:
-        face = assembly.elements[f"{channel.key}/return_face"].aperture
-        assert isinstance(face, Circle)
-        start = np.broadcast_to(placed.pose(channel.reticle_body).translation, (1, RAYS, 3))
-        position, direction = _aimed(
-            instrument, backend, channel.camera, f"{channel.key}/outgoing", start, _disk(face.radius)
-        )
-        chain = assembly.sequences[f"{channel.key}/monitor"]
-        systems = assemble(assembly, [chain])
-        traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chain)))
-        places = [position[0]]
-        for k, name in enumerate(chain):
-            places.append(placed.pose(assembly.elements[name].body).apply(traced.hit(k)[0]))
+@dataclass(frozen=True, eq=False)
+class MonitorBeam:
+    """A channel's light from the pinhole to the area CCD.
+
+    Attributes:
+        channel: whose.
+        segments: of its N rays, (N, K, 2, 3), world.
+        inside: the solid around each segment.
+        position, direction: of the rays at the pinhole, (N, 3) each, world.
+        valid: which rays get there, (N,).
+    """
+
+    channel: Channel
+    segments: np.ndarray
+    inside: tuple[str | None, ...]
+    position: np.ndarray
+    direction: np.ndarray
+    valid: np.ndarray
+
+    def outside(self, path: str) -> np.ndarray:
+        """Segments that are not inside a solid, (N, K', 2, 3)."""
+        return self.segments[:, [medium != path for medium in self.inside]]
+
+
+def monitor_beams(instrument: Instrument, backend: Backend, points: np.ndarray) -> list[MonitorBeam]:
+    """Trace the beams of all channels.
+
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
+        points: of the return faces that the rays meet, (N, 2), the faces' radius being 1.
+
+    Raises:
+        AimError: no such rays.
+    """
+    assembly, channels, placed = instrument.assembly, instrument.channels, instrument.assembly.place()
+    radius = [assembly.elements[f"{c.key}/return_face"].aperture.inscribed for c in channels]  # type: ignore[union-attr]
+    start = np.array([placed.pose(c.reticle_body).translation for c in channels])[:, None]
+    guess = np.array([instrument.toward_optics(placed, c.camera)[0] for c in channels])[:, None]
+    systems = assemble(assembly, [f"{c.key}/outgoing" for c in channels], placed=placed)
+    target = np.array(radius)[:, None, None] * points
+    position, direction = _through(backend, systems, start, guess, target)
+    chains = [assembly.sequences[f"{c.key}/monitor"] for c in channels]
+    systems = assemble(assembly, chains, placed=placed)
+    traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chains[0])))
+    hits, valid = [traced.hit(k) for k in range(len(chains[0]))], traced.numpy()[3]
+    out = []
+    for i, (channel, chain) in enumerate(zip(channels, chains, strict=True)):
+        places = [position[i]]
+        for hit, name in zip(hits, chain, strict=True):
+            places.append(placed.pose(assembly.elements[name].body).apply(hit[i]))
         media = media_along(assembly.sequence(f"{channel.key}/monitor"))
-        out.append((channel.key, _segments(places), [medium.solid for medium in media[:-1]]))
+        inside = tuple(medium.solid for medium in media[:-1])
+        out.append(MonitorBeam(channel, _segments(places), inside, position[i], direction[i], valid[i]))
     return out
+
+
+def check_beams(instrument: Instrument, backend: Backend) -> None:
+    """Check that every monitor beam gets to its area CCD whole.
+
+    Raises:
+        InputError: the edge of a clear aperture or a body takes a part of one; one issue for each.
+        MisplacedError: light of a channel does not get to its return face.
+    """
+    try:
+        beams = monitor_beams(instrument, backend, _WHOLE)
+    except AimError as error:
+        raise MisplacedError(f"light of the monitor does not get to its return faces: {error}", ("monitor",)) from error
+    bodies = convex_bodies(instrument)
+    hulls = {path: ConvexHull(corners).equations for path, corners in bodies.items()}
+    issues = []
+    for beam in beams:
+        if not beam.valid.all():
+            issues.append(_cut(instrument, backend, beam))
+        for path, planes in hulls.items():
+            if path.rpartition("/")[0] == f"{BASE}/{beam.channel.camera}":
+                continue  # mirrors and board of the camera: the prescription gives them no substrates
+            segments = beam.outside(path)
+            low, high = segments.min(axis=(0, 2)), segments.max(axis=(0, 2))
+            near = np.all((low <= bodies[path].max(axis=0)) & (high >= bodies[path].min(axis=0)), axis=-1)
+            if not near.any():
+                continue
+            taken = rays_taken(segments[:, near], planes)
+            if taken.any():
+                where, choice = remedy(instrument, path)
+                text = (
+                    f"{path} stands in the beam {beam.channel.key} and takes {np.sum(taken)} of its {len(taken)} rays"
+                )
+                issues.append(instrument.spec.issue(text, where, allowed=f"{choice} beside the beam"))
+    if issues:
+        raise InputError(*issues)
+
+
+def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
+    """At which element a beam loses its first rays, and by how much."""
+    assembly, channel = instrument.assembly, beam.channel
+    names = assembly.sequences[f"{channel.key}/monitor"]
+    steps = enumerate(alive_along(backend, assembly, names, beam.position, beam.direction), 1)
+    count, element, alive = next((n, element, alive) for n, (element, alive) in steps if not alive.all())
+    off = beside(assembly, backend, names[:count], beam.position, beam.direction, ~alive)
+    how = "" if off is None else f": it reaches {1e3 * off:.3g} mm beyond the clear aperture"
+    key = key_of(element.body)
+    key = instrument.spec.key_of(channel.camera, channel.side, key if key[0] == "cameras" else (*key, "width"))
+    return instrument.spec.issue(
+        f"the beam {channel.key} is cut at {element.name} on {element.body}{how}",
+        key,
+        allowed="a place in the pupil, prism widths and a return face with which the whole beam passes twice",
+    )
 
 
 def _segments(places: list[np.ndarray]) -> np.ndarray:
@@ -158,10 +261,17 @@ def _aimed(
     instrument: Instrument, backend: Backend, camera: str, sequence: str, start: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays from points (1, N, 3) of a focal plane through targets (N, 2) of a sequence's last element."""
-    guess = np.broadcast_to(instrument.toward_optics(instrument.assembly.place(), camera)[0], start.shape)
+    guess = instrument.toward_optics(instrument.assembly.place(), camera)[0]
+    return _through(backend, assemble(instrument.assembly, [sequence]), start, guess, target[None])
+
+
+def _through(
+    backend: Backend, systems: SystemBatch, start: np.ndarray, guess: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from points (B, N or 1, 3), first sent along ``guess``, through targets (B, N, 2) of the last element."""
+    start, guess = (np.broadcast_to(a, (*target.shape[:2], 3)) for a in (start, guess))
     fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
-    systems = assemble(instrument.assembly, [sequence])
-    q, _ = aim(backend, systems, fan, target[None], tolerance=_AIM)
+    q, _ = aim(backend, systems, fan, target, tolerance=_AIM)
     return fan.at(q)
 
 

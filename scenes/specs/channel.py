@@ -21,6 +21,12 @@ def prism_of(path: str) -> str | None:
     return next((part for part in path.split("/") if part in PRISMS), None)
 
 
+def channel_of(path: str) -> tuple[str, str] | None:
+    """Camera and name of the channel to whose prisms or boards a body belongs, by its path; None for no channel."""
+    parts = path.split("/")
+    return (parts[1], parts[3]) if len(parts) > 4 and parts[2] in ("monitor", "focal_plane") else None
+
+
 @dataclass(frozen=True)
 class Channel:
     """One monitor channel of one camera.

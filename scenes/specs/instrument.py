@@ -15,7 +15,7 @@ from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.channel import PRISM_0, PRISM_180, SIDES
 from scenes.specs.detector import AreaSide, PixelPitch
-from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import (
     Catalogued,
@@ -373,6 +373,32 @@ class InstrumentSpec(Spec):
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
     disturbances: Reference | None = None
+
+    def key_of(self, camera: str, channel: str, key: KeyPath) -> KeyPath:
+        """Where the file says something of a channel: at the channel itself if it does there, else where it says it of
+        all.
+
+        Args:
+            camera: its name; one that is not in the file changes nothing.
+            channel: its name, likewise.
+            key: where it says it of all, e.g. ``("monitor", "prism_180", "width")``.
+        """
+        site = self.cameras.get(camera)
+        if site is None or site.channels is None or channel not in site.channels:
+            return key
+        whole = {
+            ("monitor", "field"): "field",
+            ("cameras", camera, "pupil_offset"): "pupil_offset",
+            ("monitor", "return_face"): "return_face",
+            ("central_prism", "spread"): "spread",
+            ("monitor", "reticle", "photons_per_frame"): "photons_per_frame",
+            ("monitor", PRISM_180): PRISM_180,
+            ("monitor", PRISM_0): PRISM_0,
+        }
+        for start, name in whole.items():
+            if key[: len(start)] == start and getattr(site.channels[channel], name) is not None:
+                return ("cameras", camera, "channels", channel, name, *key[len(start) :])
+        return key
 
     def channels_of(self, camera: str) -> dict[str, ChannelParts]:
         """All channels of a camera's monitor, by name.

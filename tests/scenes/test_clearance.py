@@ -87,10 +87,11 @@ def test_reference_instruments_have_room(name, instrument) -> None:
 
 @pytest.fixture
 def bare(backend, monkeypatch):
-    """Function: changes of gf7_pair -> instrument, without the check that would refuse it."""
+    """Function: changes of gf7_pair -> instrument, without the checks that would refuse it."""
     import scenes.models.instrument_builder
 
-    monkeypatch.setattr(scenes.models.instrument_builder, "check_clearance", lambda instrument: None, raising=False)
+    monkeypatch.setattr(scenes.models.instrument_builder, "check_clearance", lambda instrument: None)
+    monkeypatch.setattr(scenes.models.instrument_builder, "check_beams", lambda instrument, backend: None)
     return lambda folder, *changes: built(changed(folder, *changes), backend)
 
 
@@ -235,8 +236,10 @@ def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> No
 
 
 def test_a_wide_beam_that_only_just_passes(backend, tmp_path) -> None:
-    """A face as wide as the prisms is built; one micrometre more is not."""
-    assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60 mm")), backend)
+    """The way back lies beside the way out, by which the prisms have to be wider than the face."""
+    assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 57 mm")), backend)
+    with pytest.raises(InputError, match=r"prism_180\.width: the beam .* is cut at .*: it reaches 0\.\d+ mm beyond"):
+        built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60 mm")), backend)
     with pytest.raises(InputError, match="narrower than the beam"):
         built(changed(tmp_path, ("aperture: 50 mm", "aperture: 60.001 mm")), backend)
 
