@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -11,15 +13,32 @@ from scipy.spatial import ConvexHull
 from optics.geometry.solid import Solid, solid_mesh
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0, SIDES, prism_of
+from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
 from twin.pictures.light_paths import RIM, Beam, LightPaths
-from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.run.svg import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    YELLOW,
+    look,
+    new_figure,
+    plain_axes,
+    to_svg,
+)
 
 FIELD_COLOURS = {"left edge": SKY, "centre": BLUE, "right edge": PURPLE}
-SIDE_COLOURS = {"left": VERMILION, "right": ORANGE}
+CHANNEL_COLOURS = (VERMILION, ORANGE, "#7a4a12", GREY, YELLOW, INK)
+"""Of a camera's monitor beams, in the order of its channels; they begin again where there are more."""
 ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
-_GLASS, _BLOCK = (0.34, 0.71, 0.91, 0.25), (0.0, 0.62, 0.45, 0.22)  # fills, red, green, blue and opacity
+# fills: red, green, blue and opacity
+_GLASS, _BLOCK, _FRAME = (0.34, 0.71, 0.91, 0.25), (0.0, 0.62, 0.45, 0.22), (0.42, 0.45, 0.50, 0.35)
 _UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the stop: the ones in the plane of symmetry
 
 
@@ -39,24 +58,48 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
         axes.grid(color=LIGHT, lw=0.5)
         axes.set_axisbelow(True)
         plain_axes(axes)
+        colours = _colours(instrument)
+        kinds = {_fill(solid) for solid in instrument.solids}
         handles = [
             Line2D([], [], color=BLUE, lw=1.2, label="imaging beam: chief and marginal rays, field centre"),
-            Line2D([], [], color=VERMILION, lw=1.2, label="monitor beam, left channel (out and back)"),
+            *(
+                Line2D([], [], color=colours[name], lw=1.2, label=f"monitor beam, {name} channel (out and back)")
+                for name in dict.fromkeys(c.side for c in instrument.channels if c in _seen(instrument, c.camera))
+            ),
             Line2D([], [], color=INK, lw=3, label="mirrors, clear apertures"),
             Line2D([], [], color=GREEN, lw=3, label="focal plane; return faces"),
-            Patch(fc=_GLASS, ec=INK, lw=0.8, label="glass prisms"),
+            *([Patch(fc=_GLASS, ec=INK, lw=0.8, label="glass prisms")] if _GLASS in kinds else []),
+            *([Patch(fc=_FRAME, ec=INK, lw=0.8, label="mirrors and frames of the monitor")] if _FRAME in kinds else []),
             Patch(fc=_BLOCK, ec=INK, lw=0.8, label="central prism, common reference"),
         ]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return to_svg(figure)
 
 
+def _channel(beam: Beam) -> str:
+    return beam.name.rpartition("/")[2]
+
+
+def _colours(instrument: Instrument) -> dict[str, str]:
+    """Name of a channel -> colour, the same in all cameras."""
+    names = dict.fromkeys(channel.side for channel in instrument.channels)
+    return {name: CHANNEL_COLOURS[i % len(CHANNEL_COLOURS)] for i, name in enumerate(names)}
+
+
+def _seen(instrument: Instrument, camera: str) -> list[Channel]:
+    """The channels that the side view shows: those at -Y lie behind others, where both ends have some."""
+    own = [c for c in instrument.channels if c.camera == camera]
+    return [c for c in own if c.ccd[1] > 0.0] or own
+
+
 def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str) -> None:
     model, placed = instrument.cameras[camera], paths.placed
     imaging = next(b for b in paths.of(camera, monitor=False) if b.name.endswith("centre"))
-    monitor = paths.of(camera, monitor=True)[0]
     _fan(axes, imaging, BLUE, 0.09)
-    _fan(axes, monitor, VERMILION, 0.30)
+    seen, colours = {c.side for c in _seen(instrument, camera)}, _colours(instrument)
+    for beam in paths.of(camera, monitor=True):
+        if _channel(beam) in seen:
+            _fan(axes, beam, colours[_channel(beam)], 0.30)
     centres = [placed.pose(f"{BASE}/{camera}/{m}").apply(_section(model, m).mean(axis=0)) for m in model.mirrors]
     middle = np.mean(centres, axis=0)
     for mirror in model.mirrors:
@@ -85,24 +128,34 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     _label(axes, text, np.array([origin.translation[0], first[:, 2].min()]), (-4, -22), "top", bold=True)
 
 
+def _fill(solid: Solid) -> tuple[float, float, float, float]:
+    return _GLASS if solid.transparent else _BLOCK if solid.path == CENTRAL_PRISM else _FRAME
+
+
 def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
-    """Outlines of all glass bodies; left and right ones lie behind each other and get one label."""
-    small = []
+    """Outlines of all glass bodies and frames; one label for each camera's."""
+    small: list[tuple[np.ndarray, str]] = []
+    large: dict[str, list[tuple[np.ndarray, str]]] = {}
+    labelled = {c.prism_body(PRISM_180): c.camera for camera in instrument.cameras for c in _seen(instrument, camera)}
     for solid in instrument.solids:
         outline = _outline(solid, paths)
-        fill = _GLASS if solid.transparent else _BLOCK
-        axes.add_patch(Polygon(outline, closed=True, fc=fill, ec="none", zorder=1.6))
+        axes.add_patch(Polygon(outline, closed=True, fc=_fill(solid), ec="none", zorder=1.6))
         axes.add_patch(Polygon(outline, closed=True, fill=False, ec=INK, lw=0.8, zorder=3))
+        what = "prism" if solid.transparent else "mirrors"
         if solid.path == CENTRAL_PRISM:
             middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
             _label(axes, "central prism", np.array([middle, outline[:, 1].min()]), (0, -4), "top")
         elif prism_of(solid.path) == PRISM_0:
-            small.append(outline)
-        elif f"/{SIDES[0]}/" in solid.path:
-            _label(axes, "180° prism", outline[np.argmax(outline[:, 1])], (0, 5), "bottom")
-    corners = np.concatenate(small)
-    among = np.array([np.mean([outline[:, 0].mean() for outline in small]), corners[:, 1].max()])
-    _label(axes, "0° prisms", among, (0, 6), "bottom")
+            small.append((outline, what))
+        elif solid.path in labelled:
+            large.setdefault(labelled[solid.path], []).append((outline[np.argmax(outline[:, 1])], what))
+    for found in large.values():
+        what = "prisms" if {what for _, what in found} == {"prism"} and len(found) > 1 else found[0][1]
+        _label(axes, f"180° {what}", max((top for top, _ in found), key=lambda top: float(top[1])), (0, 5), "bottom")
+    corners = np.concatenate([outline for outline, _ in small])
+    among = np.array([np.mean([outline[:, 0].mean() for outline, _ in small]), corners[:, 1].max()])
+    names = {"prisms" if what == "prism" else what for _, what in small}
+    _label(axes, f"0° {' and '.join(sorted(names))}", among, (0, 6), "bottom")
 
 
 def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
@@ -189,12 +242,18 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
                 grid[line, k].set_axis_off()
         handles = [Line2D([], [], color=INK, lw=1.3, label="clear aperture")]
         handles += [Line2D([], [], color=c, lw=1.3, label=f"imaging, {f}") for f, c in FIELD_COLOURS.items()]
+        ends = {c.side: c.ccd[1] > 0.0 for c in instrument.channels}
         marks = [
-            Patch(fc=SIDE_COLOURS["left"], alpha=0.5, label="monitor, left"),
-            Patch(fill=False, ec=SIDE_COLOURS["right"], lw=1.4, label="monitor, right"),
+            Patch(**_style(colour, ends[name]), label=f"monitor, {name}")
+            for name, colour in _colours(instrument).items()
         ]
         figure.legend(handles=[*handles, *marks], loc="outside upper center", ncols=6, columnspacing=1.3)
         return to_svg(figure)
+
+
+def _style(colour: str, filled: bool) -> dict[str, Any]:
+    """Of a beam's footprint; those of both ends may coincide, so that those at +Y are filled, the others outlines."""
+    return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 
 
 def _footprints(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str, mirror: str) -> None:
@@ -203,13 +262,12 @@ def _footprints(axes: Axes, instrument: Instrument, paths: LightPaths, camera: s
     for beam in paths.of(camera, monitor=False):
         edge = 1e3 * beam.footprints[mirror, 0][1:]
         axes.add_patch(Polygon(edge, closed=True, fill=False, ec=FIELD_COLOURS[beam.name.rpartition("/")[2]], lw=1.2))
+    colours, ends = _colours(instrument), {c.side: c.ccd[1] > 0.0 for c in instrument.channels if c.camera == camera}
     for beam in paths.of(camera, monitor=True):
-        colour = SIDE_COLOURS.get(beam.name.rpartition("/")[2], VERMILION)
+        style = _style(colours[_channel(beam)], ends[_channel(beam)])
         for (where, _), points in beam.footprints.items():
             if where == mirror:
-                # the sides may coincide: one is filled, the other an outline
-                fill = {"fc": colour, "alpha": 0.5} if beam.name.endswith("left") else {"fill": False, "lw": 1.4}
-                axes.add_patch(Polygon(1e3 * points[1:], closed=True, ec=colour, **fill))
+                axes.add_patch(Polygon(1e3 * points[1:], closed=True, **style))
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
     axes.grid(color=LIGHT, lw=0.4)

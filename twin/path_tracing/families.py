@@ -170,7 +170,9 @@ def _short(part: str, nominal: tuple[Touch, ...]) -> str:
     own = {touch.part.rpartition("/")[0] for touch in nominal}
     camera = nominal[0].part.partition("/")[0] + "/"
     for holder in sorted(own, key=len, reverse=True):
-        channel = holder.rpartition("/")[0] + "/"
+        # a channel's bodies stand below base/<camera>/monitor/<channel>/, mirrors of a frame one level deeper
+        steps = holder.split("/")
+        channel = "/".join(steps[:4] if steps[2:3] == ["monitor"] else steps[:-1]) + "/"
         if "/" in holder and part.startswith(channel):
             part = part.removeprefix(channel)
             break

@@ -34,7 +34,7 @@ class Beam:
 
     Attributes:
         camera: whose.
-        name: ``imaging/left edge`` ... or ``monitor/left``, ``monitor/right``.
+        name: ``imaging/left edge`` ... or ``monitor/`` and the channel's name.
         vertices: (1 + RIM, K, 3) world points, middle ray first, metres; imaging beams run from the scene to the line
             CCD, monitor beams from the pinhole to the area CCD.
         footprints: (mirror, pass) -> (1 + RIM, 2) points in the mirror's x, y, metres; pass 0 first, then 1.
@@ -71,10 +71,11 @@ def trace_light_paths(instrument: Instrument, backend: Backend, state: State, re
         backend: where to trace.
         state: what is perturbed.
         reach: how far the imaging beams are drawn beyond the first mirror toward the scene, metres; 0 takes the
-            distance of the 180-deg prisms.
+            distance of the farthest 180-deg prism.
     """
     placed = instrument.assembly.place([state])
-    reach = reach or float(instrument.spec.monitor.prism_180.distance)
+    spec = instrument.spec
+    reach = reach or max(one.prism_180.distance for name in spec.cameras for one in spec.channels_of(name).values())
     beams = _imaging(instrument, backend, state, placed, reach) + _monitor(instrument, backend, state, placed)
     return LightPaths(tuple(beams), placed)
 

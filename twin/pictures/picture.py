@@ -18,7 +18,7 @@ import numpy as np
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0
+from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0, prism_of
 from twin.pictures.light_paths import LightPaths, trace_light_paths
 from twin.pictures.picture_light import PictureError, Studio, colour_variant
 from twin.pictures.picture_scene import Part, View, framed, points_in_world, studio_parts
@@ -208,7 +208,7 @@ def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View,
     if shot.shows == "instrument":
         wanted, (azimuth, elevation, field) = list(points), (-66.0, 24.0, 28.0)
     elif shot.shows == "prisms":
-        wanted = [name for name in points if name.startswith(CENTRAL_PRISM) or name.endswith(f"/{PRISM_0}")]
+        wanted = [name for name in points if name.startswith(CENTRAL_PRISM) or prism_of(name) == PRISM_0]
         azimuth, elevation, field = -66.0, 24.0, 24.0
     elif shot.shows == "focal_plane":
         plane = f"{BASE}/{next(iter(instrument.cameras))}/focal_plane"

@@ -16,7 +16,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import behind
 from scenes.specs.channel import BASE
 from twin.pictures.light_paths import LightPaths
-from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON, build_scene
+from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON, build_scene, is_mirror
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
         f"{BASE}/{camera}/{mirror}": behind(model, mirror)
         for camera, model in instrument.cameras.items()
         for mirror in model.mirrors
-    }
+    } | {solid.path: -1.0 for solid in instrument.solids if is_mirror(solid)}
     parts: list[Part] = []
     lowest = np.inf
     for name in scene.graph.nodes_geometry:

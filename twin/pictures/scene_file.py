@@ -22,7 +22,7 @@ from trimesh.visual.material import PBRMaterial
 
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.solid import solid_mesh
+from optics.geometry.solid import Coating, Solid, solid_mesh
 from optics.geometry.tree import AT_REST, PlacedBodies, State
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
@@ -164,8 +164,17 @@ def body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.
     for solid in instrument.solids:  # as they have grown: brought back to nominal size like all others
         mesh = solid_mesh(solid, placed).mesh
         mesh.vertices = mesh.vertices / placed.scale[0, placed.index[solid.path]].real
-        out[solid.path] = _painted(mesh, GLASS if solid.transparent else BLOCK)
+        out[solid.path] = _painted(mesh, _material(solid))
     return out
+
+
+def is_mirror(solid: Solid) -> bool:
+    """Whether a body is the plate of a mirror, whose polished side looks along its own +Z."""
+    return any(face.coating is Coating.MIRROR and face.body == solid.path for face in solid.faces)
+
+
+def _material(solid: Solid) -> PBRMaterial:
+    return GLASS if solid.transparent else MIRROR if is_mirror(solid) else BLOCK
 
 
 def baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
