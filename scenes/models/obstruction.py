@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from optics.geometry.solid import solid_mesh
+from optics.geometry.tree import PlacedBodies
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import points_to_world
@@ -23,8 +24,9 @@ from scenes.models.camera_assembly import line_body
 from scenes.models.clearance import convex_bodies, remedy
 from scenes.models.instrument_model import MisplacedError, key_of
 from scenes.models.monitor_chain import beside
-from scenes.specs.channel import BASE, PRISM_180, Channel
-from scenes.yaml.errors import InputError, Issue
+from scenes.specs.baffle import Plate
+from scenes.specs.channel import BASE, PRISM_0, PRISM_180, Channel
+from scenes.yaml.errors import InputError, Issue, KeyPath
 
 if TYPE_CHECKING:
     from scenes.models.instrument_model import Instrument
@@ -209,29 +211,61 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
         beams = monitor_beams(instrument, backend, _WHOLE)
     except AimError as error:
         raise MisplacedError(f"light of the monitor does not get to its return faces: {error}", ("monitor",)) from error
-    bodies = convex_bodies(instrument)
+    placed = instrument.assembly.place()
+    bodies = convex_bodies(instrument, placed)
     hulls = {path: ConvexHull(corners).equations for path, corners in bodies.items()}
     issues = []
     for beam in beams:
         if not beam.valid.all():
             issues.append(_cut(instrument, backend, beam))
+        camera = instrument.cameras[beam.channel.camera]
+        within = len(camera.mirrors)  # segments inside the camera, on the way out and on the way back
         for path, planes in hulls.items():
-            if path.rpartition("/")[0] == f"{BASE}/{beam.channel.camera}":
-                continue  # mirrors and board of the camera: the prescription gives them no substrates
             segments = beam.outside(path)
+            if path.rpartition("/")[0] == f"{BASE}/{beam.channel.camera}":
+                # the prescription gives its own parts no substrates there, and its first mirror's hull holds its light
+                first = int(path.endswith(f"/{camera.mirrors[0]}"))
+                segments = beam.segments[:, within + first : -within - first]
             low, high = segments.min(axis=(0, 2)), segments.max(axis=(0, 2))
             near = np.all((low <= bodies[path].max(axis=0)) & (high >= bodies[path].min(axis=0)), axis=-1)
             if not near.any():
                 continue
             taken = rays_taken(segments[:, near], planes)
             if taken.any():
-                where, choice = remedy(instrument, path)
-                text = (
-                    f"{path} stands in the beam {beam.channel.key} and takes {np.sum(taken)} of its {len(taken)} rays"
-                )
-                issues.append(instrument.spec.issue(text, where, allowed=f"{choice} beside the beam"))
+                text = f"{path} stands in the beam {beam.channel.key} and takes {_count(taken)}"
+                where, choice = _way_out(instrument, beam.channel, path)
+                issues.append(instrument.spec.issue(text, where, allowed=choice))
+        for plate in instrument.baffles:
+            taken = _crossing(beam.segments, plate, placed)
+            if taken.any():
+                text = f"a plate of {plate.name} stands in the beam {beam.channel.key} and takes {_count(taken)}"
+                where = ("baffles", plate.name) if plate.name in instrument.spec.baffles else ("baffles",)
+                issues.append(instrument.spec.issue(text, where, allowed="a size and place beside the beam"))
     if issues:
-        raise InputError(*issues)
+        raise InputError(*dict.fromkeys(issues))
+
+
+def _way_out(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:
+    """Which key takes a body out of a channel's beam, and what to choose there: that of a prism, else the beam's."""
+    if path in {solid.path for solid in instrument.solids}:
+        where, choice = remedy(instrument, path)
+        return where, f"{choice} beside the beam"
+    where = instrument.spec.key_of(channel.camera, channel.side, ("monitor", PRISM_0, "shift"))
+    return where, "a shift (or prism distance, or place on the central prism) that leads the beam past it"
+
+
+def _count(taken: np.ndarray) -> str:
+    return f"{np.sum(taken)} of its {len(taken)} rays"
+
+
+def _crossing(segments: np.ndarray, plate: Plate, placed: PlacedBodies) -> np.ndarray:
+    """Which rays, segments (N, K, 2, 3), go through a plate, (N,)."""
+    into = (placed.pose(plate.body) @ plate.pose).inverse()
+    start, end = into.apply(segments[:, :, 0]), into.apply(segments[:, :, 1])
+    through = start[..., 2] * end[..., 2] < 0.0
+    share = np.where(through, start[..., 2] / np.where(through, start[..., 2] - end[..., 2], 1.0), 0.0)
+    at = start + share[..., None] * (end - start)
+    return np.asarray(np.any(through & plate.outline.contains(at[..., 0], at[..., 1]), axis=-1))
 
 
 def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:

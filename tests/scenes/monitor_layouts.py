@@ -45,12 +45,13 @@ def explicit_pair() -> dict[str, Any]:
 
 def two_beams() -> dict[str, Any]:
     """The pair with a second beam on each side, nearer to the middle of the pupil and somewhat farther out in the
-    field; its prisms stand behind the first beam's, its facets farther out on the block.
+    field; its prisms stand behind the first beam's, its facets farther out on the block. The first beam goes down
+    between the backward camera's focal plane and M3's light.
     """
     data = explicit_pair()
     monitor = data["monitor"]
     monitor["prism_180"]["width"] = monitor["prism_0"]["width"] = "40 mm"
-    monitor["prism_0"]["shift"] = "200 mm"
+    monitor["prism_0"]["shift"] = "245 mm"
     monitor["return_face"]["aperture"] = "34 mm"
     for site, sign in zip(data["cameras"].values(), (-1, 1), strict=True):
         for name, end in (("left", 1), ("right", -1)):

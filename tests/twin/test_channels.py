@@ -1,0 +1,225 @@
+"""Monitors with other channels than the plain pair, and with mirrors in place of prisms: light, heat, path tracer."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from optics.geometry.tree import Motion, State
+from optics.numerics.backend import Backend
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.thermal.heat import Temperature
+from scenes.models.scene_surface import IDEAL
+from scenes.models.scenery import build_scenery
+from scenes.specs.resolved import resolve
+from tests.scenes import monitor_layouts
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.source import RaySource
+from twin.path_tracing.stray_rays import monitor_families
+from twin.path_tracing.tracer import PathTracer
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.scene_file import build_scene
+
+ARCSEC = np.pi / 648000.0
+STATES: list[State] = [
+    {},
+    {
+        "base/forward/M2": Motion(shift=(2e-6, -1e-6, 3e-6)),
+        "base/backward/focal_plane": Motion(rotate=(1e-5, 0.0, 2e-5)),
+    },
+]
+
+
+def experiment(data: dict[str, Any], folder: Path, backend: Backend) -> MonitorExperiment:
+    """From plain data of an instrument, by way of a file."""
+    monitor_layouts.write(data, folder / "own.yaml")
+    (folder / "job.yaml").write_text("instrument: own.yaml\n", "utf-8")
+    return MonitorExperiment(resolve(folder / "job.yaml"), backend)
+
+
+@pytest.fixture(scope="module")
+def two(backend, tmp_path_factory) -> MonitorExperiment:
+    return experiment(monitor_layouts.two_beams(), tmp_path_factory.mktemp("two"), backend)
+
+
+@pytest.fixture(scope="module")
+def hollow(backend, tmp_path_factory) -> MonitorExperiment:
+    return experiment(monitor_layouts.hollow_pair(), tmp_path_factory.mktemp("hollow"), backend)
+
+
+# --- light ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None:
+    """Bit by bit: bodies, elements, photons."""
+    plain, written = (
+        experiment(data, tmp_path, backend) for data in (monitor_layouts.pair(), monitor_layouts.explicit_pair())
+    )
+    a, b = plain.instrument, written.instrument
+    assert a.channels == b.channels
+    assert a.assembly.tree.paths == b.assembly.tree.paths
+    for what in ("rotation", "translation", "scale"):
+        np.testing.assert_array_equal(getattr(a.assembly.place(), what), getattr(b.assembly.place(), what))
+    assert dict(a.assembly.sequences) == dict(b.assembly.sequences)
+    np.testing.assert_array_equal(plain.path.expected_photons(STATES), written.path.expected_photons(STATES))
+
+
+def test_more_channels_leave_the_others_as_they_are(two, backend, tmp_path) -> None:
+    """The first pair alone has the same spots: its parts do not know of the others, and light is traced ray by ray.
+
+    Rays are aimed for all channels together, until the worst is good enough: up to the tolerance of aiming.
+    """
+    data = monitor_layouts.two_beams()
+    for site in data["cameras"].values():
+        site["channels"] = {name: site["channels"][name] for name in ("left", "right")}
+    # a block as wide as that of the two pairs
+    alone = experiment(data, tmp_path, backend)
+    names = [c.key for c in two.instrument.channels]
+    assert names == [f"{c}/{s}" for c in ("forward", "backward") for s in ("left", "right", "left_2", "right_2")]
+    own = [names.index(c.key) for c in alone.instrument.channels]
+    placed = [e.instrument.assembly.place() for e in (alone, two)]
+    for channel in alone.instrument.channels:
+        for body in (channel.prism_body("prism_180"), channel.prism_body("prism_0"), channel.face_body):
+            found, wanted = (p.pose(body) for p in placed)
+            # facets are squared to rays that are aimed to 1e-9 m or better
+            np.testing.assert_allclose(found.translation, wanted.translation, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(found.rotation, wanted.rotation, rtol=0, atol=1e-10)
+    few, many = alone.path.coarse_trace(STATES).place, two.path.coarse_trace(STATES).place[own]
+    np.testing.assert_allclose(few, many, rtol=0, atol=1e-6)
+    before, after = alone.path.expected_photons(STATES), two.path.expected_photons(STATES)[:, own]
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * before.max())
+
+
+def test_the_order_of_channels_is_that_of_the_results(two, backend, tmp_path) -> None:
+    data = monitor_layouts.two_beams()
+    order = ("right_2", "left", "left_2", "right")
+    for site in data["cameras"].values():
+        site["channels"] = {name: site["channels"][name] for name in order}
+    shuffled = experiment(data, tmp_path, backend)
+    keys = [c.key for c in two.instrument.channels]
+    own = [keys.index(c.key) for c in shuffled.instrument.channels]
+    assert [c.side for c in shuffled.instrument.channels[:4]] == list(order)
+    a, b = two.path.coarse_trace(STATES).place[own], shuffled.path.coarse_trace(STATES).place
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
+
+
+def test_every_channel_gets_its_light(two) -> None:
+    """All spots are whole and in the middle of their CCDs, and get their photons."""
+    photons = two.path.expected_photons([{}])[0]
+    asked = np.array([c.photons for c in two.instrument.channels])
+    # beyond r = v f lambda / (pi D) an Airy pattern has 2 / (pi v) of its light; on the edge of a square of half side h
+    # the mean of 1 / r over all directions is 2 sqrt(2) / (pi h); the spot is not quite in the middle of its CCD
+    spec = two.instrument.spec.monitor
+    half = 0.5 * spec.area_ccd.rows * spec.area_ccd.pitch
+    f = np.array([two.instrument.cameras[c.camera].line_focal_length for c in two.instrument.channels])
+    v = np.pi * np.array([c.aperture for c in two.instrument.channels]) * half / (spec.wavelength * f)
+    beyond = 2.0 / (np.pi * v) * 2.0 * np.sqrt(2.0) / np.pi
+    np.testing.assert_allclose(1.0 - photons.sum(axis=(1, 2)) / asked, beyond, rtol=0.1)
+    rows, columns = np.indices(photons.shape[1:])
+    for k, axis in enumerate((rows, columns)):
+        middle = (photons * axis).sum(axis=(1, 2)) / photons.sum(axis=(1, 2)) - 0.5 * (photons.shape[1 + k] - 1)
+        assert np.abs(middle).max() < 1.0
+
+
+def test_a_channels_own_photons_and_face(backend, tmp_path) -> None:
+    """Half the light gives half the image; a narrower face a wider spot, in its own channel alone."""
+    data = monitor_layouts.two_beams()
+    reference = experiment(data, tmp_path, backend).path.expected_photons([{}])[0]
+    site = data["cameras"]["backward"]
+    site["channels"]["left_2"] |= {"photons_per_frame": 2.0e6}
+    site["channels"]["right"] |= {"return_face": {"aperture": "24 mm"}}
+    changed = experiment(data, tmp_path, backend)
+    found = changed.path.expected_photons([{}])[0]
+    names = [c.key for c in changed.instrument.channels]
+    dim, narrow = names.index("backward/left_2"), names.index("backward/right")
+    for i in range(len(names)):
+        if i == narrow:
+            assert found[i].max() < 0.6 * reference[i].max()
+        else:
+            share = 0.5 if i == dim else 1.0
+            np.testing.assert_allclose(found[i], share * reference[i], rtol=0, atol=1e-5 * reference[i].max())
+
+
+# --- heat -------------------------------------------------------------------------------------------------------------
+
+
+def test_heat_of_a_channels_prisms_moves_its_spot_alone(two) -> None:
+    channel = next(c for c in two.instrument.channels if c.key == "forward/left_2")
+    field = Temperature(0.0, (0.0, 0.02, 0.05))
+    states = [{}, *(two.thermal.state({channel.prism_body(p): field}) for p in ("prism_180", "prism_0"))]
+    place = two.path.coarse_trace(states).place
+    moved = np.linalg.norm(place[:, 1:] - place[:, :1], axis=-1)
+    own = two.instrument.channels.index(channel)
+    assert np.all(moved[own] > 1e-3)
+    np.testing.assert_array_equal(np.delete(moved, own, axis=0), 0.0)
+
+
+def test_frames_keep_what_glass_turns(hollow, two) -> None:
+    """A uniform change of a perfect frame turns no beam; a gradient turns it by what its material expands, of which a
+    beam in glass gets more by the index alone.
+    """
+    channel = hollow.instrument.channels[0]
+    body = channel.prism_body("prism_180")
+    states = [
+        {},
+        hollow.thermal.state({body: Temperature(20.0)}),
+        hollow.thermal.state({body: Temperature(0.0, (0, 0, 0.05))}),
+    ]
+    place = hollow.path.coarse_trace(states).place[0]
+    moved = np.linalg.norm(place[1:] - place[0], axis=-1)
+    # the beam is displaced with the mirrors, so that it passes the camera's aberrations elsewhere
+    assert moved[0] < 2e-3
+    glass = two.instrument.channels[0]
+    warm = two.thermal.state({glass.prism_body("prism_180"): Temperature(0.0, (0.0, 0.0, 0.05))})
+    through = two.path.coarse_trace([{}, warm]).place[0]
+    assert moved[1] < 0.1 * np.linalg.norm(through[1] - through[0])
+
+
+# --- path tracer, pictures --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", ["two", "hollow"])
+def test_the_path_tracers_nominal_light_is_the_traced_light(layout, request, backend) -> None:
+    """For every channel, with a reflector turned: places on the CCD and path lengths."""
+    own = request.getfixturevalue(layout)
+    instrument = own.instrument
+    turned = instrument.channels[-1].prism_body("prism_0") + "/mirror_a"
+    state = {turned: Motion(rotate=(0.0, 2.0 * ARCSEC, 0.0))}
+    scenery = build_scenery(instrument, state, IDEAL)
+    tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument))
+    placed, aimed = instrument.assembly.place([state]), own.path.coarse.nominal
+    for number, channel in enumerate(instrument.channels):
+        direction = aimed.direction[number]
+        position = np.broadcast_to(placed.pose(channel.reticle_body).translation, direction.shape)
+        systems = assemble(instrument.assembly, [f"{channel.key}/monitor"], [state])
+        place, _, length, valid = (
+            a[0] for a in trace(backend, systems, make_rays(backend, position, direction)).numpy()
+        )
+        run = tracer.run(RaySource.even(position, direction), keep=True)
+        found = run.detections
+        ccd = [d.name for d in scenery.detectors].index(f"{channel.key}/area_ccd")
+        mine = (found.kind == NOMINAL) & (found.detector == ccd)
+        path = found.path[mine]
+        np.testing.assert_array_equal(np.sort(path), np.nonzero(valid)[0])
+        assert valid.sum() > 50
+        np.testing.assert_allclose(found.place[mine], place[path, :2], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.length[mine], length[path], rtol=0, atol=1e-12)
+
+
+def test_drawings_show_every_channel(two, hollow, backend) -> None:
+    for own in (two, hollow):
+        paths = trace_light_paths(own.instrument, backend, {})
+        names = {(b.camera, b.name) for b in paths.beams if b.is_monitor}
+        assert names == {(c.camera, f"monitor/{c.side}") for c in own.instrument.channels}
+        scene = build_scene(own.instrument, paths)
+        assert {s.path for s in own.instrument.solids} <= set(scene.graph.nodes_geometry)
+        reach = max(
+            one.prism_180.distance
+            for c in own.instrument.cameras
+            for one in own.instrument.spec.channels_of(c).values()
+        )
+        beam = paths.of("forward", monitor=False)[1].vertices[0]
+        assert np.linalg.norm(beam[0] - beam[1]) == pytest.approx(reach, rel=1e-9)
