@@ -286,14 +286,24 @@ def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
 
 
 def check_prisms(spec: InstrumentSpec) -> None:
-    """Check that the prisms' glasses have an index at the monitor's wavelength and that they let the beam pass.
+    """Check that the prisms' glasses have an index at the monitor's wavelength, that they let the beam pass, and that
+    all channels have the same kinds.
 
     Raises:
         InputError: one of them does not.
     """
     wavelength = spec.monitor.wavelength
+    kinds: dict[str, Reflector] = {}
     for camera in spec.cameras:
         for side, given in spec.channels_of(camera).items():
+            for name, prism in given.prisms.items():
+                if kinds.setdefault(name, prism.reflector) is not prism.reflector:
+                    raise spec.error(
+                        f"{camera}/{side} has another kind of reflector than the channels before it",
+                        spec.key_of(camera, side, ("monitor", name, "kind")),
+                        found=prism.kind,
+                        allowed="the same kind in all channels of an instrument, whose light is traced together",
+                    )
             face = given.return_face.aperture
             for name, prism in given.prisms.items():
                 key = spec.key_of(camera, side, ("monitor", name))

@@ -133,6 +133,12 @@ REFUSED = [
         ["the boards of forward/left and forward/left_2 stand in each other"],
     ),
     ([((*SECOND, "field"), "44 deg")], "cameras.forward.channels.left_2.field", ["forward/left_2"]),
+    # another kind in one channel
+    (
+        [((*SECOND, "prism_0"), monitor_layouts.HOLLOW_0)],
+        "cameras.forward.channels.left_2.prism_0.kind",
+        ["forward/left_2 has another kind of reflector", "found 'periscope'"],
+    ),
     # as text
     ([((*SECOND, "field"), None)], "cameras.forward.channels.left_2.field", ["missing"]),
     ([((*SECOND, "prism_0", "material"), "N-BK77")], "cameras.forward.channels.left_2.prism_0.material", ["N-BK7"]),
