@@ -1,6 +1,7 @@
 """Ghosts and stray light in the render job: what is added to the images, and what the prisms' tilt is good for."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from scenes.specs.baffle import BaffleSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve_job
+from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.stray_light import REACH, diffraction_spots, stray_light
+from twin.path_tracing.stray_light import REACH, diffraction_spots, ghost_warnings, stray_light
 from twin.path_tracing.stray_rays import NominalPathLost, trace_stray
 from twin.render import app
 
@@ -34,13 +36,23 @@ def square_prisms(backend):
 def test_the_tilt_keeps_ghosts_off_the_spot(experiment, square_prisms):
     """Square faces throw their reflections onto the spot; 3 arcmin send them past the CCD, and the spot stays."""
     tilted = experiment("gf7_pair")
-    shares = []
+    shares, told = [], []
     for setup in (tilted, square_prisms):
         light = stray_light(setup, {}, PATHS, 1)
         shares.append(light.share(setup.nominal_photons))
+        told.append(ghost_warnings(setup, light))
     # eight passes with a residual reflection each, seen with the light that they let pass: some percent
     assert np.all(shares[1] > 0.02)
     assert np.all(shares[0] < 2e-3 * shares[1])
+    assert told[0] == ()
+    assert len(told[1]) == 4
+    for channel, text in zip(square_prisms.instrument.channels, told[1], strict=True):
+        share, strongest = (float(n) for n in re.findall(r"([\d.]+) %", text))
+        assert text.startswith(f"ghosts on the area CCD of {channel.key} have")
+        assert f"comes from {channel.key} by prism_" in text
+        # what lies on the CCD, in the paths that were drawn; scattered light counts in the share, too
+        assert share == pytest.approx(100.0 * shares[1][square_prisms.instrument.channels.index(channel)], rel=0.1)
+        assert 0.0 < strongest <= share
     for setup in (tilted, square_prisms):
         place = np.einsum("n,bnk->bk", setup.path.nodes.share, setup.path.rays([{}]).position[..., :2])
         assert np.abs(place).max() < 0.05 * setup.path.pitch
@@ -117,10 +129,12 @@ def test_a_baffle_in_the_way_stops_the_light(experiment, backend):
     plate = {"shape": "plate", "body": channel.face_body, "position": ["0 mm", "0 mm", "50 mm"]}
     lid = BaffleSpec.model_validate({**plate, "width": "80 mm", "height": "80 mm"})
     spec = resolved.instrument.model_copy(update={"baffles": {"lid": lid}})
-    covered = build_instrument(spec, resolved.cameras, backend)
+    with pytest.raises(InputError, match=r"baffles\.lid: a plate of lid stands in the beam forward/left and takes 145"):
+        build_instrument(spec, resolved.cameras, backend)
+    free, lids = experiment("gf7_pair").instrument, lid.plates("lid")
     with pytest.raises(NominalPathLost, match="forward/left"):
-        trace_stray(covered, backend, {}, PATHS, 1, [channel])
-    run = trace_stray(covered, backend, {}, PATHS, 1, covered.channels[1:2]).runs["forward/right"]
+        trace_stray(free, backend, {}, PATHS, 1, [channel], baffles=lids)
+    run = trace_stray(free, backend, {}, PATHS, 1, free.channels[1:2], baffles=lids).runs["forward/right"]
     assert run.nominal("forward/right/area_ccd").count > 1000
 
 

@@ -15,6 +15,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import find_obstructions
+from scenes.specs.channel import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
@@ -25,7 +26,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotFocus
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.monitor.truth import trace_truth
-from twin.path_tracing.stray_light import stray_light
+from twin.path_tracing.stray_light import ghost_warnings, stray_light
 from twin.path_tracing.stray_rays import NominalPathLost
 from twin.run.procedure import Advance, silent
 from twin.targets.target_images import TargetLostError
@@ -167,6 +168,7 @@ def render_job(
             *_warnings(experiment, nominal, photons[0], before, after[0]),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
+            *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
             *(targets.warnings if targets is not None else ()),
             *(quality.warnings if quality is not None else ()),
             *((FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
@@ -235,7 +237,7 @@ def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
     return tuple(
         f"{o.body} stands in the beam {o.beam} and takes {100.0 * o.share:.1f}% of it"
         for o in stray.obstructions
-        if o.used == 0.0
+        if o.used == 0.0 and not (prism_of(o.body) == PRISM_180 and o.beam == f"{o.body.split('/')[1]}/imaging")
     )
 
 

@@ -27,6 +27,10 @@ REACH = 88
 FAMILIES = 20
 """How many families of each source are listed, the strongest first."""
 
+GHOSTS = 1e-3
+"""Share of a spot's light above which ghosts on its area CCD are warned of: a pixel of motion reads wrong by 1e-3 px,
+some times the centroid's noise."""
+
 
 @dataclass(frozen=True, eq=False)
 class StrayLight:
@@ -114,3 +118,29 @@ def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
     grid = Grid(-REACH * path.pitch, path.pitch, 2 * REACH + 1)
     spots = image(path.fields([{}]), grid, grid, single=True).astype(np.float64)
     return np.asarray(spots / spots.sum(axis=(1, 2), keepdims=True))
+
+
+def ghost_warnings(experiment: MonitorExperiment, light: StrayLight) -> tuple[str, ...]:
+    """One warning for each area CCD on which ghosts of any source have more than GHOSTS of its own spot's light."""
+    out, traced = [], light.traced
+    for channel in experiment.path.channels:
+        name = f"{channel.key}/area_ccd"
+        own = traced.runs[channel.key].nominal(name)
+        found = [
+            (traced.photons_per_power[source] * family.energy / channel.photons, source, family)
+            for source, run in traced.runs.items()
+            for family in run.families
+            if family.detector == name and family.kind == "ghost"
+        ]
+        total = sum(share for share, _, _ in found)
+        if total > GHOSTS:
+            share, source, family = max(found, key=lambda one: one[0])
+            off = np.hypot(*np.subtract(family.centroid, own.centroid)) / experiment.path.pitch
+            usual = traced.runs[source].nominal(f"{source}/area_ccd").touches
+            out.append(
+                f"ghosts on the area CCD of {channel.key} have {100.0 * total:.2g} % of its spot's light and pull the "
+                f"spot by that share of what it moves and they do not; the strongest, {100.0 * share:.2g} %, comes "
+                f"from {source} by {family_name(family.touches, usual)}, {off:.3g} px from the spot: another tilt of "
+                "that prism, or another field, leads it aside"
+            )
+    return tuple(out)
