@@ -43,14 +43,15 @@ def setup(run: RenderRun) -> dict[str, Any]:
         )
     monitor = spec.monitor
     ccd = monitor.area_ccd
+    parts = [one for name in spec.cameras for one in spec.channels_of(name).values()]
     return {
         "cameras": cameras,
         "monitor": {
             "wavelength_nm": plain(1e9 * monitor.wavelength),
             "pinhole_um": plain(1e6 * monitor.reticle.pinhole),
-            "return_face_mm": plain(1e3 * monitor.return_face.aperture),
-            "field_deg": plain(float(np.degrees(monitor.field))),
-            "photons_1e6": plain(1e-6 * monitor.reticle.photons_per_frame),
+            "return_face_mm": _all([1e3 * c.aperture for c in instrument.channels]),
+            "fields_deg": _fields([float(np.degrees(one.field)) for one in parts]),
+            "photons_1e6": _all([1e-6 * c.photons for c in instrument.channels]),
         },
         "ccd": {
             "rows": ccd.rows,
@@ -64,6 +65,20 @@ def setup(run: RenderRun) -> dict[str, Any]:
         "reference": fixed(spec.temperature - ZERO_CELSIUS, 2),
         "heated": _heated(run),
     }
+
+
+def _all(values: list[float]) -> str:
+    """Different values among those of all channels: ``50``, or ``34, 24``."""
+    return ", ".join(dict.fromkeys(plain(value) for value in values))
+
+
+def _fields(degrees: list[float]) -> str:
+    """Different field places: ``±1.22``, or ``±1.22, 1.25`` where one end of the line has more than the other."""
+    ends: dict[str, set[bool]] = {}
+    for field in degrees:
+        ends.setdefault(plain(abs(field)), set()).add(field > 0.0)
+    signs = {frozenset((True, False)): "±", frozenset((True,)): "", frozenset((False,)): "\N{MINUS SIGN}"}
+    return ", ".join(signs[frozenset(own)] + size for size, own in ends.items())
 
 
 def _perturbations(run: RenderRun) -> list[dict[str, str]]:
