@@ -25,9 +25,12 @@ from typer._click.exceptions import MissingParameter
 from docs.site.command_pages import parser, programs
 from docs.site.spec_examples import accepted, examples
 from scenes.models.disturbances import motions_of_spec
+from scenes.models.instrument_builder import build_instrument
 from scenes.schema import MODELS
 from scenes.specs.disturbances import DisturbancesSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
+from scenes.specs.load import load_camera
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
@@ -138,7 +141,7 @@ def models_of(text: str) -> list[type[Any]]:
 
 
 @pytest.mark.parametrize("block", blocks("yaml"), ids=str)
-def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument) -> None:
+def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument, backend) -> None:
     models = models_of(block.text)
     assert models, "no sort of file"
     if models[0] is JobSpec:
@@ -146,6 +149,9 @@ def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument) -> None:
         check_nodes(job, instrument(job.instrument).nodes)
     if models[0] is DisturbancesSpec:
         motions_of_spec(validate(DisturbancesSpec, parse_yaml(block.text)), instrument("gf7_pair"))
+    if models[0] is InstrumentSpec:
+        spec = validate(InstrumentSpec, parse_yaml(block.text))
+        build_instrument(spec, {site.camera: load_camera(site.camera) for site in spec.cameras.values()}, backend)
 
 
 @pytest.mark.parametrize("block", tables(), ids=str)
