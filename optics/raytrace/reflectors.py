@@ -20,7 +20,7 @@ plates are one body for heat; the bar is the reflector's own body, the plates st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
 from math import sqrt
@@ -294,7 +294,7 @@ def _thickness(width: float) -> float:
 
 def _on_frame(
     mount: Mount,
-    mirrors: list[tuple[Passage, tuple[float, float, float]]],
+    mirrors: Sequence[tuple[Passage, tuple[float, float, float]]],
     apex: tuple[float, float, float],
     axis: int,
 ) -> ReflectorParts:
