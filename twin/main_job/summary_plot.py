@@ -64,7 +64,9 @@ def _draw(run: RenderRun) -> Figure:
             if k:
                 _scale_bar(axes, run, column, row, half)
             else:
-                axes.set_title(f"{channel.camera} camera, {channel.side} spot", fontsize=13, pad=7)
+                # many pictures are narrow
+                text = "{} camera, {} spot" if columns <= 4 else "{}, {}"
+                axes.set_title(text.format(channel.camera, channel.side), fontsize=13 if columns <= 4 else 10, pad=7)
     _table(figure, tables, 1.0 - top - 0.1 / sum(heights), run)
     return figure
 

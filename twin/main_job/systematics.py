@@ -66,11 +66,12 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
     # what weighs all motions by what is stated takes none of them as it is
     known = 0 if run.estimators[run.judged].stated else FAMILY
     out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
-    for j, (name, table) in enumerate(run.crosstalk.items()):
+    own = {name: run.experiment.instrument.coordinates_of(name) for name in names}
+    for name, table in run.crosstalk.items():
         for i, motion in enumerate(table.motions):
             if i < known or abs(amounts[name][i]) <= SHOWN:
                 continue
-            read = gain[:, 4 * j : 4 * j + 4] @ table.spot_shift[:, i]
+            read = gain[:, own[name]] @ table.spot_shift[:, i]
             part = (read - (table.true[:, i] if name == camera else 0.0)) * amounts[name][i]
             if not np.any(part):
                 continue

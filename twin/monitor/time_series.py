@@ -105,7 +105,7 @@ class TimeSeries:
             None unless the altitude of a pair is known.
         recovered_ground: estimator -> the same as they are read, arrays (T,); empty likewise.
         smoothed: all measurements together; None where nothing is stated to move.
-        shift: (T, 4 x cameras) of the spots, in their order, px; shift_covariance: (T, cameras, 4, 4), px^2.
+        shift: (T, 2 C) of the spots, in their order, px; shift_covariance: (T, 2 C, 2 C), px^2.
         photons: expected photons per pixel and frame, float32 (T, C, rows, columns).
         shown_photons: those of the time that is shown, as they were exposed, (C, rows, columns).
         frames: the first frame of each time, uint16 (T, C, rows, columns).
