@@ -12,7 +12,7 @@ from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, Channel, prism_of
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, SIDES, Channel, prism_of
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import NodeInfo
 from scenes.yaml.errors import KeyPath
@@ -56,11 +56,12 @@ class Instrument:
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Camera -> distance of its two area CCDs (the papers' L), metres; of more than two the largest."""
+        """Camera -> distance of its pair of area CCDs (the papers' L), metres; without a pair the largest of two."""
         out = {}
         for name in self.cameras:
-            places = [c.ccd[1] for c in self.channels if c.camera == name]
-            out[name] = abs(max(places) - min(places))
+            places = {c.side: c.ccd[1] for c in self.channels if c.camera == name}
+            pair = [places[side] for side in SIDES] if set(SIDES) <= set(places) else list(places.values())
+            out[name] = abs(max(pair) - min(pair))
         return out
 
     def channels_of(self, camera: str) -> tuple[int, ...]:

@@ -107,6 +107,15 @@ def test_the_order_of_channels_is_that_of_the_results(two, backend, tmp_path) ->
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
+def test_the_printed_formulas_are_about_the_pair(two, backend, tmp_path) -> None:
+    """Their L and field are those of left and right, not those of the channels that stand farthest out."""
+    plain = experiment(monitor_layouts.pair(), tmp_path, backend)
+    for camera in plain.instrument.cameras:
+        found, wanted = two.geometry(camera), plain.geometry(camera)
+        assert (found.separation_m, found.field_beta_rad) == (wanted.separation_m, wanted.field_beta_rad)
+        assert found.separation_m < max(c.ccd[1] for c in two.instrument.channels) * 1.99
+
+
 def test_every_channel_gets_its_light(two) -> None:
     """All spots are whole and in the middle of their CCDs, and get their photons."""
     photons = two.path.expected_photons([{}])[0]

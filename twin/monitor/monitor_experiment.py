@@ -26,6 +26,7 @@ from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
+from scenes.specs.channel import SIDES
 from scenes.specs.course import noll
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
@@ -197,12 +198,14 @@ class MonitorExperiment:
         The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
         """
         by_x, by_y, *_ = self._truth_by_family[camera].T
+        given = self.instrument.spec.channels_of(camera)
+        one = given[SIDES[0]] if SIDES[0] in given else next(iter(given.values()))
         return MonitorGeometry(
             focal_length_m=self.nominal_truth.principal_distance[camera],
             separation_m=self.instrument.separation[camera],
             pixel_m=self.path.pitch,
             field_alpha_rad=0.0,
-            field_beta_rad=self.instrument.spec.monitor.field,
+            field_beta_rad=abs(one.field),
             focal_length_x_m=float(1.0 / abs(by_x[0])),
             d_f_per_alpha_m=float(by_x[3] / by_x[0]),
             d_gamma_per_beta=float(by_y[2] / by_y[1]),

@@ -320,7 +320,7 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
 def _spot_responses(resolved: ResolvedJob) -> list[Asked]:
     out = []
     for camera in resolved.instrument.cameras:
-        for side in ("left", "right"):
+        for side in resolved.instrument.channels_of(camera):
             for axis in ("row", "column"):
                 key = ("recovered", "spots", camera, side, "after", axis)
                 out.append(Asked(f"spots.{camera}.{side}.{axis}", ResponseSpec(key=key, unit="px")))
