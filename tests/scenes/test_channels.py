@@ -173,9 +173,9 @@ JUNK = [
 
 
 def edited(data: dict[str, Any], rng: random.Random) -> dict[str, Any]:
-    """Something else, nothing, or another value of the file at one to three places."""
+    """Something else, nothing, or another value of the file at one or two places."""
     data = copy.deepcopy(data)
-    for _ in range(rng.randint(1, 3)):
+    for _ in range(rng.randint(1, 2)):
         places = [(place, key) for place, key in _places(data) if place is not data or key == "cameras"]
         place, key = rng.choice(places)
         do = rng.random()
@@ -198,26 +198,31 @@ def _places(place: Any) -> list[tuple[Any, Any]]:
 
 
 def _edit(count: int, seed: int, backend, folder) -> list[str]:
-    """How many edits are built, and what is said of the others."""
-    rng, base, said = random.Random(seed), monitor_layouts.two_beams(), []
-    base = {**base, "monitor": {**base["monitor"], "prism_0": monitor_layouts.HOLLOW_0 | {"shift": "245 mm"}}}
-    base["monitor"]["prism_0"] |= {"width": "40 mm"}
-    for _ in range(count):
+    """What is said of edits that are refused; every other one is of a layout with mirrors in place of prisms."""
+    rng, said = random.Random(seed), []
+    glass, hollow = monitor_layouts.two_beams(), monitor_layouts.two_beams()
+    for place in (hollow["monitor"], *(c for s in hollow["cameras"].values() for c in s["channels"].values())):
+        for prism, kind in (("prism_180", "hollow_transfer"), ("prism_0", "periscope")):
+            if prism in place:
+                place[prism] = {**place[prism], "kind": kind, "material": "CFRP"}
+    for base in (glass, hollow):
+        monitor_layouts.built(base, folder, backend)
+    for k in range(count):
         try:
-            monitor_layouts.built(edited(base, rng), folder, backend)
+            monitor_layouts.built(edited((glass, hollow)[k % 2], rng), folder, backend)
         except InputError as error:
             said.append(str(error))
     return said
 
 
 def test_random_edits_are_refused_in_words(backend, tmp_path) -> None:
-    said = _edit(40, 1, backend, tmp_path)
-    assert len(said) > 10
+    said = _edit(20, 1, backend, tmp_path)
+    assert 8 < len(said) < 20
     assert all("own.yaml" in text for text in said)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_many_random_edits_are_refused_in_words(seed, backend, tmp_path) -> None:
-    said = _edit(200, 100 + seed, backend, tmp_path)
+    said = _edit(100, 100 + seed, backend, tmp_path)
     assert all("own.yaml" in text for text in said)
