@@ -173,7 +173,7 @@ class MonitorImages:
         state, k, column = self.motions.index(motion), self.cameras.index(camera), "YX".index(axis)
         moved = (self.before - self.after)[state, 2 * k : 2 * k + 2, column]
         pitch = self.geometry(camera).pixel_m
-        variance = np.diagonal(self.covariance[state, k])[column::2]
+        variance = np.diagonal(self.covariance[state])[4 * k : 4 * k + 4][column::2]
         return float(moved[0]) * pitch, float(moved[1]) * pitch, float(np.sqrt(variance.mean())) * pitch
 
     def over_truth(self, motion: str, estimator: str, parameter: str) -> Ratio:
