@@ -1,0 +1,196 @@
+"""What the light of a layout can know: information and posterior covariance of all parameters, from the traced
+derivatives of the stated disturbances and the light of every spot.
+
+The M motions x ~ N(0, C), in standard deviations, move the spots by A x and the cameras by B x. Spots with noise R hold
+the Fisher information A' R^-1 A on them; what is left of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1 B', which
+equals B C B' - B C A' (A C A' + R)^-1 A C B' also where C is singular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.limits import Split, split
+from analysis.spots.likelihood import image_bound
+from optics.numerics.backend import Backend
+from scenes.models.disturbances import motions_of_spec
+from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import ThermalModel
+from scenes.specs.disturbances import DisturbancesSpec
+from twin.monitor.monitor_path import MonitorPath
+from twin.monitor.stated_disturbances import disturbances_of
+from twin.sensors.area_detector import EmvaDetector
+
+NOISE = "noise"
+"""What the images add beside the stated causes."""
+_SLOPE = 2  # pixels more on every side of an image, for its slopes
+_PARAMETERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What a layout's spots know of its cameras.
+
+    Attributes:
+        disturbances: stated, with their derivatives: D spot coordinates, K cameras.
+        noise: (D, D) px^2 of the shifts, of the images before and after together.
+        quantities: name -> (n, 4 K) rows on all parameters; the quantity's variance is the mean of the rows'.
+    """
+
+    disturbances: Disturbances
+    noise: np.ndarray
+    quantities: Mapping[str, np.ndarray]
+
+    @cached_property
+    def fisher(self) -> np.ndarray:
+        """(M, M) information of the spots on the motions, per standard deviation squared."""
+        spots = self.disturbances.spots
+        return np.asarray(spots.T @ np.linalg.solve(self.noise, spots))
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """(4 K, D) of the estimate with the least variance, rad and m per pixel."""
+        return self.disturbances.best_gain(self.noise)
+
+    @cached_property
+    def posterior(self) -> np.ndarray:
+        """(4 K, 4 K) covariance of the parameters that is left, rad and m."""
+        return np.asarray(self.disturbances.misfit(self.gain) + self.gain @ self.noise @ self.gain.T)
+
+    @property
+    def prior(self) -> np.ndarray:
+        """(4 K, 4 K) before any measurement."""
+        return self.disturbances.parameter_covariance
+
+    def sigma(self, name: str) -> float:
+        """What is left of a quantity, SI."""
+        return _spread(self.quantities[name], self.posterior)
+
+    def sigma_before(self, name: str) -> float:
+        """The same without any measurement."""
+        return _spread(self.quantities[name], self.prior)
+
+    def shares(self, name: str, measured: bool = True) -> dict[str, float]:
+        """Variance of a quantity by cause, SI; causes are independent of one another, so that shares add up.
+
+        Args:
+            name: of the quantity.
+            measured: what is left of it, with the noise; else before any measurement.
+        """
+        rows, stated = self.quantities[name], self.disturbances
+        found = split(rows, stated, self.noise, self.gain)
+        shares = Split.by(found.after if measured else found.before, stated.causes)
+        out = {cause: float(np.mean(share)) for cause, share in shares.items()}
+        return {**out, NOISE: float(np.mean(found.noise))} if measured else out
+
+    @property
+    def spot_sigma(self) -> np.ndarray:
+        """(D,) standard deviations of the spots' places, px."""
+        return np.sqrt(np.diag(self.disturbances.spot_covariance))
+
+    def with_frames(self, times: float) -> Information:
+        """The same with so many times the frames, and no pattern that stays from one to the next."""
+        return replace(self, noise=self.noise / times)
+
+
+def _spread(rows: np.ndarray, covariance: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows))))
+
+
+def information_of(
+    instrument: Instrument,
+    stated: Sequence[DisturbancesSpec],
+    detector: EmvaDetector,
+    backend: Backend,
+    ground: GroundGeometry | None = None,
+    alike: bool = False,
+) -> list[Information]:
+    """What an instrument's spots know, one for each statement of what moves.
+
+    Args:
+        instrument: the instrument.
+        stated: disturbances files.
+        detector: of the area CCDs.
+        backend: where to trace.
+        ground: of a pair; the height is then one of the quantities.
+        alike: spots of one camera and one beam width are taken to have the same noise.
+
+    Raises:
+        InputError: the disturbances name a body that the instrument does not have.
+        BeamMissedError, AimError: light does not come to the area CCDs.
+    """
+    path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
+    noise = spot_noise(path, detector, alike)
+    rows = quantity_rows(instrument, ground)
+    return [
+        Information(disturbances_of(motions_of_spec(spec, instrument), path, thermal, instrument, backend), noise, rows)
+        for spec in stated
+    ]
+
+
+def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict[str, np.ndarray]:
+    """Name -> (n, 4 K) rows: every camera's d_alpha, d_beta, d_gamma (rad) and d_f (m) as ``camera/d_alpha``; the
+    intersection angle of the first two cameras; height and plan (m) at the line's middle.
+    """
+    names = list(instrument.cameras)
+    unit = np.eye(_PARAMETERS * len(names))
+    out = {
+        f"{name}/{key}": unit[None, _PARAMETERS * c + k]
+        for c, name in enumerate(names)
+        for k, key in enumerate(("d_alpha", "d_beta", "d_gamma", "d_f"))
+    }
+    if len(names) > 1:
+        out["angle"] = (unit[0] - unit[_PARAMETERS])[None]
+    if ground is not None:
+        first, second = (instrument.cameras[name].line_focal_length for name in names[:2])
+        rows = ground.rows((first, second))
+        out["height"] = rows[len(rows) // 2, 2:3]
+    return out
+
+
+def ground_of(instrument: Instrument) -> GroundGeometry | None:
+    """How a pair of known altitude sees the ground; None for other instruments."""
+    spec, names = instrument.spec, list(instrument.cameras)
+    if spec.altitude is None or len(names) != 2:
+        return None
+    looks, fields = [], []
+    for name in names:
+        model = instrument.cameras[name]
+        line = model.spec.line
+        looks.append(spec.cameras[name].look)
+        fields.append(0.5 * line.pixels * line.pitch / model.line_focal_length)
+    return GroundGeometry(spec.altitude, (names[0], names[1]), (looks[0], looks[1]), (fields[0], fields[1]))
+
+
+def spot_noise(path: MonitorPath, detector: EmvaDetector, alike: bool = False) -> np.ndarray:
+    """Covariance of all shifts by the noise of images before and after, (D, D) px^2: of each spot twice the bound that
+    no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames.
+
+    Args:
+        path: the monitor's light.
+        detector: of the area CCDs.
+        alike: spots of one camera and one beam width are taken to have one shape; their light is their own.
+
+    Raises:
+        BeamMissedError, AimError: light does not come to the area CCDs.
+    """
+    channels, spec = path.channels, path.instrument.spec
+    groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
+    shown = tuple(c for c in channels if c in groups.values())
+    own = path if len(shown) == len(channels) else MonitorPath(replace(path.instrument, channels=shown), path.backend)
+    photons = own.expected_photons([{}], margin=_SLOPE)[0]
+    exposure = spec.monitor.area_ccd.exposure
+    model, dark = detector.noise_model(exposure), float(detector.expected_dn(np.zeros((1, 1)), exposure)[0, 0])
+    out = np.zeros((len(channels), 2, len(channels), 2))
+    for k, channel in enumerate(channels):
+        like = groups[(channel.camera, channel.aperture) if alike else channel.key]
+        image = photons[shown.index(like)] * (channel.photons / like.photons)
+        light = detector.expected_dn(image, exposure) - dark
+        out[k, :, k, :] = 2.0 * image_bound(light[None], dark, model, spec.monitor.frames)[0]
+    return out.reshape(2 * len(channels), -1)
