@@ -268,6 +268,8 @@ def check_module(module: str, arguments: list[str]) -> None:
     if arguments and arguments != ["--help"]:
         below = getattr(command, "commands", {})
         if below:
+            # of twin.design the file says which subcommand it is
+            arguments = getattr(command, "whole", list)(arguments)
             command, arguments = below[arguments[0]], arguments[1:]
         if arguments:
             try:

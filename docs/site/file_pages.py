@@ -16,6 +16,7 @@ READ_BY = {
     "instrument": 'jobs and tests, which name it: `instrument: gf7_pair`; in a script `twin.load("gf7_pair")`',
     "camera": "`python -m twin.camera FILE`; instruments, tests and designs, which name it: `camera: gf7`",
     "camera_design": "`python -m twin.design FILE`",
+    "monitor_design": "`python -m twin.design monitor FILE`",
     "detector": "instruments, bands of cameras and lines of payloads, which name it: `detector: monitor_ccd`",
     "disturbances": "jobs, instruments and error budgets, which name it: `disturbances: orbit`",
     "error_budget": "`python -m twin.validate --only 001.table3,001.table4,001.table5`",

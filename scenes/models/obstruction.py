@@ -100,10 +100,10 @@ def rays_taken(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
     return np.asarray(np.any((length > _TOUCHING) & ~beside, axis=-1))
 
 
-def _disk(radius: float) -> np.ndarray:
-    """Points spread evenly over a disk, (RAYS, 2)."""
-    k = np.arange(RAYS)
-    r = radius * np.sqrt((k + 0.5) / RAYS)
+def _disk(radius: float, rays: int = RAYS) -> np.ndarray:
+    """Points spread evenly over a disk, (rays, 2)."""
+    k = np.arange(rays)
+    r = radius * np.sqrt((k + 0.5) / rays)
     return np.stack([r * np.cos(_GOLDEN * k), r * np.sin(_GOLDEN * k)], axis=-1)
 
 
@@ -117,8 +117,15 @@ def _whole() -> np.ndarray:
 _WHOLE = _whole()
 
 
-def imaging_segments(instrument: Instrument, backend: Backend, camera: str) -> list[np.ndarray]:
-    """Rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, world."""
+def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays: int = RAYS) -> list[np.ndarray]:
+    """Rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, world.
+
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
+        camera: whose.
+        rays: N, in each of the three beams.
+    """
     assembly, model, placed = instrument.assembly, instrument.cameras[camera], instrument.assembly.place()
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
     line = np.array([[0.0, y, 0.0] for y in (half, 0.0, -half)])
@@ -126,10 +133,10 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str) -> l
     stop = assembly.elements[f"{camera}/{model.spec.stop}"].aperture
     assert stop is not None
     radius = stop.inscribed
-    start = np.repeat(points, RAYS, axis=0)[None]
+    start = np.repeat(points, rays, axis=0)[None]
     chain = assembly.sequences[f"{camera}/image_to_object"]
     position, direction = _aimed(
-        instrument, backend, camera, f"{camera}/image_to_stop", start, np.tile(_disk(radius), (3, 1))
+        instrument, backend, camera, f"{camera}/image_to_stop", start, np.tile(_disk(radius, rays), (3, 1))
     )
     systems = assemble(assembly, [chain])
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chain)), world=True)

@@ -1,5 +1,5 @@
 """A camera, as a file in scenes/library/cameras gives it: its optical prescription, the line CCDs of its spectral bands
-with time delay and integration, and its optimisation.
+with time delay and integration; and what is to be designed: a camera's prescription, or the layout of a monitor.
 """
 
 from collections.abc import Mapping
@@ -12,11 +12,13 @@ from pydantic_core import CoreSchema, core_schema
 
 from optics.geometry.sag_terms import SAG_TERMS, SagTerm
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs.detector import PixelPitch
+from scenes.specs.instrument import Frames, GlassName, MadeOf, Photons, check_made, reflector_kinds
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Vector, Wavelength
-from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text, Whole
-from scenes.yaml.units import ANGLE, LENGTH, SCALE, TIME, format_quantity, parse_quantity, power_of_length
+from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE, TIME, format_quantity, parse_quantity, power_of_length
 
 Spectrum = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
 RateError = Annotated[float, Quantity(SCALE, largest="50 percent")]
@@ -120,6 +122,190 @@ class CameraDesignSpec(Spec):
             if wrong:
                 raise Problem("the image is a plane", wrong[0], "z", within=("vary", name))
         return self
+
+
+LengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]
+FieldRange = Annotated[tuple[float, float], Vector(Quantity(ANGLE, above_zero=True, largest="45 deg"), 2)]
+
+
+class BeamRangesSpec(Spec):
+    """What may vary of each of a monitor's beams, from and to; what is left out is as the start has it.
+
+    A beam stands four times in a pair: at both ends of both cameras' lines, mirrored.
+
+    Attributes:
+        pupil_x: of its middle in the entrance pupil, toward the central prism positive, metres.
+        pupil_y: likewise along the line, positive toward the beam's own end of it, metres.
+        width: diameter of its return face, metres; prisms are wider by as much as those of the start.
+        field: angle from the visual axis at which its area CCD stands, radians.
+        prism_180_distance: from the camera's origin to its 180-deg prism, metres.
+        prism_0_distance: from its return face to its rhomboid, metres.
+        shift: of its rhomboid, metres.
+        spread_x: from the central prism's apex to its facet along the base's X, metres.
+        spread_y: likewise along Y, metres.
+    """
+
+    pupil_x: LengthRange | None = None
+    pupil_y: LengthRange | None = None
+    width: LengthRange | None = None
+    field: FieldRange | None = None
+    prism_180_distance: LengthRange | None = None
+    prism_0_distance: LengthRange | None = None
+    shift: LengthRange | None = None
+    spread_x: LengthRange | None = None
+    spread_y: LengthRange | None = None
+
+    @model_validator(mode="after")
+    def _from_less_to_more(self) -> "BeamRangesSpec":
+        for name in type(self).model_fields:
+            given = getattr(self, name)
+            if given is not None and not given[0] <= given[1]:
+                raise Problem("the range ends before it begins", within=(name,), allowed="[smallest, largest]")
+        return self
+
+
+class TransferChoiceSpec(Spec):
+    """What sends a beam back.
+
+    Attributes:
+        material: its glass, or what its mirrors stand on.
+        kind: by its name among the reflectors; the prism when nothing is said.
+    """
+
+    material: MadeOf
+    kind: Annotated[str, reflector_kinds(returns=True)] | None = None
+
+    @model_validator(mode="after")
+    def _made_of_what_it_may(self) -> "TransferChoiceSpec":
+        check_made(self.material, REFLECTORS[self.kind or "lateral_transfer"])
+        return self
+
+
+class ShiftChoiceSpec(Spec):
+    """What displaces a beam.
+
+    Attributes:
+        material: its glass, or what its mirrors stand on.
+        kind: by its name among the reflectors; the rhomboid when nothing is said.
+    """
+
+    material: MadeOf
+    kind: Annotated[str, reflector_kinds(returns=False)] | None = None
+
+    @model_validator(mode="after")
+    def _made_of_what_it_may(self) -> "ShiftChoiceSpec":
+        check_made(self.material, REFLECTORS[self.kind or "rhomboid"])
+        return self
+
+
+class PrismChoiceSpec(Spec):
+    """What a beam may have for its two prisms.
+
+    Attributes:
+        prism_180: in place of the start's lateral-transfer prism.
+        prism_0: in place of its rhomboid.
+    """
+
+    prism_180: TransferChoiceSpec
+    prism_0: ShiftChoiceSpec
+
+
+class MonitorGoalSpec(Spec):
+    """What a layout is to reach: standard deviations that are left when the spots have been read; of both cameras the
+    worse, of several disturbances files the worst.
+
+    Attributes:
+        angle: of the change of the intersection angle, radians.
+        d_f: of the change of a principal distance, metres.
+        height: of a point on the ground, metres; needs the instrument's altitude.
+    """
+
+    angle: Annotated[float, Quantity(ANGLE, above_zero=True)] | None = None
+    d_f: PositiveLength | None = None
+    height: PositiveLength | None = None
+
+    @model_validator(mode="after")
+    def _something(self) -> "MonitorGoalSpec":
+        if not self.wanted:
+            raise Problem("what is the layout to reach?", "nothing", "one or several of angle, d_f and height")
+        return self
+
+    @property
+    def wanted(self) -> dict[str, float]:
+        """Those that are given, SI."""
+        return {name: value for name in type(self).model_fields if (value := getattr(self, name)) is not None}
+
+
+class MonitorLimitsSpec(Spec):
+    """What a layout must not exceed.
+
+    Attributes:
+        pupil_share: of a camera's imaging pupil that its monitor's prisms take, at the worst place of the line.
+        mass: of all prisms together, with what stands in their place and without the central prism, kg.
+        spot_sigmas: so many standard deviations of its place each spot stays on its area CCD.
+        ghost_paths: of every source, by which the layouts on the front are path-traced; one is left out whose ghosts
+            have more than a thousandth of a spot's light. None are traced when left out.
+    """
+
+    pupil_share: Annotated[float, Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
+    mass: Annotated[float, Quantity(MASS, above_zero=True)] | None = None
+    spot_sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 3.0
+    ghost_paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] | None = None
+
+
+class MonitorSearchSpec(Spec):
+    """How long is searched.
+
+    Attributes:
+        beams: that are drawn at random before anything is known.
+        layouts: combinations of them that are compared, at most.
+        rounds: in which the beams of the best layouts are changed and combined anew, by steps that halve each time the
+            round before found nothing better.
+        changed: beams that each round tries.
+        exact: layouts that are built as a whole after the first draw, and after each round.
+    """
+
+    beams: Annotated[Whole, Field(ge=1, le=100_000)] = 120
+    layouts: Annotated[Whole, Field(ge=1, le=10_000_000)] = 2000
+    rounds: Annotated[Whole, Field(ge=0, le=1000)] = 6
+    changed: Annotated[Whole, Field(ge=1, le=10_000)] = 24
+    exact: Annotated[Whole, Field(ge=1, le=1000)] = 8
+
+
+class MonitorDesignSpec(Spec):
+    """A monitor's layout to be found: how many beams, where and through which prisms.
+
+    Attributes:
+        instrument: to start from, by name or path; a pair whose monitor's channels are mirrored.
+        name: of the new instrument.
+        description: of the new instrument, for people.
+        disturbances: files of what is expected to move, by name or path; what the instrument names, when left out.
+        beams: at each end of a line, at most.
+        vary: what may vary of each beam.
+        prisms: by a name of one's own, what each beam may have for prisms; the start's, when left out.
+        central_material: of the central prism, in place of the start's.
+        photons_per_frame: of every spot, in place of the start's.
+        frames: of a measurement, in place of the start's.
+        goal: what is to be reached.
+        limits: what must not be exceeded.
+        search: how long is searched.
+        seed: of everything drawn.
+    """
+
+    instrument: Reference
+    name: Name
+    description: Text = ""
+    disturbances: Annotated[tuple[Reference, ...], Field(min_length=1)] | None = None
+    beams: Annotated[Whole, Field(ge=1, le=6)]
+    vary: BeamRangesSpec
+    prisms: Annotated[Named[PrismChoiceSpec], Field(min_length=1)] | None = None
+    central_material: GlassName | None = None
+    photons_per_frame: Photons | None = None
+    frames: Frames | None = None
+    goal: MonitorGoalSpec
+    limits: MonitorLimitsSpec = MonitorLimitsSpec()
+    search: MonitorSearchSpec = MonitorSearchSpec()
+    seed: Seed = 0
 
 
 FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]

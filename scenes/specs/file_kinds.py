@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec
+from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
@@ -66,7 +66,8 @@ FILE_KINDS = (
         "twin.camera",
         "an instrument's `cameras: {NAME: {camera: FILE}}`",
     ),
-    FileKind("camera_design", CameraDesignSpec, "an optimisation of a camera", "twin.design"),
+    FileKind("camera_design", CameraDesignSpec, "an optimisation of a camera", "twin.design camera"),
+    FileKind("monitor_design", MonitorDesignSpec, "a search for a monitor's layout", "twin.design monitor"),
     FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
     FileKind(
         "disturbances",

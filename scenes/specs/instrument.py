@@ -54,7 +54,7 @@ def _spelt(name: str) -> str:
 FaceErrors = Annotated[dict[Name, Tilt], NothingIsEmpty, AfterValidator(FrozenMap)]
 
 
-def _kinds(returns: bool) -> OneOf:
+def reflector_kinds(returns: bool) -> OneOf:
     """Names of the reflectors that send the beam back, or of those that send it on."""
     return OneOf(lambda: (name for name, kind in REFLECTORS.items() if kind.returns == returns))
 
@@ -68,7 +68,7 @@ def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector
             raise Problem("no such face", shown(name), names_text(known), nearest(name, known), within)
 
 
-def _check_made(made_of: str, reflector: Reflector) -> None:
+def check_made(made_of: str, reflector: Reflector) -> None:
     """Refuse what a reflector cannot be made of."""
     if made_of not in (GLASSES if reflector.transparent else MATERIALS):
         names = GLASSES if reflector.transparent else MATERIALS
@@ -98,7 +98,7 @@ class Prism180Spec(Spec):
     width: PositiveLength
     tilt: Tilt = (0.0, 0.0)
     angle_errors: FaceErrors = Field(default_factory=FrozenMap)
-    kind: Annotated[str, _kinds(returns=True)] | None = None
+    kind: Annotated[str, reflector_kinds(returns=True)] | None = None
 
     @property
     def reflector(self) -> Reflector:
@@ -107,7 +107,7 @@ class Prism180Spec(Spec):
 
     @model_validator(mode="after")
     def _can_be_made(self) -> "Prism180Spec":
-        _check_made(self.material, self.reflector)
+        check_made(self.material, self.reflector)
         _check_faces(self.angle_errors, self.reflector)
         return self
 
@@ -133,7 +133,7 @@ class Prism0Spec(Spec):
     width: PositiveLength
     tilt: Tilt = (0.0, 0.0)
     angle_errors: FaceErrors = Field(default_factory=FrozenMap)
-    kind: Annotated[str, _kinds(returns=False)] | None = None
+    kind: Annotated[str, reflector_kinds(returns=False)] | None = None
 
     @property
     def reflector(self) -> Reflector:
@@ -142,7 +142,7 @@ class Prism0Spec(Spec):
 
     @model_validator(mode="after")
     def _can_be_made(self) -> "Prism0Spec":
-        _check_made(self.material, self.reflector)
+        check_made(self.material, self.reflector)
         _check_faces(self.angle_errors, self.reflector)
         return self
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec
+from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
 from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
@@ -111,6 +111,32 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
         return None
     stated = validate(DisturbancesSpec, read_yaml(_find(DISTURBANCES, reference, owner, key)))
     return stated if asked is None else stated.changed(asked)
+
+
+def read_design(
+    design: MonitorDesignSpec,
+) -> tuple[InstrumentSpec, dict[str, CameraSpec], DetectorSpec, dict[str, DisturbancesSpec]]:
+    """What a search for a layout refers to: the instrument to start from, its cameras by the name that it gives them,
+    its area CCD and disturbances by their names in the design.
+
+    Raises:
+        InputError: a file is not there or not valid, or nothing is stated to move.
+    """
+    start = load_instrument(_find(INSTRUMENTS, design.instrument, design, ("instrument",)))
+    files = paths_of_cameras(start)
+    cameras = {site.camera: load_camera(files[name]) for name, site in start.cameras.items()}
+    owner: Spec = design
+    references = design.disturbances
+    if references is None:
+        owner, references = start, () if start.disturbances in (None, NONE) else (str(start.disturbances),)
+    if not references:
+        problem = f"nothing is stated to move in {start.name}"
+        raise design.error(problem, ("disturbances",), allowed="disturbances files, by name or path")
+    stated = {}
+    for k, reference in enumerate(references):
+        key: KeyPath = ("disturbances", k) if owner is design else ("disturbances",)
+        stated[reference] = validate(DisturbancesSpec, read_yaml(_find(DISTURBANCES, reference, owner, key)))
+    return start, cameras, load_detector(path_of_detector(start)), stated
 
 
 def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:

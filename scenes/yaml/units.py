@@ -65,6 +65,7 @@ MOMENT = Kind("a time", "s", ("min", "h", "s"), "12 min", ("min", "h", "s"))
 """When something is, as against how long it takes: minutes and hours come first."""
 SPEED = Kind("a speed", "m/s", ("m/s", "km/s", "mm/s"), "7.6 km/s", ("m/s", "km/s", "mm/s"))
 POWER = Kind("a power", "W", ("mW", "W", "uW", "nW"), "1 mW", ("mW", "W"))
+MASS = Kind("a mass", "kg", ("kg", "g"), "20 kg", ("kg", "g"))
 TEMPERATURE = Kind("a temperature", "K", ("degC", "K"), "20 degC", ("degC", "K"))
 TEMPERATURE_DIFFERENCE = Kind("a temperature difference", "K", ("K", "mK"), "0.1 K")
 PER_LENGTH = Kind("an inverse length", "1/m", ("1/m", "1/mm"), "0.5 1/m")
@@ -73,7 +74,7 @@ PER_LENGTH5 = Kind("an inverse length to the fifth", "1/m^5", ("1/m^5", "1/mm^5"
 PER_LENGTH7 = Kind("an inverse length to the seventh", "1/m^7", ("1/m^7", "1/mm^7"), "1e-3 1/m^7")
 TEMPERATURE_GRADIENT = Kind("a temperature gradient", "K/m", ("K/m", "mK/m"), "0.1 K/m")
 KINDS = (
-    *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, TEMPERATURE, TEMPERATURE_GRADIENT),
+    *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, MASS, TEMPERATURE, TEMPERATURE_GRADIENT),
     *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
 )
 
@@ -108,6 +109,8 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "mW": (Decimal("1e-3"), "kg*m**2/s**3"),
     "uW": (Decimal("1e-6"), "kg*m**2/s**3"),
     "nW": (Decimal("1e-9"), "kg*m**2/s**3"),
+    "kg": (Decimal(1), "kg"),
+    "g": (Decimal("1e-3"), "kg"),
     "K": (Decimal(1), "K"),
     "mK": (Decimal("1e-3"), "K"),
     "K/m": (Decimal(1), "K/m"),

@@ -19,6 +19,7 @@ from twin.study.__main__ import app as study
 
 FOLDERS = {
     "examples/study": "study",
+    "examples/design_monitor": "monitor_design",
     "examples/design": "camera_design",
     "examples/": "job",
     "lab/focus": "focus_test",
@@ -116,7 +117,7 @@ def test_the_commands_are_there(kind) -> None:
             design,
             (),
             "orbit/simulate.yaml",
-            "images of the ground, which twin.design does not read; python -m twin.orbit simu",
+            "images of the ground, which twin.design camera does not read; python -m twin.orbit simu",
         ),
     ],
 )

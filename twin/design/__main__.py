@@ -1,4 +1,4 @@
-"""``python -m twin.design``: optimise a camera's prescription with exact Jacobians; before, after, the new file."""
+"""``python -m twin.design``: optimise a camera's prescription, or find the layout of a monitor."""
 
 from __future__ import annotations
 
@@ -7,21 +7,72 @@ if __name__ == "__main__":
 
     end_quietly()
 
-from typing import Any
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+from optics.numerics.threads import cores
 from scenes.models.camera_design import resolve_design
-from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet
+from scenes.models.monitor_layout import resolve_monitor_design
+from scenes.specs.file_kinds import kind_of
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import read_yaml
+from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
 from twin.run.command import Test, run_test
 
 PROGRAM = "twin.design"
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+class ByFile(TyperGroup):
+    """A program whose subcommand need not be named: the file says which it is."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As of any group, with the subcommand that may have been left out."""
+        return list(super().parse_args(ctx, self.whole(args)))
+
+    def whole(self, args: list[str]) -> list[str]:
+        """Arguments with the subcommand of the file among them before them, where they begin with none."""
+        words = [word for word in args if not word.startswith("-")]
+        if not words or args[0] in self.commands or "--help" in args:
+            return args
+        return ["monitor" if any(_is_layout(word) for word in words) else "camera", *args]
 
 
-@app.command()
-def main(
+def _is_layout(word: str) -> bool:
+    """Whether a word is the path of a search for a monitor's layout; what is wrong with a file its command says."""
+    try:
+        kind = kind_of(read_yaml(word).data)
+    except InputError:
+        return False
+    return kind is not None and kind.name == "monitor_design"
+
+
+app = typer.Typer(
+    cls=ByFile,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+)
+
+
+@app.callback()
+def main() -> None:
+    """Design a camera, or the monitor of a pair. The file says which it is: the subcommand may be left out.
+
+    Examples: `python -m twin.design camera scenes/examples/design_gf7_short.yaml` and
+    `python -m twin.design monitor scenes/examples/design_monitor_two.yaml`
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+
+
+@app.command("camera")
+def camera(
     file: File,
     out: Out = None,
     backend: BackendName = "llvm",
@@ -32,14 +83,48 @@ def main(
     """Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
     the field is made least, with the focal length, the envelope and free beams as constraints.
 
-    Example: `python -m twin.design scenes/examples/design_gf7_short.yaml`
+    Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
 
     The run folder gets the new camera's file in artefacts/,
     design.json, config.yaml and a report.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    run_test(PROGRAM, "", file, resolve_design, _design, Options(out, None, backend, force, as_json, quiet))
+    run_test(PROGRAM, "camera", file, resolve_design, _design, Options(out, None, backend, force, as_json, quiet))
+
+
+@app.command("monitor")
+def monitor(
+    file: File,
+    out: Out = None,
+    workers: Annotated[
+        int | None, typer.Option(min=0, max=1024, help="Number of worker processes. Default: one for each core.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was broken off.")] = False,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find the layout of a pair's monitor: how many beams, where in the pupil, through which prisms; by what their
+    light can know of the cameras under stated disturbances, what they take of the pupil, and what they weigh.
+
+    Example: `python -m twin.design monitor scenes/examples/design_monitor_two.yaml --workers 2`
+
+    The run folder gets the instruments of the best layouts in artefacts/, layouts.json, config.yaml and a report. While
+    it runs, what was tried is kept in OUT.search beside it; with --resume the same command goes on from there. The
+    result depends neither on the number of workers nor on where it was broken off.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+    journal = Path(f"{out if out is not None else Path('runs') / file.stem}.search")
+    if not resume:
+        journal.unlink(missing_ok=True)
+    count = cores() if workers is None else workers
+    load = partial(_monitor, count, journal)
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "monitor", file, resolve_monitor_design, load, options)
 
 
 def _design() -> Test[Any]:
@@ -47,6 +132,14 @@ def _design() -> Test[Any]:
     from twin.design.design_run import DESIGN
 
     return DESIGN, design_report
+
+
+def _monitor(workers: int, journal: Path) -> Test[Any]:
+    from twin.design.monitor_design import MONITOR_DESIGN, run_monitor_design
+    from twin.design.monitor_report import monitor_design_report
+
+    run = partial(run_monitor_design, workers=workers, journal=journal)
+    return replace(MONITOR_DESIGN, run=run), monitor_design_report
 
 
 if __name__ == "__main__":

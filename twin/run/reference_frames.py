@@ -75,6 +75,15 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         },
         "turntable": {"angles": "readings of the turntable's circle about its axis; errors: reading minus true angle"},
         "design": {"prescription": "vertex of M1; light enters toward +z, y in the symmetry plane, x along the line"},
+        "layouts": {
+            "pupil_x, pupil_y": "in the entrance pupil: toward the central prism, and along the line toward the beam's "
+            "own end of it",
+            "spread_x, spread_y": "base frame, from the central prism's apex",
+            "field": "from the visual axis along the line; the beam stands at both ends",
+            "forward, backward, cameras": _CAMERA,
+            "angle": _ANGLE,
+            "height": "up, at the middle of the line",
+        },
         "optics": {
             "fields": "shares of the half field: along the line, positive at the end at +Y of the focal plane (left), "
             "and along the track, positive at its +X",

@@ -1,0 +1,318 @@
+"""Layouts of a monitor: the beams of a design, the instrument's file that has them, and what they take of mass, pupil
+and glass.
+
+A beam stands four times in a pair: at both ends of both cameras' lines, mirrored. Its pupil offset counts toward the
+central prism, and along the line toward the beam's own end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from optics.geometry.solid import solid_mesh
+from optics.materials.material import material
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from scenes.models.obstruction import imaging_segments, rays_taken
+from scenes.specs.camera import CameraSpec, MonitorDesignSpec, PrismChoiceSpec
+from scenes.specs.channel import CENTRAL_PRISM, SIDES
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.disturbances import DisturbancesSpec
+from scenes.specs.instrument import ChannelParts, ChannelSpec, InstrumentSpec, MountedCameraSpec, ReturnFaceSpec
+from scenes.specs.load import read_design
+from scenes.specs.resolved import ExperimentSetup, read_setup
+from scenes.yaml.spec import Paths
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
+
+if TYPE_CHECKING:
+    from scenes.models.instrument_model import Instrument
+
+RAYS = 2000
+"""Rays of an imaging beam by which shares of the pupil are told: to about a thousandth."""
+AS_STARTED = "start"
+"""Name of the prisms of the instrument that a design starts from."""
+
+
+class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
+    """A design with all it refers to.
+
+    Attributes:
+        instrument: to start from.
+        cameras: by the name that the instrument gives them.
+        detector: data sheet of the area CCDs.
+        disturbances: by the name that the design, or the instrument, gives them.
+    """
+
+    instrument: InstrumentSpec
+    cameras: Paths[CameraSpec]
+    detector: DetectorSpec
+    disturbances: Paths[DisturbancesSpec]
+
+
+def resolve_monitor_design(path: str | Path) -> MonitorDesignSetup:
+    """Read a design and all it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or the instrument is none that can be designed so.
+    """
+    setup = read_setup(MonitorDesignSetup, path)
+    if setup is None:
+        test = validate(MonitorDesignSpec, read_yaml(path))
+        instrument, cameras, detector, disturbances = read_design(test)
+        setup = MonitorDesignSetup.model_construct(
+            test=test,
+            instrument=instrument,
+            cameras=FrozenMap(cameras),
+            detector=detector,
+            disturbances=FrozenMap(disturbances),
+        )
+    test, start = setup.test, setup.instrument
+    if len(start.cameras) != 2:
+        raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
+    if test.goal.height is not None and start.altitude is None:
+        raise test.error(f"{start.name} does not state its altitude", ("goal", "height"), allowed="angle or d_f")
+    start_beams(setup)
+    return setup
+
+
+@dataclass(frozen=True)
+class Beam:
+    """One beam of a layout, at both ends of both cameras' lines.
+
+    Attributes:
+        pupil_x, pupil_y: middle in the entrance pupil, toward the central prism and toward its own end of the line, m.
+        width: diameter of its return face, m.
+        field: angle of its area CCD from the visual axis, rad.
+        prism_180_distance: from the camera's origin, m.
+        prism_0_distance: from its return face, m.
+        shift: of its rhomboid, m.
+        spread_x, spread_y: of its facet from the apex, m.
+        prisms: by their name in the design.
+    """
+
+    pupil_x: float
+    pupil_y: float
+    width: float
+    field: float
+    prism_180_distance: float
+    prism_0_distance: float
+    shift: float
+    spread_x: float
+    spread_y: float
+    prisms: str = AS_STARTED
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The continuous ones, (9,), in the order of ``CONTINUOUS``."""
+        return np.array([getattr(self, name) for name in CONTINUOUS])
+
+
+CONTINUOUS = tuple(item.name for item in fields(Beam) if item.name != "prisms")
+"""Names of what varies continuously."""
+Layout = tuple[Beam, ...]
+
+
+def start_beams(setup: MonitorDesignSetup) -> Layout:
+    """The beams of the instrument that a design starts from.
+
+    Raises:
+        InputError: they do not stand mirrored at both ends of both lines.
+    """
+    start, first = setup.instrument, next(iter(setup.instrument.cameras))
+    sign, beams = _toward(start, start.cameras[first]), []
+    for one in start.channels_of(first).values():
+        if one.field > 0.0:
+            made, small = one.prism_180, one.prism_0
+            x, y = one.pupil_offset
+            numbers = (sign * x, y, one.return_face.aperture, one.field, made.distance, small.distance, small.shift)
+            beams.append(Beam(*numbers, *one.spread, prisms=_prisms_of(setup, one)))
+    again = layout_spec(setup, tuple(beams))
+    for camera in start.cameras:
+        own, made_again = start.channels_of(camera), again.channels_of(camera)
+        places = [sorted((c.field, c.pupil_offset, c.spread) for c in them.values()) for them in (own, made_again)]
+        if len(own) != len(made_again) or not np.allclose(_flat(places[0]), _flat(places[1]), atol=1e-12):
+            problem = f"the channels of {camera} are not those of {first}, mirrored"
+            raise setup.test.error(problem, ("instrument",), found=start.name, allowed="an instrument whose are")
+    return tuple(beams)
+
+
+def _prisms_of(setup: MonitorDesignSetup, one: ChannelParts) -> str:
+    """Name of the prisms that a channel of the start has."""
+    monitor = setup.instrument.monitor
+    has = [(prism.material, prism.kind) for prism in (one.prism_180, one.prism_0)]
+    known = {AS_STARTED: [(prism.material, prism.kind) for prism in (monitor.prism_180, monitor.prism_0)]}
+    for name, chosen in (setup.test.prisms or {}).items():
+        known[name] = [(prism.material, prism.kind) for prism in (chosen.prism_180, chosen.prism_0)]
+    for name, parts in known.items():
+        if parts == has:
+            return name
+    problem = f"the channels of {setup.instrument.name} have prisms that the design does not name"
+    raise setup.test.error(
+        problem, ("prisms",), found=f"{has[0]}, {has[1]}", allowed="these, under a name of one's own"
+    )
+
+
+def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]]]) -> np.ndarray:
+    return np.array([[field, *offset, *spread] for field, offset, spread in places])
+
+
+def _toward(spec: InstrumentSpec, site: MountedCameraSpec) -> float:
+    """+1 where the central prism lies on the camera's +X side, else -1."""
+    return 1.0 if spec.central_prism.position[0] > site.position[0] else -1.0
+
+
+def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> InstrumentSpec:
+    """The instrument that has these beams; all else as in the start, but for its name, light, frames and the central
+    prism's material.
+
+    Args:
+        setup: the design.
+        beams: each becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and ``right_2``.
+    """
+    start, test = setup.instrument, setup.test
+    monitor = start.monitor
+    sites = {}
+    for name, site in start.cameras.items():
+        channels = {}
+        for n, beam in enumerate(beams):
+            ends = dict(zip(SIDES, (1.0, -1.0), strict=True))
+            for side, end in ends.items():
+                offset = (_toward(start, site) * beam.pupil_x, end * beam.pupil_y)
+                channels[channel_name(side, n)] = _channel(setup, beam, end * beam.field, offset)
+        sites[name] = site.model_copy(update={"pupil_offset": None, "channels": FrozenMap(channels)})
+    light = test.photons_per_frame or monitor.reticle.photons_per_frame
+    reticle = monitor.reticle.model_copy(update={"photons_per_frame": light})
+    monitor = monitor.model_copy(update={"reticle": reticle, "frames": test.frames or monitor.frames})
+    block = start.central_prism
+    block = block.model_copy(update={"material": test.central_material or block.material})
+    update = {
+        "central_prism": block,
+        "name": test.name,
+        "description": test.description,
+        "cameras": FrozenMap(sites),
+        "monitor": monitor,
+    }
+    return start.model_copy(update=update)
+
+
+def channel_name(side: str, number: int) -> str:
+    """Name of a beam's channel at one of ``SIDES``; beams are counted from 0."""
+    return side if number == 0 else f"{side}_{number + 1}"
+
+
+def _channel(setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[float, float]) -> ChannelSpec:
+    monitor = setup.instrument.monitor
+    rim = monitor.prism_180.width - monitor.return_face.aperture, monitor.prism_0.width - monitor.return_face.aperture
+    chosen = (setup.test.prisms or {}).get(beam.prisms)
+    kinds = [{} if chosen is None else dict(one) for one in _parts(chosen)]
+    large = {"distance": beam.prism_180_distance, "width": beam.width + rim[0], **kinds[0]}
+    small = {"distance": beam.prism_0_distance, "shift": beam.shift, "width": beam.width + rim[1], **kinds[1]}
+    return ChannelSpec.model_construct(
+        field=field,
+        pupil_offset=offset,
+        return_face=ReturnFaceSpec.model_construct(aperture=beam.width),
+        spread=(beam.spread_x, beam.spread_y),
+        prism_180=monitor.prism_180.model_copy(update=large),
+        prism_0=monitor.prism_0.model_copy(update=small),
+    )
+
+
+def _parts(chosen: PrismChoiceSpec | None) -> Iterator[Mapping[str, object]]:
+    """Material and kind of both prisms, as updates."""
+    for one in (None, None) if chosen is None else (chosen.prism_180, chosen.prism_0):
+        yield {} if one is None else {"material": one.material, "kind": one.kind}
+
+
+def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | None]:
+    """Kinds of a beam's two reflectors; None for the prism itself."""
+    monitor, chosen = setup.instrument.monitor, (setup.test.prisms or {}).get(beam.prisms)
+    own = (monitor.prism_180.kind, monitor.prism_0.kind)
+    return own if chosen is None else (chosen.prism_180.kind, chosen.prism_0.kind)
+
+
+def drawn_beam(setup: MonitorDesignSetup, rng: np.random.Generator) -> Beam:
+    """A beam at random, evenly in all that may vary."""
+    start = start_beams(setup)[0]
+    numbers = {name: float(rng.uniform(*ends)) for name, ends in _ranges(setup).items()}
+    return replace(start, **numbers, prisms=_chosen(setup, rng))
+
+
+def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.random.Generator) -> Beam:
+    """A beam near another one.
+
+    Args:
+        setup: the design.
+        beam: that is changed.
+        step: standard deviation of the change of each number, relative to its range; its ends throw back.
+        rng: source of all that is drawn. About half of the numbers stay, so that single ones are tried, too.
+    """
+    numbers = {}
+    for name, (low, high) in _ranges(setup).items():
+        value = getattr(beam, name) + (high - low) * step * float(rng.standard_normal()) * float(rng.integers(2))
+        value = 2.0 * low - value if value < low else 2.0 * high - value if value > high else value
+        numbers[name] = float(np.clip(value, low, high))
+    prisms = _chosen(setup, rng) if rng.random() < step else beam.prisms
+    return replace(beam, **numbers, prisms=prisms)
+
+
+def _ranges(setup: MonitorDesignSetup) -> dict[str, tuple[float, float]]:
+    return {name: ends for name in CONTINUOUS if (ends := getattr(setup.test.vary, name)) is not None}
+
+
+def _chosen(setup: MonitorDesignSetup, rng: np.random.Generator) -> str:
+    names = tuple(setup.test.prisms or (AS_STARTED,))
+    return names[int(rng.integers(len(names)))]
+
+
+def instrument_file(spec: InstrumentSpec, remark: str) -> str:
+    """Text of an instrument's file, with remarks at its top."""
+    head = "".join(f"# {line}\n" for line in remark.splitlines())
+    return head + dump_yaml({k: v for k, v in spec.plain().items() if v not in ("", {})})
+
+
+def prism_mass(instrument: Instrument) -> float:
+    """Mass of all prisms and of what stands in their place, kg, without the central prism."""
+    placed, total = instrument.assembly.place(), 0.0
+    for solid in instrument.solids:
+        if solid.path != CENTRAL_PRISM:
+            total += float(solid_mesh(solid, placed).mesh.volume) * material(solid.material).density
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class ImagingBeams:
+    """Imaging beams of an instrument's cameras, of which prisms take their part.
+
+    Attributes:
+        segments: camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), base frame, metres.
+    """
+
+    segments: Mapping[str, Sequence[np.ndarray]]
+
+    @classmethod
+    def of(cls, instrument: Instrument, backend: Backend) -> ImagingBeams:
+        """Those of an instrument; every layout on the same cameras has the same."""
+        return cls({name: imaging_segments(instrument, backend, name, RAYS) for name in instrument.cameras})
+
+    def taken(self, instrument: Instrument) -> np.ndarray:
+        """Which rays some prism of an instrument takes, (cameras, 3, RAYS)."""
+        placed, out = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
+        for solid in instrument.solids:
+            corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).mesh.vertices)
+            planes = ConvexHull(corners).equations
+            for c, beams in enumerate(self.segments.values()):
+                for k, rays in enumerate(beams):
+                    out[c, k] |= rays_taken(rays, planes)
+        return out
+
+
+def pupil_share(taken: np.ndarray) -> float:
+    """Largest share of a camera's pupil along its line, by what ``ImagingBeams.taken`` gives."""
+    return float(taken.mean(axis=-1).max())

@@ -1,0 +1,53 @@
+"""What a monitor's layout knows, and a search for layouts with two workers."""
+
+from __future__ import annotations
+
+import time
+
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.monitor_layout import MonitorDesignSetup, resolve_monitor_design
+from scenes.specs.load import EXAMPLES
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.workbench import Workbench
+from twin.design.layout_bench import LayoutBench
+from twin.design.layout_search import Search
+from twin.monitor.information import information_of
+from twin.run.procedure import silent
+
+INFORMATION_S, SEARCH_S = 2.0, 900.0
+EXAMPLE = EXAMPLES / "design_monitor_two.yaml"
+
+
+def drawn(setup: MonitorDesignSetup, beams: int) -> MonitorDesignSetup:
+    """The search without its rounds, and with so many beams."""
+    search = setup.test.search.model_copy(update={"beams": beams, "layouts": beams * beams, "rounds": 0, "exact": 4})
+    return setup.model_copy(update={"test": setup.test.model_copy(update={"search": search})})
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Seconds of both."""
+    setup = drawn(resolve_monitor_design(EXAMPLE), 6 if quick else 64)
+    own = LayoutBench(setup, bench.backend)
+    instrument = build_instrument(setup.instrument, setup.cameras, bench.backend)
+    seconds, motions = [], 0
+    for _ in range(3):
+        begun = time.monotonic()
+        (found,) = information_of(instrument, list(setup.disturbances.values()), own.detector, bench.backend)
+        seconds.append(time.monotonic() - begun)
+        motions = len(found.disturbances.labels)
+    begun = time.monotonic()
+    searched = Search(own, 2, 0, None, silent).run()
+    spent = time.monotonic() - begun
+    text = f"{searched.compared} layouts of {searched.standing} beams, {searched.built} built, two workers"
+    return Speed(
+        (
+            Number(
+                "information_s",
+                min(seconds[1:]),
+                f"what four sides know of {motions} motions, warm",
+                "s",
+                Limit(INFORMATION_S),
+            ),
+            Number("search_s", spent, text, "s", Limit(SEARCH_S)),
+        )
+    )

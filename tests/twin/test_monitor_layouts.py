@@ -1,0 +1,330 @@
+"""Layouts of a monitor: what their light can know, what they cost, which are refused, and the search for better
+ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from optics.numerics.backend import Backend, load_backend
+from scenes.models.monitor_layout import (
+    Beam,
+    MonitorDesignSetup,
+    instrument_file,
+    layout_spec,
+    resolve_monitor_design,
+    start_beams,
+)
+from scenes.specs.load import load_instrument
+from scenes.yaml.errors import InputError
+from twin.design import monitor_design
+from twin.design.__main__ import app
+from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
+from twin.design.monitor_design import MONITOR_DESIGN, MonitorDesignRun, run_monitor_design
+from twin.design.search_journal import Journal
+from twin.monitor.information import Information, spot_noise
+from twin.monitor.monitor_path import MonitorPath
+from twin.run.procedure import BenchError
+from twin.run.run_folder import RunFolderError
+
+STATED = """
+name: mirrors
+causes:
+  mounts: {bodies: base/*/M?, rotate: 1 arcsec, shift: 1 um, reason: mounts}
+  figures: {bodies: base/*/M?, figure: {Z4: 10 nm, Z5: 10 nm, Z6: 10 nm, Z7: 10 nm, Z8: 10 nm}, reason: bonds}
+  prisms: {bodies: base/*/monitor/*/prism_180, rotate: 1 arcsec, reason: mounts}
+"""
+DESIGN = """
+instrument: gf7_pair
+name: better
+beams: 2
+disturbances: [mirrors.yaml]
+vary:
+  pupil_x: [90 mm, 150 mm]
+  pupil_y: [0 mm, 20 mm]
+  width: [30 mm, 36 mm]
+  prism_180_distance: [2.55 m, 2.75 m]
+  prism_0_distance: [0.5 m, 0.7 m]
+  spread_y: [100 mm, 112 mm]
+goal: {angle: 0.05 arcsec, d_f: 2 um}
+limits: {pupil_share: 20 percent}
+search: {beams: 2, layouts: 20, rounds: 1, changed: 1, exact: 1}
+"""
+FIRST = Beam(0.22, 0.0, 0.034, np.radians(1.22), 2.4, 0.5, 0.15, 0.06, 0.05)
+SECOND = Beam(0.13, 0.0, 0.034, np.radians(1.25), 2.65, 0.65, 0.1, 0.06, 0.11)
+THIRD = Beam(0.06, 0.0, 0.030, np.radians(1.20), 2.8, 0.8, 0.1, 0.05, 0.1)
+
+
+def written(folder: Path, design: str = DESIGN) -> Path:
+    (folder / "mirrors.yaml").write_text(STATED, "utf-8")
+    file = folder / "design.yaml"
+    file.write_text(design, "utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def backend() -> Backend:
+    return load_backend("llvm")
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory: pytest.TempPathFactory) -> MonitorDesignSetup:
+    return resolve_monitor_design(written(tmp_path_factory.mktemp("design")))
+
+
+@pytest.fixture(scope="module")
+def bench(setup: MonitorDesignSetup, backend: Backend) -> LayoutBench:
+    return LayoutBench(setup, backend)
+
+
+@pytest.fixture(scope="module")
+def facts(bench: LayoutBench) -> tuple[BeamFacts, ...]:
+    tried = tuple(bench.try_beam(beam) for beam in (FIRST, SECOND, THIRD))
+    assert [one.refused for one in tried] == ["", "", ""]
+    return tried
+
+
+def test_the_start_is_a_layout_of_one_beam(setup: MonitorDesignSetup) -> None:
+    (beam,) = start_beams(setup)
+    assert (beam.pupil_x, beam.pupil_y, beam.width) == (0.22, 0.0, 0.05)
+    spec = layout_spec(setup, (beam,))
+    for camera in spec.cameras:
+        assert spec.channels_of(camera) == setup.instrument.channels_of(camera)
+
+
+def test_a_further_beam_never_raises_a_sigma(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
+    for fewer, more in (((0,), (0, 1)), ((1,), (0, 1)), ((0, 1), (0, 1, 2)), ((0, 2), (0, 1, 2))):
+        few, many = (combined([facts[k] for k in which], "mirrors.yaml") for which in (fewer, more))
+        # rounding of covariances whose largest and smallest eigenvalues are 1e9 apart
+        assert np.linalg.eigvalsh(few - many).min() > -1e-9 * np.trace(few)
+        assert np.trace(many) < np.trace(few)
+
+
+def test_beams_combined_are_the_layout_that_is_built(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
+    built = bench.try_layout((FIRST, SECOND))
+    assert built.refused == ""
+    left = combined(facts[:2], "mirrors.yaml")
+    for name, rows in bench.rows.items():
+        sigma = float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", rows, left, rows))))
+        # the second facet stands elsewhere on the block than alone: the beams' ways differ by some millimetres
+        assert built.sigmas["mirrors.yaml"][name] == pytest.approx(sigma, rel=0.01)
+    shares = built.shares["mirrors.yaml"]["angle"]
+    assert np.sqrt(sum(shares.values())) == pytest.approx(built.sigmas["mirrors.yaml"]["angle"], rel=1e-9)
+    assert built.mass == pytest.approx(facts[0].mass + facts[1].mass, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def path(bench: LayoutBench) -> MonitorPath:
+    return MonitorPath(bench.start, bench.backend)
+
+
+def with_light(path: MonitorPath, times: float, frames: int) -> MonitorPath:
+    """The monitor with other light and another number of frames."""
+    start = path.instrument
+    monitor = start.spec.monitor.model_copy(update={"frames": frames})
+    channels = tuple(replace(channel, photons=times * channel.photons) for channel in start.channels)
+    spec = start.spec.model_copy(update={"monitor": monitor})
+    return MonitorPath(replace(start, spec=spec, channels=channels), path.backend)
+
+
+def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBench, path: MonitorPath) -> None:
+    even = replace(bench.detector, prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
+    once = spot_noise(with_light(path, 1.0, 4), even)
+    assert spot_noise(with_light(path, 1.0, 12), even) == pytest.approx(once / 3.0, rel=1e-12)
+    # shot noise alone, but for what rounding to grey values adds
+    assert spot_noise(with_light(path, 2.0, 4), even) == pytest.approx(once / 2.0, rel=0.01)
+    stated = bench._information(bench.start, alike=False)["mirrors.yaml"].disturbances
+    shared = np.array([not is_own(body) for body in stated.bodies])
+    own = stated.scaled(shared.astype(float))
+    one = Information(own, once, bench.rows)
+    twice = replace(
+        one,
+        disturbances=replace(own, spots=np.concatenate([own.spots, own.spots])),
+        noise=np.kron(np.eye(2), once),
+    )
+    brighter = replace(one, noise=once / 2.0)
+    assert twice.fisher == pytest.approx(brighter.fisher, rel=1e-9, abs=1e-9 * float(np.abs(one.fisher).max()))
+    assert twice.posterior == pytest.approx(brighter.posterior, rel=1e-6, abs=1e-9 * float(np.trace(one.posterior)))
+    # the two forms of the posterior are one
+    root = own.parameters @ np.linalg.solve(np.eye(len(shared)) + one.fisher, own.parameters.T)
+    assert one.posterior == pytest.approx(root, rel=1e-5, abs=1e-9 * float(np.trace(root)))
+
+
+def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, path: MonitorPath) -> None:
+    """N photons through a round aperture tell a place to wavelength / (2 pi NA sqrt(N)), and a shift is of two images.
+    Pinhole and pixel, and rounding to grey values, fill the dark rings, which tell much of it.
+    """
+    even = replace(bench.detector, prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
+    lit = with_light(path, 1.0, 4)
+    electrons = 4 * even.quantum_efficiency * np.array([channel.photons for channel in lit.channels])
+    airy = lit.wavelength / (2.0 * np.pi * lit.numerical_aperture * np.sqrt(electrons)) / lit.pitch
+    sigma = np.sqrt(np.diag(spot_noise(lit, even)).reshape(-1, 2))
+    assert np.all(sigma > np.sqrt(2.0) * airy[:, None])
+    assert np.all(sigma < 1.35 * np.sqrt(2.0) * airy[:, None])
+
+
+def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
+    # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
+    start = path.instrument
+    channels = tuple(replace(c, photons=0.25 * c.photons) if c.side == "left" else c for c in start.channels)
+    uneven = MonitorPath(replace(start, channels=channels), path.backend)
+    taken, own = (np.diag(spot_noise(uneven, bench.detector, alike)) for alike in (True, False))
+    assert taken == pytest.approx(own, rel=0.02)
+    assert own[0] > 1.5 * own[2]
+
+
+def test_bodies_of_one_channel_are_told_from_shared_ones() -> None:
+    own = ("base/forward/monitor/left_2/prism_0", "base/central_prism/forward_left", "base/a/focal_plane/right/reticle")
+    assert all(is_own(body) for body in own)
+    assert not any(is_own(body) for body in ("base/forward/M1", "base/central_prism", "base/forward/focal_plane"))
+
+
+def test_beams_that_stand_in_each_other_are_not_combined(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
+    assert not touching(facts[0], facts[1])
+    near = bench.try_beam(replace(SECOND, pupil_x=0.135, spread_y=0.105))
+    assert near.refused == ""
+    assert touching(facts[1], near)
+
+
+def test_a_layout_whose_prisms_collide_is_refused_with_both_bodies_and_the_line(
+    setup: MonitorDesignSetup, tmp_path: Path
+) -> None:
+    near = replace(SECOND, prism_180_distance=2.42, pupil_x=0.2)
+    file = tmp_path / "hand.yaml"
+    file.write_text(instrument_file(layout_spec(setup, (FIRST, near)), "made by hand"), "utf-8")
+    design = written(tmp_path, DESIGN.replace("instrument: gf7_pair", "instrument: hand.yaml"))
+    result = CliRunner().invoke(app, ["monitor", str(design), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    told = " ".join(result.output.split())
+    assert "base/forward/monitor/left/prism_180" in told
+    assert "base/forward/monitor/left_2/prism_180" in told
+    lines = file.read_text("utf-8").splitlines()
+    number = int(told.split("hand.yaml:")[1].split(":")[0])
+    assert "distance: 2.42 m" in lines[number - 1] or "distance: 2.4 m" in lines[number - 1]
+    assert not (tmp_path / "out").exists()
+
+
+class Stop(Exception):
+    """Breaks a search off."""
+
+
+@pytest.fixture(scope="module")
+def whole(setup: MonitorDesignSetup, backend: Backend) -> MonitorDesignRun:
+    return run_monitor_design(setup, backend, seed=1)
+
+
+def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path: Path) -> None:
+    best = whole.points[0]
+    assert whole.merit(best.facts) < whole.merit(whole.found.start)
+    assert best.facts.pupil_share <= 0.2
+    file = tmp_path / f"{best.name}.yaml"
+    file.write_text(best.text, "utf-8")
+    again = load_instrument(file)
+    assert again.channels_of("forward") == layout_spec(whole.setup, best.facts.beams).channels_of("forward")
+    numbers = MONITOR_DESIGN.numbers(whole)
+    assert numbers["search"]["beams_tried"] == 3
+    assert next(iter(numbers["layouts"])) == "better"
+
+
+def test_a_journal_keeps_every_bit_and_is_of_one_search(facts: tuple[BeamFacts, ...], tmp_path: Path) -> None:
+    file = tmp_path / "a.search"
+    with Journal(file, "one") as journal:
+        journal.keep(FIRST, facts[0])
+        kept = file.read_text("utf-8")
+    assert not file.exists()  # that of a search that is complete
+    file.write_text(kept + '{"of": "a line that was cut', "utf-8")
+    with pytest.raises(RunFolderError, match="another search"), Journal(file, "two"):
+        pass
+    with Journal(file, "one") as journal:
+        again = journal.known(FIRST)
+        assert journal.known(SECOND) is None
+    assert again.beam == FIRST
+    for name in ("taken", "facets", "light"):
+        assert np.array_equal(getattr(again, name), getattr(facts[0], name))
+    for name in ("shared", "own", "parameters"):
+        assert np.array_equal(getattr(again.seen["mirrors.yaml"], name), getattr(facts[0].seen["mirrors.yaml"], name))
+
+
+@pytest.mark.slow
+def test_a_search_that_is_broken_off_goes_on_to_the_same_end(
+    setup: MonitorDesignSetup, backend: Backend, whole: MonitorDesignRun, tmp_path: Path
+) -> None:
+    journal = tmp_path / "out.search"
+
+    def stop(part: str, done: int, total: int) -> None:
+        if done == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        run_monitor_design(setup, backend, 1, stop, journal=journal)
+    kept = len(journal.read_text("utf-8").splitlines())
+    assert kept == 3  # the head and both beams
+    again = run_monitor_design(setup, backend, 1, journal=journal)
+    assert not journal.exists()
+    assert MONITOR_DESIGN.numbers(again) == MONITOR_DESIGN.numbers(whole)
+
+
+def test_layouts_with_ghosts_are_left_out(whole: MonitorDesignRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The path tracer is not run: what it says of the layouts is what is tested elsewhere."""
+    limits = whole.setup.test.limits.model_copy(update={"ghost_paths": 20_000})
+    setup = whole.setup.model_copy(update={"test": whole.setup.test.model_copy(update={"limits": limits})})
+    asked: list[int] = []
+
+    def traced(experiment: object, state: object, paths: int, seed: int) -> str:
+        asked.append(paths)
+        return "light"
+
+    monkeypatch.setattr(monitor_design, "stray_light", traced)
+    monkeypatch.setattr(monitor_design, "ghost_warnings", lambda experiment, light: ("a ghost",))
+    monkeypatch.setattr(monitor_design.Search, "run", lambda self: whole.found)
+    with pytest.raises(BenchError, match="ghosts"):
+        run_monitor_design(setup, whole.bench.backend)
+    assert set(asked) == {20_000}
+    monkeypatch.setattr(monitor_design, "ghost_warnings", lambda experiment, light: ())
+    again = run_monitor_design(setup, whole.bench.backend)
+    assert [point.name for point in again.points] == [point.name for point in whole.points]
+
+
+@pytest.mark.slow
+def test_workers_change_nothing(setup: MonitorDesignSetup, backend: Backend, whole: MonitorDesignRun) -> None:
+    again = run_monitor_design(setup, backend, 1, workers=2)
+    assert MONITOR_DESIGN.numbers(again) == MONITOR_DESIGN.numbers(whole)
+
+
+@pytest.mark.parametrize(
+    ("change", "to", "told"),
+    [
+        ("pupil_x: [90 mm, 150 mm]", "pupil_x: [150 mm, 90 mm]", "the range ends before it begins"),
+        ("goal: {angle: 0.05 arcsec, d_f: 2 um}", "goal: {}", "what is the layout to reach?"),
+        ("goal: {angle: 0.05 arcsec, d_f: 2 um}", "goal: {angle: 0.05}", "angle"),
+        ("disturbances: [mirrors.yaml]", "disturbances: [weather]", "no such name in disturbances"),
+        ("limits: {pupil_share: 20 percent}", "limits: {mass: 20 m}", "mass"),
+        ("instrument: gf7_pair", "instrument: gf8_pair", "no such name in instruments"),
+        (
+            "beams: 2",
+            "beams: 2\nprisms: {a: {prism_180: {material: N-BK7, kind: rhomboid}, prism_0: {material: Zerodur}}}",
+            "rhomboid",
+        ),
+    ],
+)
+def test_bad_input_is_told_with_its_line(tmp_path: Path, change: str, to: str, told: str) -> None:
+    file = written(tmp_path, DESIGN.replace(change, to, 1))
+    with pytest.raises(InputError) as error:
+        resolve_monitor_design(file)
+    assert told in str(error.value)
+    issue = error.value.issues[0]
+    assert issue.line is not None
+    assert file.read_text("utf-8").splitlines()[issue.line - 1].split(":")[0].strip() in to
+
+
+def test_the_file_says_which_design_it_is(tmp_path: Path) -> None:
+    file = written(tmp_path, DESIGN.replace("goal: {angle: 0.05 arcsec, d_f: 2 um}", "goal: {}"))
+    for words in ([str(file)], ["monitor", str(file)]):
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 2
+        assert "what is the layout to reach?" in " ".join(result.output.split())

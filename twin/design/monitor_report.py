@@ -1,0 +1,231 @@
+"""Report of a search for a monitor's layout: the front, what limits each layout, drawings, the instruments' files."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from scenes.models.instrument_builder import build_instrument
+from scenes.models.monitor_layout import layout_spec
+from twin.design.layout_bench import LayoutFacts
+from twin.design.monitor_design import GOAL_NAMES, UNITS, MonitorDesignRun, Point, verdict
+from twin.main_job.light_path_plots import side_view_svg
+from twin.pictures.light_paths import trace_light_paths
+from twin.run.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
+from twin.run.report import Report, Section
+from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
+
+_MOST_CAUSES = 6
+
+
+def monitor_design_report(run: MonitorDesignRun) -> Report:
+    """Report of a search."""
+    setup, found = run.setup, run.found
+    start, test = setup.instrument.name, setup.test
+    rows = [_row(run, start, found.start), *(_row(run, point.name, point.facts) for point in run.points)]
+    heads = (
+        "layout",
+        "beams per end",
+        *(f"{GOAL_NAMES[g]}, σ [{shown_unit(UNITS[g][0])}]" for g in test.goal.wanted),
+        "worst σ / goal",
+        "pupil [%]",
+        "prisms [kg]",
+        "glass path [m]",
+        "spots, σ [px]",
+    )
+    places = [decimals_for(min(run.worst(f, g) for _, f in _named(run)) / UNITS[g][1], 3) for g in test.goal.wanted]
+    decimals = (None, None, *places, 2, 1, 1, 2, 1)
+    stated = ", ".join(setup.disturbances)
+    caption = f"One standard deviation, the worst over cameras and disturbances ({stated})."
+    summary = Table("layouts", "The start and the layouts on the front", caption, heads, rows, decimals)
+    best = run.points[0]
+    with look("layouts"):
+        front = SvgFigure("front", "What a smaller sigma costs", _FRONT, to_svg(front_figure(run)))
+        causes = SvgFigure("causes", "What limits them", _CAUSES, to_svg(cause_figure(run)))
+        pupils = SvgFigure("pupils", "Beams in the entrance pupil", _PUPILS, to_svg(pupil_figure(run)))
+    drawings = tuple(_drawing(run, point) for point in run.points[:2])
+    sections = (
+        Section("The front", (_search_text(run),), (front, _beams_table(run))),
+        Section("What limits it", (), (causes, *(_cause_table(run, name) for name in setup.disturbances))),
+        Section("The layouts", (), (pupils, *drawings)),
+        Section(
+            "The instruments",
+            ("Each file can be named by a job of twin.render, or stand in scenes/library/instruments.",),
+            tuple(
+                CameraFile(p.name.lower(), p.name, f"The instrument of layout {p.name}.", p.text) for p in run.points
+            ),
+        ),
+    )
+    facts = (("start", start), ("disturbances", stated), ("best", best.name))
+    lead = (f"The instrument of the best layout is artefacts/{best.name.lower()}.yaml.",)
+    return Report(f"Layout of {test.name}", verdict(run), lead, facts, summary, sections)
+
+
+_FRONT = (
+    "Every layout that was built and stands: what it leaves of the goal that it is farthest from, relative to what is "
+    "wanted, against the share of the imaging pupil that its prisms take and against their mass. Named ones are on the "
+    "front: no other is better in all three."
+)
+_CAUSES = "Standard deviations by cause before any measurement and as the start and the best layout leave them."
+_PUPILS = "Of the first camera as light comes in; X points toward the central prism. Filled: left; open: right."
+
+
+def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int | float]:
+    goals = [run.worst(facts, goal) / UNITS[goal][1] for goal in run.setup.test.goal.wanted]
+    ends = [run.merit(facts), 100.0 * facts.pupil_share, facts.mass, facts.glass_path, facts.spot_sigma]
+    return [name, len(facts.beams), *goals, *ends]
+
+
+def _search_text(run: MonitorDesignRun) -> str:
+    found = run.found
+    text = (
+        f"{found.beams} beams were tried alone, of which {found.standing} can stand; {found.compared} combinations "
+        f"were compared, {found.built} built as a whole, {len(found.layouts)} of these stand."
+    )
+    refused = sorted(found.refused.items(), key=lambda item: -item[1])[:3]
+    if refused:
+        text += " Most were refused since " + "; ".join(f"{reason} ({count})" for reason, count in refused) + "."
+    steps = ", ".join(f"{value:.3g}" for value in found.progress)
+    return f"{text} The best ratio to the goal after the first draw and after each round: {steps}."
+
+
+def _beams_table(run: MonitorDesignRun) -> Table:
+    heads = ("layout", "beam", "pupil x [mm]", "pupil y [mm]", "width [mm]", "field [deg]", "180° prism [m]")
+    more = ("0° prism [m]", "shift [mm]", "facet x [mm]", "facet y [mm]", "prisms")
+    rows: list[list[Cell]] = []
+    for name, facts in _named(run):
+        for n, beam in enumerate(facts.beams, 1):
+            mm = [1e3 * v for v in (beam.pupil_x, beam.pupil_y, beam.width)]
+            rest = [1e3 * v for v in (beam.shift, beam.spread_x, beam.spread_y)]
+            places = [float(np.degrees(beam.field)), beam.prism_180_distance, beam.prism_0_distance]
+            rows.append([name, n, *mm, *places, *rest, beam.prisms])
+    title = "Beams of the layouts"
+    places_shown = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, None)
+    return Table("beams", title, "Each stands at both ends of both lines.", (*heads, *more), rows, places_shown)
+
+
+def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
+    return [(run.setup.instrument.name, run.found.start), *((p.name, p.facts) for p in run.points)]
+
+
+def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, measured: bool) -> dict[str, float]:
+    """Standard deviations by cause, of the camera in which the goal's quantity is worse, units of the goal."""
+    key = max(run.bench.goals_of(goal), key=lambda one: facts.sigmas[name][one])
+    shares = (facts.shares if measured else facts.shares_before)[name][key]
+    return {cause: sqrt(max(share, 0.0)) / UNITS[goal][1] for cause, share in shares.items()}
+
+
+def _cause_table(run: MonitorDesignRun, name: str) -> Table:
+    heads, columns = ["cause"], []
+    for goal in run.setup.test.goal.wanted:
+        unit = shown_unit(UNITS[goal][0])
+        columns.append(_causes_of(run, run.found.start, name, goal, False))
+        heads.append(f"{GOAL_NAMES[goal]}, unmeasured [{unit}]")
+        for label, facts in _named(run)[:2]:
+            columns.append(_causes_of(run, facts, name, goal, True))
+            heads.append(f"{label} [{unit}]")
+    causes = dict.fromkeys(cause for column in columns for cause in column)
+    rows: list[list[Cell]] = [[cause, *(column.get(cause, 0.0) for column in columns)] for cause in causes]
+    totals = [sqrt(sum(v * v for v in column.values())) for column in columns]
+    rows.append(["together", *totals])
+    places = (None, *(decimals_for(0.01 * total, 1) for total in totals))
+    title = f"By cause: {name}"
+    return Table(f"causes-{name.lower()}".replace("/", "-").replace(".", "-"), title, "σ.", tuple(heads), rows, places)
+
+
+def front_figure(run: MonitorDesignRun) -> Figure:
+    """Layouts: sigma against pupil share, and against mass."""
+    figure = new_figure(3.6)
+    left, right = figure.subplots(1, 2, sharey=True)
+    costs = (("share of the imaging pupil [%]", lambda f: 100.0 * f.pupil_share), ("prisms [kg]", lambda f: f.mass))
+    for axes, (label, cost) in zip((left, right), costs, strict=True):
+        every = run.found.layouts
+        axes.plot([cost(f) for f in every], [run.merit(f) for f in every], "o", ms=3.5, color=LIGHT, mec=GREY, mew=0.5)
+        for k, point in enumerate(run.points):
+            x, y = cost(point.facts), run.merit(point.facts)
+            axes.plot([x], [y], "o", ms=6, color=VERMILION if k == 0 else BLUE)
+            text = point.name.removeprefix(f"{run.points[0].name}_") if k else "best"
+            above = k % 2 == 0  # neighbours on the front may stand close
+            axes.annotate(text, (x, y), (5, 5) if above else (-9, -11), textcoords="offset points", fontsize=8)
+        start = run.found.start
+        axes.plot([cost(start)], [run.merit(start)], "s", ms=6, color=INK)
+        axes.annotate(run.setup.instrument.name, (cost(start), run.merit(start)), (6, -10), textcoords="offset points")
+        axes.axhline(1.0, color=ORANGE, lw=1.0)
+        axes.set(xlabel=label, yscale="log")
+        axes.grid(color=LIGHT, lw=0.4, which="both")
+        axes.set_axisbelow(True)
+        axes.margins(0.12)
+        plain_axes(axes)
+    left.annotate(
+        "goal", (1.0, 1.0), (-2, 3), xycoords=("axes fraction", "data"), textcoords="offset points", ha="right"
+    )
+    left.set_ylabel("worst σ relative to the goal")
+    return figure
+
+
+def cause_figure(run: MonitorDesignRun) -> Figure:
+    """Standard deviations by cause: unmeasured, start, best; a panel for each goal, of the worst disturbances."""
+    goals = tuple(run.setup.test.goal.wanted)
+    figure = new_figure(3.4)
+    panels = figure.subplots(1, len(goals), squeeze=False)[0]
+    for axes, goal in zip(panels, goals, strict=True):
+        _cause_bars(axes, run, goal)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    return figure
+
+
+def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
+    best = run.points[0].facts
+    name = max(best.sigmas, key=lambda one: max(best.sigmas[one][key] for key in run.bench.goals_of(goal)))
+    columns = [
+        ("unmeasured", LIGHT, _causes_of(run, run.found.start, name, goal, False)),
+        (run.setup.instrument.name, SKY, _causes_of(run, run.found.start, name, goal, True)),
+        (run.points[0].name, VERMILION, _causes_of(run, best, name, goal, True)),
+    ]
+    size = {c: max(col.get(c, 0.0) for _, _, col in columns[1:]) for _, _, col in columns for c in col}
+    causes = sorted(size, key=lambda cause: -size[cause])[:_MOST_CAUSES]
+    y = np.arange(len(causes))
+    for k, (label, colour, column) in enumerate(columns):
+        axes.barh(y + 0.27 * (k - 1), [column.get(c, 0.0) for c in causes], 0.25, color=colour, label=label, ec="none")
+    axes.set_yticks(y, [cause.replace("_", " ") for cause in causes])
+    axes.invert_yaxis()
+    values = [column.get(c, 0.0) for _, _, column in columns for c in causes]
+    top = max(values)
+    axes.set(xscale="log", xlim=(max(min((v for v in values if v > 0.0), default=top), 1e-4 * top) / 2, 2.0 * top))
+    axes.set_xlabel(f"{GOAL_NAMES[goal]}, σ [{shown_unit(UNITS[goal][0])}] ({name})")
+    axes.grid(axis="x", color=LIGHT, lw=0.4)
+    axes.set_axisbelow(True)
+    plain_axes(axes)
+
+
+def pupil_figure(run: MonitorDesignRun) -> Figure:
+    """Where the beams of the start and of each layout go through the entrance pupil."""
+    shown = _named(run)[:4]
+    figure = new_figure(3.0)
+    radius = 0.5e3 * next(iter(run.setup.cameras.values())).entrance_pupil
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    for axes, (name, facts) in zip(panels, shown, strict=True):
+        axes.add_patch(Circle((0.0, 0.0), radius, fill=False, ec=INK, lw=1.2))
+        for k, beam in enumerate(facts.beams):
+            colour = (VERMILION, BLUE, ORANGE, SKY)[k % 4]
+            for sign, fill in ((1.0, True), (-1.0, False)):
+                place = (1e3 * beam.pupil_x, sign * 1e3 * beam.pupil_y)
+                axes.add_patch(Circle(place, 0.5e3 * beam.width, fill=fill, fc=colour, ec=colour, alpha=0.7, lw=1.2))
+        axes.set(xlim=(-1.1 * radius, 1.1 * radius), ylim=(-1.1 * radius, 1.1 * radius), aspect="equal", title=name)
+        axes.set_xlabel("X [mm]")
+        plain_axes(axes)
+    panels[0].set_ylabel("Y, along the line [mm]")
+    return figure
+
+
+def _drawing(run: MonitorDesignRun, point: Point) -> SvgFigure:
+    spec = layout_spec(run.setup, point.facts.beams)
+    instrument = build_instrument(spec, run.setup.cameras, run.bench.backend)
+    drawing = side_view_svg(instrument, trace_light_paths(instrument, run.bench.backend, {}))
+    caption = "Base X-Z plane; all prisms, and the beams of the left end of each line."
+    return SvgFigure(f"side-{point.name.lower()}", f"{point.name} from the side", caption, drawing)
