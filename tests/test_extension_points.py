@@ -23,10 +23,10 @@ from scipy import stats
 
 import twin.render
 import twin.validate
-from analysis.monitor import monitoring, recovery
+from analysis.monitor import recovery
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.estimators import Estimator, OfEachCamera, Shifts
+from analysis.monitor.estimators import Estimator, Formula, OfEachCamera, Shifts
 from analysis.monitor.monitoring import PARAMETERS, MonitorGeometry
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import gaussian_fit, mean_frames
@@ -271,6 +271,10 @@ BAR = (8, 60)
 """Width and length of the toy target, pixels."""
 
 
+DERIVED = Formula("derived", "", "")
+"""The corrected formulas themselves."""
+
+
 class Half(OfEachCamera):
     """Half of what the corrected formulas say."""
 
@@ -278,7 +282,7 @@ class Half(OfEachCamera):
     note = "half of what derived says"
 
     def camera_gain(self, camera: CameraCalibration, covariance: np.ndarray) -> np.ndarray:
-        return 0.5 * monitoring.coefficients("derived", camera.geometry)
+        return 0.5 * DERIVED.camera_gain(camera, covariance)
 
 
 class Nothing(Estimator):
@@ -289,7 +293,7 @@ class Nothing(Estimator):
     stated = True
 
     def gain(self, shifts: Shifts) -> np.ndarray:
-        return np.zeros_like(shifts.covariance)
+        return np.zeros((len(shifts.covariance), 4 * len(shifts.cameras), shifts.covariance.shape[-1]))
 
 
 def one_bar(pitch: float, region: int) -> Target:
@@ -315,8 +319,12 @@ def turned(count: int) -> dict[str, np.ndarray]:
     generator = np.random.default_rng(7)
     start = generator.uniform(40.0, 60.0, (count, 4, 2))
     roots = generator.normal(0.0, 1e-3, (count, 2, 4, 4))
-    joint = roots @ np.swapaxes(roots, -1, -2) + 1e-7 * np.eye(4)
-    return {"start": start, "end": start + generator.normal(0.0, 0.3, start.shape), "covariance": joint}
+    each = roots @ np.swapaxes(roots, -1, -2) + 1e-7 * np.eye(4)
+    whole = np.zeros((count, 2, 4, 2, 4))
+    for k in range(2):
+        whole[:, k, :, k] = each[:, k]
+    end = start + generator.normal(0.0, 0.3, start.shape)
+    return {"start": start, "end": end, "covariance": whole.reshape(count, 8, 8)}
 
 
 def calibrations() -> dict[str, CameraCalibration]:

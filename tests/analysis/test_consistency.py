@@ -55,8 +55,8 @@ def test_noise_moves_the_chi_square_by_what_is_said(stated) -> None:
 
 
 def test_judged_is_the_best_that_stands_in_the_results(stated) -> None:
-    assert judged(applicable(stated)) == "posterior"
-    assert judged(applicable(None)) == "model"
+    assert judged(applicable({}, stated)) == "posterior"
+    assert judged(applicable({}, None)) == "model"
     assert judged(reversed(list(ESTIMATORS))) == "posterior"
     with pytest.raises(ValueError, match="results without posterior or model: there are derived"):
         judged(["derived"])

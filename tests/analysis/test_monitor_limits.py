@@ -113,7 +113,7 @@ def test_total_sigmas_of_every_estimator_hold_on_the_linear_model():
     s = x @ stated.spots.T + rng.multivariate_normal(np.zeros(len(noise)), noise, count)
     still = np.zeros((1, 4, 2))
     tried = 0
-    for estimator in applicable(stated).values():
+    for estimator in applicable(cameras, stated).values():
         gain = estimator.gain(Shifts(still, still, noise[None], cameras, stated))[0]
         split = limits.split(unit_rows(stated), stated, noise, gain)
         error = s @ gain.T - x @ stated.parameters.T
@@ -148,7 +148,7 @@ def test_with_the_papers_family_alone_the_posterior_is_the_model():
     still = np.zeros((1, 4, 2))
     for noise, tolerance in ((np.zeros((8, 8)), 1e-9), (a_noise(size=1e-3), 1e-9)):
         shifts = Shifts(still, still, noise[None], cameras, stated)
-        found = {name: one.gain(shifts)[0] for name, one in applicable(stated).items()}
+        found = {name: one.gain(shifts)[0] for name, one in applicable(cameras, stated).items()}
         scale = np.abs(found["model"]).max(axis=1, keepdims=True)
         np.testing.assert_allclose(found["posterior"] / scale, found["model"] / scale, atol=tolerance)
 

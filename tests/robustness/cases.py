@@ -148,11 +148,11 @@ def _renders() -> Iterator[Case]:
         "pair.yaml": _with(
             _text("library/instruments/gf7_pair.yaml"),
             ("{camera: gf7, look: 26", "{camera: ./gf7.yaml, look: 26"),
-            ("{camera: gf7, look: -5", "{camera: conic.yaml, look: -5"),
+            ("{camera: gf7, look: -5", "{camera: short.yaml, look: -5"),
             ("monitor_ccd", "sub/ccd.yaml"),
         ),
         "gf7.yaml": _with(_text("library/cameras/gf7.yaml"), ("detector: gf7_pan", "detector: ./pan.yaml")),
-        "conic.yaml": _text("library/cameras/gf7_conic.yaml"),
+        "short.yaml": _text("library/cameras/gf7_short.yaml"),
         "sub/ccd.yaml": _text("library/detectors/monitor_ccd.yaml"),
         "pan.yaml": _text("library/detectors/gf7_pan.yaml"),
     }

@@ -5,6 +5,7 @@ the truth.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,8 +34,8 @@ FALSE = 1e-2
 CHUNK = 40
 """States that are rendered at once; the numbers do not depend on it."""
 STATES = "random states"
-_DRAWN = 9
-"""Number of the random stream of the states."""
+_DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
+"""Numbers of the random streams of the states, of their detectors and of the noise before and after."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ def run_states(
     seed: int,
     advance: Advance = silent,
 ) -> Coverage:
-    """Draw, render, expose and recover states; every state has a nominal measurement of its own before it.
+    """Draw, render, expose and recover states; every state has detectors and a nominal measurement of its own.
 
     Args:
         experiment: the instrument, with stated disturbances.
@@ -158,10 +159,8 @@ def run_states(
             continue
         some = [states[k] for k in kept]
         photons = experiment.path.expected_photons(some)
-        calm = np.broadcast_to(experiment.nominal_photons, photons.shape)
-        # a stream of its own for each state and for the measurement before it, whichever others were lost
-        before = _exposed(experiment, calm, frames, seed, count + first + kept)
-        after = _exposed(experiment, photons, frames, seed, first + kept)
+        # streams of its own for each state, whichever others were lost
+        before, after = _exposed(experiment, photons, frames, seed, first + kept)
         found, good = _recovered(experiment, before, after)
         if found is None:
             continue
@@ -216,18 +215,24 @@ def _recovered(
 
 def _exposed(
     experiment: MonitorExperiment, photons: np.ndarray, frames: int, seed: int, numbers: np.ndarray
-) -> np.ndarray:
-    """Frames of states whose random streams have these numbers."""
-    pieces = [
-        experiment.frames_after(photons[run[0] : run[-1] + 1], frames, seed, int(numbers[run[0]]))
-        for run in _runs(numbers)
-    ]
-    return np.concatenate(pieces)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frames of the nominal state and of states of these numbers, (S, C, frames, rows, columns), each pair by detectors
+    of its own: with one detector for all, what its pattern does to the nominal spots would be the same error in all.
+    """
+    detector, channels = experiment.detector, len(experiment.path.channels)
+    before = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
+    after = np.empty_like(before)
 
+    def expose(k: int) -> None:
+        number = int(numbers[k])
+        pattern = detector.fixed_pattern((channels, *experiment.path.shape), stream(seed, _DETECTOR, number))
+        for kind, light, out in ((_BEFORE, experiment.nominal_photons, before), (_AFTER, photons[k], after)):
+            own = stream(seed, kind, number)
+            out[k] = detector.expose(light, pattern, frames, experiment.exposure, own, threads=1)
 
-def _runs(numbers: np.ndarray) -> list[np.ndarray]:
-    """Places of consecutive numbers."""
-    return np.split(np.arange(len(numbers)), np.flatnonzero(np.diff(numbers) != 1) + 1)
+    with ThreadPoolExecutor(min(cores(), 8)) as pool:
+        list(pool.map(expose, range(len(photons))))
+    return before, after
 
 
 def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]) -> dict[str, np.ndarray]:
