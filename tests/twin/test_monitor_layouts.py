@@ -11,16 +11,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from analysis.monitor.limits import ANGLE_GROUP
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.monitor_layout import (
     Beam,
+    ImagingBeams,
     MonitorDesignSetup,
     instrument_file,
     layout_spec,
+    prism_mass,
+    pupil_share,
     resolve_monitor_design,
     start_beams,
 )
+from scenes.specs.job import JobSpec
 from scenes.specs.load import load_instrument
+from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from twin.design import monitor_design
 from twin.design.__main__ import app
@@ -28,9 +34,11 @@ from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, t
 from twin.design.monitor_design import MONITOR_DESIGN, MonitorDesignRun, run_monitor_design
 from twin.design.search_journal import Journal
 from twin.monitor.information import Information, spot_noise
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.run.procedure import BenchError
 from twin.run.run_folder import RunFolderError
+from twin.uncertainty.monitor_limits import expected_covariance, find_limits
 
 STATED = """
 name: mirrors
@@ -328,3 +336,25 @@ def test_the_file_says_which_design_it_is(tmp_path: Path) -> None:
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 2
         assert "what is the layout to reach?" in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(("name", "less"), [("gf7_pair_two", (12.0, 10.0)), ("gf7_pair_best", (16.0, 15.0))])
+@pytest.mark.parametrize("disturbances", ["orbit", pytest.param("launch", marks=pytest.mark.slow)])
+def test_the_shipped_layouts_know_more(backend, name, less, disturbances):
+    """What their page says: how many times less the posterior leaves of the angle and of d_f, at about the same share
+    of the imaging pupils, and a fifteenth of the mass.
+    """
+    left, share, mass = {}, {}, {}
+    for one in ("gf7_pair", name):
+        named = {"instrument": one, "disturbances": {"file": disturbances}}
+        experiment = MonitorExperiment(resolve_job(JobSpec.model_validate(named)), backend)
+        limits = find_limits(experiment, expected_covariance(experiment, experiment.instrument.spec.monitor.frames), 9)
+        sigma = limits.splits["posterior"].sigma
+        angle = next(s for q, s in zip(limits.quantities, sigma, strict=True) if q.group == ANGLE_GROUP)
+        left[one] = angle, max(s for q, s in zip(limits.quantities, sigma, strict=True) if q.key == "d_f_um")
+        share[one] = pupil_share(ImagingBeams.of(experiment.instrument, backend).taken(experiment.instrument))
+        mass[one] = prism_mass(experiment.instrument)
+    for before, after, times in zip(left["gf7_pair"], left[name], less, strict=True):
+        assert times * after < before
+    assert share[name] < 1.3 * share["gf7_pair"]
+    assert 14.0 * mass[name] < mass["gf7_pair"]

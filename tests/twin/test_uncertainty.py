@@ -100,6 +100,13 @@ def test_sigmas_hold_in_images(instrument, disturbances):
     check_states(instrument, disturbances, 500)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", ["gf7_pair_two", "gf7_pair_best"])
+def test_sigmas_of_more_beams_hold_in_images(instrument):
+    """Fifteen times smaller ones."""
+    check_states(instrument, "orbit", 300)
+
+
 def test_states_whose_spots_leave_their_ccd_are_left_out_and_counted():
     """As often as the linear model says, within binomial limits."""
     experiment, limits = bench("monitor_pair", SHAKEN)
