@@ -48,14 +48,15 @@ class MonitorExperiment:
     Args:
         resolved: the job with everything it names; its perturbation is not used here.
         backend: where to trace.
+        free_beams: as of ``build_instrument``.
     """
 
-    def __init__(self, resolved: ResolvedJob, backend: Backend) -> None:
+    def __init__(self, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
         self.backend = backend
         self.resolved = resolved
         self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
-        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
+        self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
         self.path = MonitorPath(self.instrument, backend)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:

@@ -190,7 +190,8 @@ class ErrorBudget:
         longer = monitor.model_copy(update={"prism_0": monitor.prism_0.model_copy(update={"shift": shift})})
         instrument = whole.instrument.spec.model_copy(update={"monitor": longer})
         resolved = self.resolved.model_copy(update={"instrument": instrument})
-        half = MonitorExperiment(resolved, whole.backend)
+        # the longer rhomboids stand in the way of the other beams: glass is compared, not a layout
+        half = MonitorExperiment(resolved, whole.backend, free_beams=False)
         rms, glass = [], []
         for experiment in (whole, half):
             states = [
