@@ -12,7 +12,7 @@ from scipy.stats import chi2, kstest
 
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Posterior, Shifts
-from analysis.monitor.recovery import joint, recover
+from analysis.monitor.recovery import recover
 from analysis.monitor.series_smoother import SmoothedSeries, smooth
 from analysis.spots.spot_positions import SeriesNoise
 from optics.geometry.tree import State
@@ -171,7 +171,7 @@ def imaged(experiment: MonitorExperiment, times: np.ndarray, at: np.ndarray, cou
         noise = SeriesNoise(found.parts[0], len(at))
         noise.add(found.parts[1])
         shifts.append(found.shift)
-        covariance.append(joint(found.shift_covariance))
+        covariance.append(found.shift_covariance)
         noises.append(noise)
     return Courses(experiment, times, at, truth, height, np.array(shifts), np.array(covariance), noises)
 
@@ -271,7 +271,7 @@ def test_noise_that_measurements_share(experiment) -> None:
         noise.add(found.parts[1])
         spreads.append(noise.covariance(np.arange(2)).reshape(2, 8, 2, 8))
         shifts.append(found.shift)
-        assert joint(found.shift_covariance)[0] == pytest.approx(spreads[-1][0, :, 0], rel=1e-4, abs=1e-11)
+        assert found.shift_covariance[0] == pytest.approx(spreads[-1][0, :, 0], rel=1e-4, abs=1e-11)
     # the mean shift is not known: it is that of all detectors, which costs one of them
     middle = np.mean(shifts, axis=(0, 1))
     for two, spread in zip(shifts, spreads, strict=True):

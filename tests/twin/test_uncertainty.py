@@ -67,8 +67,10 @@ def check_states(instrument, disturbances, count):
     n, every = found.measured, found.measured == count
     tail = 0.5 * FALSE / (len(found.errors) * len(found.quantities))
     for name in found.errors:
-        # sigmas of a reading are those of the limits, which no image was drawn for, but for a little noise
-        assert found.sigmas[name][0] == pytest.approx(limits.splits[name].sigma, rel=0.02)
+        # sigmas of a reading are those of the limits, which no image was drawn for, but for the noise: it differs from
+        # state to state by some per cent, as spots meet other pixels, and is all there is of some readings of two beams
+        mean = np.sqrt(np.mean(found.sigmas[name] ** 2, axis=0))
+        assert mean == pytest.approx(limits.splits[name].sigma, rel=0.05)
         if every or name == BEST:
             square = n * found.ratio(name) ** 2
             assert np.all((square > chi2.ppf(tail, n)) & (square < chi2.isf(tail, n))), (name, found.ratio(name))
