@@ -67,10 +67,11 @@ def check_states(instrument, disturbances, count):
     n, every = found.measured, found.measured == count
     tail = 0.5 * FALSE / (len(found.errors) * len(found.quantities))
     for name in found.errors:
-        # sigmas of a reading are those of the limits, which no image was drawn for, but for the noise: it differs from
-        # state to state by some per cent, as spots meet other pixels, and is all there is of some readings of two beams
+        # sigmas of a reading are those of the limits, which no image was drawn for, but for the noise: that is the mean
+        # of six states, which meet other pixels, and most of what is left of d_f with two beams, where it is 5 % low
         mean = np.sqrt(np.mean(found.sigmas[name] ** 2, axis=0))
-        assert mean == pytest.approx(limits.splits[name].sigma, rel=0.05)
+        noisy = limits.splits[name].noise > 0.1 * limits.splits[name].sigma ** 2
+        assert np.all(np.abs(mean / limits.splits[name].sigma - 1.0) < np.where(noisy, 0.1, 0.02))
         if every or name == BEST:
             square = n * found.ratio(name) ** 2
             assert np.all((square > chi2.ppf(tail, n)) & (square < chi2.isf(tail, n))), (name, found.ratio(name))
