@@ -146,21 +146,13 @@ class Disturbances:
         # without noise, what moves no spot has no say; spots move by pixels for one standard deviation
         return np.asarray(across @ np.linalg.pinv(spread, rcond=1e-13, hermitian=True))
 
-    def error_root(self, gain: Array) -> Array:
-        """What is left of the motions in an estimate: (gain A - B) root, (..., 4 K, M).
-
-        Args:
-            gain: parameters per pixel of an estimator, (..., 4 K, D).
-        """
-        return np.asarray((gain @ self.spots - self.parameters) @ self.root)
-
     def misfit(self, gain: Array) -> Array:
         """(..., 4 K, 4 K) covariance of what an estimator makes wrong of the motions themselves.
 
         Args:
             gain: parameters per pixel of an estimator, (..., 4 K, D).
         """
-        left = self.error_root(gain)
+        left = (gain @ self.spots - self.parameters) @ self.root
         return np.asarray(left @ np.swapaxes(left, -1, -2))
 
 

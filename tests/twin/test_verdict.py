@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from analysis.monitor.limits import Split
 from analysis.monitor.monitoring import PER_SI
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
-from twin.main_job.assumptions import assumed, combination, shares_by_body
+from twin.main_job.assumptions import assumed, combination
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS
@@ -298,7 +299,7 @@ def test_the_share_of_a_body_is_that_of_its_errors() -> None:
     rng = np.random.default_rng(3)
     bodies, left = ("a", "b", "a", "c"), rng.standard_normal(4)
     drawn = rng.standard_normal((200_000, 4)) * left
-    shares = shares_by_body(left, bodies)
+    shares = {body: float(share[0]) for body, share in Split.by(left[None] ** 2, bodies).items()}
     for body in "abc":
         own = drawn[:, [b == body for b in bodies]].sum(axis=1)
         # the scatter of a variance over n draws is sqrt(2 / n): five of them

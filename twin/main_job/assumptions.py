@@ -7,16 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency
-from analysis.monitor.ground_error import AXES
-from analysis.monitor.monitoring import PARAMETERS as KEYS
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, Split, quantities, split
 from scenes.specs.channel import BASE
 from scenes.specs.course import moment
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, GROUND, Parameter
+from twin.main_job.report_labels import ANGLE, Parameter
 from twin.run.artefact import plain, significant
 
-__all__ = ["NOISE", "NOISE_ALONE", "assumed", "combination", "contradiction", "limits", "share_text", "shares_by_body"]
+__all__ = ["NOISE", "NOISE_ALONE", "assumed", "combination", "contradiction", "limits", "share_text"]
 
 NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""
@@ -77,51 +75,24 @@ def combination(run: RenderRun, camera: str, parameter: Parameter) -> np.ndarray
         camera: whose change; empty for the angle and the ground.
         parameter: which.
     """
-    names = list(run.experiment.instrument.cameras)
-    out = np.zeros(4 * len(names))
-    if camera:
-        k = KEYS.index(parameter.key)
-        out[4 * names.index(camera) + k] = PER_SI[k]
-    elif parameter == ANGLE:
-        ahead, behind = sorted(names, key=lambda name: -run.experiment.cameras[name].look_rad)
-        out[4 * names.index(ahead)], out[4 * names.index(behind)] = PER_SI[0], -PER_SI[0]
-    else:
-        ground = run.experiment.ground
-        assert ground is not None
-        first, second = (run.experiment.cameras[name].geometry.focal_length_m for name in names)
-        rows = ground.rows((first, second))
-        out[:] = rows[len(rows) // 2, AXES.index(GROUND[GROUND.index(parameter)].symbol)]
-    return out
+    group = camera or (ANGLE_GROUP if parameter == ANGLE else GROUND_GROUP)
+    found = quantities(run.experiment.cameras, run.experiment.ground)
+    return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, parameter.key))
 
 
 def limits(run: RenderRun, camera: str, parameter: Parameter) -> tuple[str, float]:
     """What the judged estimator leaves most of the variance of a change's error to, and its share: a body without the
-    base, or NOISE. Arguments as of `combination`.
+    base, or NOISE. Of a run that states disturbances; arguments as of `combination`.
     """
-    row = combination(run, camera, parameter)
-    gain = run.gains[run.judged]
-    seen = row @ gain
-    shares = {NOISE: float(seen @ run.recovery.shift_covariance[0] @ seen)}
     stated = run.experiment.disturbances
-    if stated is not None:
-        shares |= shares_by_body(row @ stated.error_root(gain), stated.bodies)
+    assert stated is not None
+    row, noise = combination(run, camera, parameter)[None], run.recovery.shift_covariance[0]
+    found = split(row, stated, noise, run.gains[run.judged])
+    variances = {NOISE: found.noise, **Split.by(found.after, stated.bodies)}
+    shares = {body: float(variance[0]) for body, variance in variances.items()}
     worst = max(shares, key=lambda body: shares[body])
     total = sum(shares.values())
     return worst.removeprefix(f"{BASE}/"), shares[worst] / total if total > 0.0 else 0.0
-
-
-def shares_by_body(left: np.ndarray, bodies: Sequence[str]) -> dict[str, float]:
-    """Body -> variance that its motions leave in an estimate, the square of the unit of ``left``.
-
-    Args:
-        left: (M,) errors by one standard deviation of each motion, independent of each other: a row of
-            `Disturbances.error_root`.
-        bodies: (M,) whose motions they are.
-    """
-    out: dict[str, float] = {}
-    for body, error in zip(bodies, left, strict=True):
-        out[body] = out.get(body, 0.0) + float(error) ** 2
-    return out
 
 
 def share_text(share: float) -> str:

@@ -125,9 +125,7 @@ class RenderRun:
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
         """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, at this measurement."""
-        spread, instrument = self.recovery.shift_covariance[0], self.experiment.instrument
-        own = {name: instrument.coordinates_of(name) for name in instrument.cameras}
-        return estimator_gains(self.experiment, {name: spread[np.ix_(at, at)] for name, at in own.items()})
+        return estimator_gains(self.experiment, self.recovery.shift_covariance[0])
 
     @cached_property
     def consistency(self) -> Consistency | None:

@@ -124,20 +124,17 @@ class CameraCrosstalk:
         return tuple(out)
 
 
-def estimator_gains(
-    experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray] | None = None
-) -> dict[str, np.ndarray]:
+def estimator_gains(experiment: MonitorExperiment, covariance: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, to first order.
 
     Args:
         experiment: the instrument, with what its job states to move.
-        covariance: camera -> (2 n, 2 n) px^2 of its n spots' shifts, which weighs them; None for no noise.
+        covariance: (2 x spots, 2 x spots) px^2 of their shifts, which weighs them; None for no noise.
     """
     spots = len(experiment.path.channels)
-    still, spread = np.zeros((1, spots, 2)), np.zeros((1, 2 * spots, 2 * spots))
-    shifts = Shifts(still, still, spread, experiment.cameras, experiment.disturbances)
-    for name, own in shifts.coordinates.items():
-        spread[0, own, own] = 0.0 if covariance is None else covariance[name]
+    still = np.zeros((1, spots, 2))
+    spread = np.zeros((2 * spots, 2 * spots)) if covariance is None else covariance
+    shifts = Shifts(still, still, spread[None], experiment.cameras, experiment.disturbances)
     used = applicable(experiment.cameras, experiment.disturbances)
     return {name: one.gain(shifts)[0] for name, one in used.items()}
 

@@ -25,6 +25,7 @@ from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.stated_disturbances import disturbances_of
+from twin.monitor.truth import ground_geometry
 from twin.sensors.area_detector import EmvaDetector
 
 NOISE = "noise"
@@ -94,10 +95,6 @@ class Information:
         """(D,) standard deviations of the spots' places, px."""
         return np.sqrt(np.diag(self.disturbances.spot_covariance))
 
-    def with_frames(self, times: float) -> Information:
-        """The same with so many times the frames, and no pattern that stays from one to the next."""
-        return replace(self, noise=self.noise / times)
-
 
 def _spread(rows: np.ndarray, covariance: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows))))
@@ -155,17 +152,12 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
 
 
 def ground_of(instrument: Instrument) -> GroundGeometry | None:
-    """How a pair of known altitude sees the ground; None for other instruments."""
-    spec, names = instrument.spec, list(instrument.cameras)
-    if spec.altitude is None or len(names) != 2:
-        return None
-    looks, fields = [], []
-    for name in names:
-        model = instrument.cameras[name]
-        line = model.spec.line
-        looks.append(spec.cameras[name].look)
-        fields.append(0.5 * line.pixels * line.pitch / model.line_focal_length)
-    return GroundGeometry(spec.altitude, (names[0], names[1]), (looks[0], looks[1]), (fields[0], fields[1]))
+    """How a pair of known altitude sees the ground, by the focal lengths along its lines; None for other instruments.
+
+    Raises:
+        InputError: its rays do not meet on the ground.
+    """
+    return ground_geometry(instrument, {name: model.line_focal_length for name, model in instrument.cameras.items()})
 
 
 def spot_noise(path: MonitorPath, detector: EmvaDetector, alike: bool = False) -> np.ndarray:

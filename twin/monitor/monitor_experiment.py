@@ -34,7 +34,7 @@ from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus
 from twin.monitor.motions import line_family
 from twin.monitor.stated_disturbances import disturbances_of
-from twin.monitor.truth import Truth, trace_truth, truth_jacobian
+from twin.monitor.truth import Truth, ground_geometry, trace_truth, truth_jacobian
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
@@ -159,20 +159,12 @@ class MonitorExperiment:
 
     @cached_property
     def ground(self) -> GroundGeometry | None:
-        """How a pair of known altitude sees the ground; None for other instruments, and where its rays do not meet."""
-        spec, names = self.instrument.spec, list(self.instrument.cameras)
-        if spec.altitude is None or len(names) != 2:
-            return None
-        looks = [spec.cameras[name].look for name in names]
-        field = []
-        for name in names:
-            line = self.instrument.cameras[name].spec.line
-            field.append(0.5 * line.pixels * line.pitch / self.nominal_truth.principal_distance[name])
-        try:
-            return GroundGeometry(spec.altitude, (names[0], names[1]), (looks[0], looks[1]), (field[0], field[1]))
-        except ValueError as error:
-            text = f"points on the ground cannot be located by these cameras ({error})"
-            raise spec.error(text, ("altitude",), allowed="cameras that look at the Earth from two sides") from error
+        """How a pair of known altitude sees the ground; None for other instruments.
+
+        Raises:
+            InputError: its rays do not meet on the ground.
+        """
+        return ground_geometry(self.instrument, self.nominal_truth.principal_distance)
 
     @cached_property
     def stated(self) -> StatedMotions | None:

@@ -50,6 +50,40 @@ class Truth:
         return geometry.found(lines[1:], lines[:1])
 
 
+def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[str, float]:
+    """Camera -> tangent of half the field along its line CCD.
+
+    Args:
+        instrument: the instrument.
+        distance: camera -> principal distance, metres.
+    """
+    lines = {name: model.spec.line for name, model in instrument.cameras.items()}
+    return {name: 0.5 * line.pixels * line.pitch / distance[name] for name, line in lines.items()}
+
+
+def ground_geometry(instrument: Instrument, distance: Mapping[str, float]) -> GroundGeometry | None:
+    """How a pair of known altitude sees the ground; None for other instruments.
+
+    Args:
+        instrument: the instrument.
+        distance: camera -> principal distance, metres.
+
+    Raises:
+        InputError: the rays of the two do not meet on the ground.
+    """
+    spec, names = instrument.spec, list(instrument.cameras)
+    if spec.altitude is None or len(names) != 2:
+        return None
+    first, second = names
+    fields = half_fields(instrument, distance)
+    looks = spec.cameras[first].look, spec.cameras[second].look
+    try:
+        return GroundGeometry(spec.altitude, (first, second), looks, (fields[first], fields[second]))
+    except ValueError as error:
+        text = f"points on the ground cannot be located by these cameras ({error})"
+        raise spec.error(text, ("altitude",), allowed="cameras that look at the Earth from two sides") from error
+
+
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
     """Trace the lines of sight of all cameras in all states.
 

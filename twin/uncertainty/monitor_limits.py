@@ -23,6 +23,7 @@ from scenes.models.instrument_model import MisplacedError
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.stated_disturbances import disturbances_of
+from twin.monitor.truth import half_fields
 
 BEST = "posterior"
 """The estimator of the least variance: what it leaves only another measurement takes away."""
@@ -165,7 +166,8 @@ def find_limits(
         Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
         Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),
     ]
-    field = limits.field_covariance(FIELD, cameras, _half_fields(experiment))
+    fields = half_fields(experiment.instrument, experiment.nominal_truth.principal_distance)
+    field = limits.field_covariance(FIELD, cameras, list(fields.values()))
     for name, gap, text in (
         ("field_now", 0.0, "a test field at the same time"),
         ("field_day", DAY, "a test field a day before"),
@@ -193,13 +195,6 @@ def find_limits(
 
 def _left(rows: np.ndarray, stated: Disturbances, noise: np.ndarray) -> np.ndarray:
     return limits.posterior_sigma(rows, stated, noise)
-
-
-def _half_fields(experiment: MonitorExperiment) -> list[float]:
-    """Tangent of half the field along the line of every camera."""
-    distance = experiment.nominal_truth.principal_distance
-    lines = {name: model.spec.line for name, model in experiment.instrument.cameras.items()}
-    return [0.5 * line.pixels * line.pitch / distance[name] for name, line in lines.items()]
 
 
 def _own(stated: Disturbances) -> list[bool]:
