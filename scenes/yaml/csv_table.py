@@ -1,0 +1,269 @@
+"""Tables of measured numbers from CSV files: heads with units, `time [s], x [mm]`, and one row for each reading.
+
+Columns may stand in any order and in any unit of their kind; numbers come out in SI units. Lines that are empty or
+begin with # are left out. A million rows take some seconds.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import stat
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
+from scenes.yaml.units import Kind, parse_quantity, unit_ratio
+
+LARGEST_TABLE = 1 << 30
+"""Bytes."""
+_HEAD = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
+_DELIMITERS = (",", ";", "\t")
+_LEAST, _MOST = -np.inf, np.inf
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column that a table may have.
+
+    Attributes:
+        name: its head, without the unit.
+        kind: of the quantity; its head then ends in a unit in square brackets. None for numbers without a unit.
+        text: whether it holds names and not numbers.
+        needed: whether a table without it is refused.
+        least, most: of its numbers, both allowed, SI units.
+        whole: whether its numbers are whole.
+    """
+
+    name: str
+    kind: Kind | None = None
+    text: bool = False
+    needed: bool = True
+    least: float = _LEAST
+    most: float = _MOST
+    whole: bool = False
+
+    @property
+    def head(self) -> str:
+        """An example of its head."""
+        return self.name if self.kind is None else f"{self.name} [{self.kind.units[0]}]"
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What a table holds.
+
+    Attributes:
+        file: its path, as the user gave it.
+        lines: (N,) line of each row in the file, counted from 1.
+        heads: name of a column -> its head as it stands in the file.
+        columns: name -> (N,) numbers in SI units, or names; those that the file does not have are missing.
+    """
+
+    file: str
+    lines: np.ndarray
+    heads: Mapping[str, str]
+    columns: Mapping[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.columns[name]
+
+    def stacked(self, *names: str) -> np.ndarray:
+        """(N, K) of K columns of numbers."""
+        return np.stack([self.columns[name] for name in names], axis=-1)
+
+    def error(
+        self,
+        row: int,
+        name: str,
+        problem: str,
+        found: str | None = None,
+        allowed: str | None = None,
+        suggestion: str | None = None,
+    ) -> InputError:
+        """What is wrong with a cell, or with the whole row for an empty name."""
+        key = (self.heads[name],) if name else ()
+        return InputError(Issue(problem, self.file, int(self.lines[row]), key, found, allowed, suggestion))
+
+
+def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1) -> Table:
+    """A table of a file.
+
+    Args:
+        path: of the file, UTF-8 text with commas, semicolons or tabs between its cells.
+        columns: that it may have; another one is refused.
+        least_rows: that it must have.
+
+    Raises:
+        InputError: the file cannot be read, a needed column is missing, a cell holds no number or one that is not
+            allowed; with the line and the head of the column.
+    """
+    file = str(path)
+    lines, rows = _rows(file, _text(path))
+    allowed = ", ".join(repr(c.head) + ("" if c.needed else " (may be missing)") for c in columns)
+    if not rows:
+        raise InputError(Issue("an empty table", file, 1, allowed=f"a row of heads: {allowed}"))
+    found = _heads(file, lines[0], rows[0], columns, allowed)
+    if len(rows) <= least_rows:
+        text = f"{len(rows) - 1} rows below the heads"
+        raise InputError(Issue(text, file, lines[0], allowed=f"{least_rows} or more"))
+    width, body = len(rows[0]), rows[1:]
+    uneven = next((k for k, row in enumerate(body) if len(row) != width), None)
+    if uneven is not None:
+        text = f"{len(body[uneven])} cells under {width} heads"
+        allowed = "as many cells as heads, and a point in decimal numbers"
+        raise InputError(Issue(text, file, lines[1 + uneven], allowed=allowed))
+    cells = list(zip(*body, strict=True))
+    numbers = np.array(lines[1:])
+    values = {
+        column.name: _values(file, numbers, rows[0][k].strip(), column, cells[k], factor) for column, k, factor in found
+    }
+    heads = {column.name: rows[0][k].strip() for column, k, _ in found}
+    return Table(file, numbers, FrozenMap(heads), FrozenMap(values))
+
+
+def _text(path: str | Path) -> str:
+    file = str(path)
+    try:
+        if not stat.S_ISREG(Path(path).stat().st_mode):
+            raise InputError(Issue("is not a regular file", file, allowed="a CSV file"))
+        with Path(path).open("rb") as stream:
+            content = stream.read(LARGEST_TABLE + 1)
+    except FileNotFoundError:
+        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path)))) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
+    if len(content) > LARGEST_TABLE:
+        raise InputError(Issue("too large", file, allowed="at most 1 GB"))
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError(Issue(f"not UTF-8 text: byte 0x{content[error.start]:02x}", file, line)) from None
+
+
+def _file_beside(path: Path) -> str | None:
+    """The table in the same folder that was probably meant."""
+    try:
+        meant = nearest(path.name, [place.name for place in path.parent.iterdir() if place.suffix == path.suffix])
+    except (OSError, ValueError):
+        return None
+    return None if meant is None else str(path.parent / meant)
+
+
+def _rows(file: str, text: str) -> tuple[list[int], list[list[str]]]:
+    """Lines and cells of the rows that hold something."""
+    first = next((row for row in text.splitlines() if row.strip() and not row.lstrip().startswith("#")), "")
+    delimiter = next((sign for sign in _DELIMITERS if sign in first), ",")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    lines, rows = [], []
+    try:
+        for row in reader:
+            if row and any(row) and not row[0].lstrip().startswith("#") and any(map(str.strip, row)):
+                lines.append(reader.line_num)
+                rows.append(row)
+    except csv.Error as error:
+        raise InputError(Issue(f"not a CSV file: {error}", file, reader.line_num)) from None
+    return lines, rows
+
+
+def _heads(
+    file: str, line: int, heads: Sequence[str], columns: Sequence[Column], allowed: str
+) -> list[tuple[Column, int, float]]:
+    """The columns that stand in the file, where, and what their numbers are multiplied by."""
+    known = {column.name: column for column in columns}
+    found: list[tuple[Column, int, float]] = []
+    for k, head in enumerate(heads):
+        text = head.strip()
+        match = _HEAD.fullmatch(text)
+        name = "" if match is None else match["name"]
+        if match is None or name not in known:
+            meant = nearest(name, known)
+            issue = Issue("no such column", file, line, (text,), shown(text), allowed, meant and known[meant].head)
+            raise InputError(issue)
+        column = known[name]
+        if any(column is other for other, _, _ in found):
+            raise InputError(Issue("another column holds the same", file, line, (text,)))
+        found.append((column, k, _factor(file, line, text, column, match["unit"])))
+    missing = next((c for c in columns if c.needed and not any(c is other for other, _, _ in found)), None)
+    if missing is not None:
+        have = names_text([head.strip() for head in heads])
+        raise InputError(Issue(f"no column {missing.head!r}", file, line, found=have, allowed=allowed))
+    return found
+
+
+def _factor(file: str, line: int, head: str, column: Column, unit: str | None) -> float:
+    """From the unit of a head to the SI unit."""
+    if column.kind is None:
+        if unit is not None:
+            raise InputError(Issue("this column has no unit", file, line, (head,), shown(unit), repr(column.head)))
+        return 1.0
+    if not unit:
+        raise InputError(Issue("a head without a unit", file, line, (head,), allowed=repr(column.head)))
+    try:
+        parse_quantity(f"1 {unit.strip()}", column.kind)
+        return unit_ratio(unit.strip(), column.kind.si)
+    except Problem as problem:
+        allowed = names_text(column.kind.units)
+        issue = Issue(problem.problem, file, line, (head,), problem.found, allowed, problem.suggestion)
+        raise InputError(issue) from None
+
+
+def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequence[str], factor: float) -> np.ndarray:
+    """SI numbers, or names, of a column."""
+
+    def wrong(row: int, problem: str, allowed: str | None = None) -> InputError:
+        return InputError(Issue(problem, file, int(lines[row]), (head,), shown(cells[row].strip()), allowed))
+
+    if column.text:
+        names = [cell.strip() for cell in cells]
+        if "" in names:
+            raise wrong(names.index(""), "an empty cell", "a name")
+        return np.array(names, dtype=object)
+    try:
+        numbers = np.array(list(map(float, cells)))
+    except ValueError:
+        row = next(k for k, cell in enumerate(cells) if not _is_number(cell))
+        comma = ", with a point and not a comma" if "," in cells[row] else ""
+        raise wrong(row, "not a number", f"a number{comma}") from None
+    odd = next((k for k, cell in enumerate(cells) if "_" in cell), None)
+    if odd is not None:  # Python takes 1_000 for a number
+        raise wrong(odd, "not a number", "a number")
+    # Degrees Celsius are the one unit with an offset; no table has absolute temperatures.
+    numbers = numbers * factor
+    for bad, problem in (
+        (~np.isfinite(numbers), "not a finite number"),
+        ((numbers < column.least) | (numbers > column.most), "out of range"),
+        (column.whole & (numbers != np.floor(numbers)), "not a whole number"),
+    ):
+        if np.any(bad):
+            row = int(np.argmax(bad))
+            raise wrong(row, problem, _range(column, factor) if problem == "out of range" else "a number")
+    return numbers
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _range(column: Column, factor: float) -> str:
+    low, high = column.least / factor, column.most / factor
+    if np.isinf(high):
+        return f"at least {low:g}"
+    return f"at most {high:g}" if np.isinf(low) else f"{low:g} to {high:g}"

@@ -1,0 +1,94 @@
+"""Tables of measured numbers: any order of columns, any unit, and errors with line and column."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scenes.yaml.csv_table import Column, Table, read_table
+from scenes.yaml.errors import InputError
+from scenes.yaml.units import ANGLE, LENGTH
+
+COLUMNS = (
+    Column("point", text=True),
+    Column("x", LENGTH),
+    Column("turn", ANGLE, needed=False),
+    Column("count", needed=False, least=0.0, most=9.0, whole=True),
+)
+
+
+def _read(folder: Path, text: str | bytes, least_rows: int = 1) -> Table:
+    path = folder / "table.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_table(path, COLUMNS, least_rows)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_units_order_comments_and_delimiters_do_not_matter(tmp_path: Path, delimiter: str) -> None:
+    one = _read(tmp_path, "point,x [mm],turn [arcsec],count\na,1.5,2,3\nb,-2,0,9\n")
+    text = "# measured\n\n count, turn [deg] ,x [um],point\r\n3,0.000555555555555555555,1500,a\r\n\r\n9,0,-2000,b"
+    two = _read(tmp_path, "\ufeff" + text.replace(",", delimiter))
+    assert list(one["point"]) == list(two["point"]) == ["a", "b"]
+    for name in ("x", "turn", "count"):
+        np.testing.assert_allclose(one[name], two[name], rtol=1e-15)
+    np.testing.assert_allclose(one.stacked("x", "count"), [[1.5e-3, 3.0], [-2e-3, 9.0]], rtol=1e-15)
+    assert list(one.lines) == [2, 3]
+    assert list(two.lines) == [4, 6]
+    assert "turn" in one
+    assert "turn" not in _read(tmp_path, "point,x [m]\na,1\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "parts"),
+    [
+        ("", 1, ["empty table", "x [um]"]),
+        ("point,x [mm]\n", 1, ["0 rows"]),
+        ("point,y [mm]\na,1\n", 1, ["no such column", "y [mm]"]),
+        ("point,turns [arcsec]\na,1\n", 1, ["did you mean 'turn [arcsec]'"]),
+        ("point,x\na,1\n", 1, ["without a unit", "x [um]"]),
+        ("point,x [arcsec]\na,1\n", 1, ["unit of an angle"]),
+        ("point,x [mmm]\na,1\n", 1, ["unknown unit"]),
+        ("point,x [m],x [mm]\na,1,1\n", 1, ["another column"]),
+        ("point,x [m],count [m]\na,1,1\n", 1, ["has no unit"]),
+        ("x [m],count\n1,1\n", 1, ["no column 'point'"]),
+        ("point,x [m]\na,1\nb\n", 3, ["1 cells under 2 heads"]),
+        ("point,x [m]\na,1\nb,1,5\n", 3, ["3 cells under 2 heads", "point in decimal"]),
+        ('point;x [m]\na;1\nb;"1,5"\n', 3, ["not a number", "not a comma"]),
+        ("point,x [m]\na,1\nb,one\n", 3, ["x [m]", "'one'", "not a number"]),
+        ("point,x [m]\na,\n", 2, ["not a number"]),
+        ("point,x [m]\na,1_0\n", 2, ["not a number"]),
+        ("point,x [m]\na,nan\n", 2, ["finite"]),
+        ("point,x [m]\na,1e999\n", 2, ["finite"]),
+        ("point,x [m]\n ,1\n", 2, ["empty cell"]),
+        ("point,x [m],count\na,1,10\n", 2, ["out of range", "0 to 9"]),
+        ("point,x [m],count\na,1,1.5\n", 2, ["whole"]),
+        ('point,x [m]\n"a,1\n', 2, ["not a CSV file"]),
+        (b"point,x [m]\na,\xff\n", 2, ["UTF-8"]),
+    ],
+)
+def test_errors_name_file_line_and_column(tmp_path: Path, text: str | bytes, line: int, parts: list[str]) -> None:
+    with pytest.raises(InputError) as error:
+        _read(tmp_path, text)
+    assert error.value.line == line
+    assert error.value.file.endswith("table.csv")
+    for part in parts:
+        assert part in str(error.value)
+
+
+def test_missing_file_names_the_one_that_was_meant(tmp_path: Path) -> None:
+    (tmp_path / "angles.csv").write_text("x")
+    with pytest.raises(InputError, match=r"angles\.csv"):
+        read_table(tmp_path / "angels.csv", COLUMNS)
+    with pytest.raises(InputError, match="regular"):
+        read_table(tmp_path, COLUMNS)
+
+
+def test_a_long_table_takes_seconds(tmp_path: Path) -> None:
+    path = tmp_path / "long.csv"
+    path.write_text("point,x [mm],count\n" + "p1,12.25,4\n" * 200_000)
+    start = time.process_time()
+    table = read_table(path, COLUMNS)
+    assert time.process_time() - start < 5.0  # 0.4 s on a quiet core
+    assert len(table) == 200_000
+    assert table["x"][-1] == 12.25e-3
