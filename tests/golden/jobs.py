@@ -94,6 +94,7 @@ ALL = (
     _job("orbit_calibrate_strip", f"twin.orbit calibrate {RUN % 'calibrate_strip'}"),
     _job("orbit_calibrate_images", f"twin.orbit calibrate {RUN % 'calibrate_images'}"),
     _job("orbit_monitor", f"twin.orbit monitor {RUN % 'monitor'}"),
+    _job("orbit_export", f"twin.orbit export {RUN % 'angle_gf7'}"),
     _job("study_render", f"twin.study {RUN % 'study_render'} --workers 1"),
     _job("study_lab", f"twin.study {RUN % 'study_lab'} --workers 1 --quiet"),
     _job("study_orbit", f"twin.study {RUN % 'study_orbit'} --workers 2 --json"),

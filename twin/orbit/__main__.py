@@ -172,7 +172,7 @@ def export(
         numbers = {**export_numbers(run), "verdict": shown.verdict}
         for name, content in export_files(run).items():
             session.folder.write_bytes(name, content)
-        ends = f"--lowest '{run.heights[0]!r} m' --highest '{run.heights[2]!r} m'"
+        ends = "" if heights is None else f"--lowest '{heights[0]!r} m' --highest '{heights[1]!r} m'"
         again = reproduce(PROGRAM, "export", str(source), ends, "--truth" if truth else "", f"--seed {read.seed}")
         name = session.backend.name
         facts = RunFacts(

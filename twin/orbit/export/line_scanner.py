@@ -233,8 +233,9 @@ def _fitted(sensor: Sensor, pitch: float, height: float, seconds: Array) -> Effe
 def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> tuple[Array, Array]:
     """Stations (N, 3), and unit directions (N, K, 3) from them to what the pixels (K,) see at a height, ITRS."""
     count = len(seconds)
-    nodes = replace(sensor, line_time=float(seconds[1] - seconds[0]), first_line_time=float(seconds[0]), lines=count)
-    nodes = _inside(nodes, seconds)
+    step = float(seconds[1] - seconds[0])
+    way = _AtNodes(sensor, seconds)
+    nodes = replace(sensor, trajectory=way, line_time=step, first_line_time=float(seconds[0]), lines=count)
     at, which = (v.ravel() for v in np.meshgrid(np.arange(float(count)), pixel, indexing="ij"))
     ground = nodes.ground(at, which, height).reshape(count, len(pixel), 3)
     if not np.all(np.isfinite(ground)):
@@ -300,8 +301,9 @@ def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple
     seconds = sensor.time(at)
     here = _image(camera, seconds, ground)
     later = _image(camera, seconds + sensor.line_time, ground)
-    sample = here[:, 1] - (which - 0.5 * (camera.pixels - 1))
+    # the line on which the model sees the point, and what of its pixel the image moves by until then
     lines = here[:, 0] / (here[:, 0] - later[:, 0])
+    sample = here[:, 1] + lines * (later[:, 1] - here[:, 1]) - (which - 0.5 * (camera.pixels - 1))
     return ModelError(height, float(np.max(np.abs(sample))), float(np.max(np.abs(lines))))
 
 
@@ -331,10 +333,6 @@ class _AtNodes:
 
     def body_to_itrs(self, seconds: Array) -> Array:
         return self._known.body_to_itrs(np.clip(seconds, self._first, self._last))
-
-
-def _inside(sensor: Sensor, seconds: Array) -> Sensor:
-    return replace(sensor, trajectory=_AtNodes(sensor, seconds))
 
 
 def _isd(
