@@ -36,6 +36,12 @@ def _bars(folder: Path) -> None:
     tifffile.imwrite(folder / "bars.tiff", np.rint(2000.0 + 40000.0 * wave).astype(np.uint16))
 
 
+def _pass(folder: Path) -> None:
+    """The run folder of a small simulated pass."""
+    words = ["twin.orbit", "simulate", f"{JOBS}/simulate.yaml", "--out", str(folder / "pass"), "--quiet"]
+    subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
+
+
 @dataclass(frozen=True)
 class Job:
     """One command.
@@ -94,7 +100,8 @@ ALL = (
     _job("orbit_calibrate_strip", f"twin.orbit calibrate {RUN % 'calibrate_strip'}"),
     _job("orbit_calibrate_images", f"twin.orbit calibrate {RUN % 'calibrate_images'}"),
     _job("orbit_monitor", f"twin.orbit monitor {RUN % 'monitor'}"),
-    _job("orbit_export", f"twin.orbit export {RUN % 'angle_gf7'}"),
+    _job("orbit_export", "twin.orbit export {here}/pass --out {out}", prepare=_pass),
+    _job("orbit_export_traced", f"twin.orbit export {RUN % 'angle_gf7'}"),
     _job("study_render", f"twin.study {RUN % 'study_render'} --workers 1"),
     _job("study_lab", f"twin.study {RUN % 'study_lab'} --workers 1 --quiet"),
     _job("study_orbit", f"twin.study {RUN % 'study_orbit'} --workers 2 --json"),
