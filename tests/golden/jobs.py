@@ -21,6 +21,7 @@ LIMIT = 900.0
 
 def _edge(folder: Path) -> None:
     """A slanted edge with even noise, in 16 bits. Rounded to whole numbers it is the same on every processor."""
+    (folder / "out").mkdir()  # where the command writes its curve; it makes no run folder
     rows, columns = np.mgrid[0:96, 0:96]
     across = columns - 47.6 - np.tan(np.radians(5.0)) * (rows - 48)
     light = 4000.0 + 20000.0 * (1.0 + np.tanh(across / 1.3))
@@ -30,6 +31,7 @@ def _edge(folder: Path) -> None:
 
 def _bars(folder: Path) -> None:
     """Bars of period 4 pixels, slightly tilted, beside an even dark and an even bright patch."""
+    (folder / "out").mkdir()
     rows, columns = np.mgrid[0:96, 0:128]
     wave = 0.5 + 0.3 * np.sin(2.0 * np.pi * (columns + 0.05 * rows) / 4.0)
     wave = np.where(columns >= 112, 1.0, np.where(columns >= 96, 0.0, wave))
@@ -151,7 +153,6 @@ def run(job: Job, here: Path) -> Done:
     """
     out = here / "out"
     if job.prepare is not None:
-        out.mkdir()
         job.prepare(here)
     places = {"jobs": JOBS, "out": str(out), "here": str(here)}
     words = [word.format(**places) for word in job.words]
