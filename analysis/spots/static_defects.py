@@ -1,0 +1,337 @@
+"""What is the same in all frames of a spot and is not the spot: bad pixels, columns and rows, an uneven background,
+reflections.
+
+Everything is looked for in the residuals of the fitted shape. A pixel is bad when it differs from what the pixels about
+it predict: light comes through the optics and has no detail of one pixel. Whether an uneven background or a reflection
+is there is decided by what it explains of chi-square. Each test finds something in one of 1 / FALSE_ALARM clean images;
+where something was found, pixels are then left out from `CLOSER` sigmas on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, signal
+from scipy.stats import chi2, norm
+
+from analysis.spots import spot_image
+from analysis.spots.frame_screening import FALSE_ALARM, Finding, ScreenedFrames
+from analysis.spots.noise import NoiseModel
+from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
+from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_template import SpotTemplate
+
+__all__ = ["Examined", "examine", "refit"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+CLOSER = 4.5
+"""Sigmas of a pixel from which it is left out of an image that is known to hold defects."""
+MOST_OTHERS = 3
+"""Reflections that are fitted."""
+NEAREST_PX = 4.0
+"""Nearer lights are not told from the spot."""
+_REACH = 2
+_MISFIT = 0.05
+"""Share of the residual around a pixel by which its prediction may be wrong."""
+_ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
+_LINE_SHARE = 0.4
+"""Of the pixels of a column or row: if so many are bad, all are."""
+_ABOVE_RING = 6.0
+"""Of a reflection over what else is left over at the same distance from the spot, in its own scatter."""
+_ROUNDS = 6
+
+
+def _prediction() -> Array:
+    """(5, 5) weights by which a pixel is predicted from those about it, by a quadratic surface through them."""
+    row, column = np.mgrid[-_REACH : _REACH + 1, -_REACH : _REACH + 1].reshape(2, -1).astype(np.float64)
+    around = (row != 0) | (column != 0)
+    design = np.stack([np.ones_like(row), row, column, row * row, row * column, column * column])[:, around]
+    out = np.zeros(row.size)
+    out[around] = np.linalg.pinv(design.T)[0]
+    return out.reshape(2 * _REACH + 1, -1)
+
+
+_PREDICTION = _prediction()
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """A spot in one state.
+
+    Attributes:
+        screened: its frames.
+        good: (H, W) pixels that are used.
+        static: (H, W) pixels that were found bad here, which are bad in all states.
+        fit: of the spot.
+        findings: of the frames and here.
+    """
+
+    screened: ScreenedFrames
+    good: Mask
+    static: Mask
+    fit: ScreenedFit
+    findings: tuple[Finding, ...]
+
+    @property
+    def clean(self) -> bool:
+        """Whether the measurement is that of clean frames."""
+        return not any(finding.corrects for finding in self.findings)
+
+
+def examine(
+    screened: ScreenedFrames,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    vibration: bool = False,
+    own: bool = False,
+    searched: bool = True,
+) -> Examined:
+    """Find what is in an image beside the spot.
+
+    Args:
+        screened: frames of one state.
+        noise: of the detector.
+        template: the spot's one shape.
+        vibration: whether smear is fitted.
+        own: whether the shape was learnt from this very image, so that residuals of it say nothing.
+        searched: whether anything is looked for; else what is known already is left out and fitted.
+
+    Raises:
+        SpotError: no spot, or it cannot be measured.
+    """
+    mean = screened.mean
+    good = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
+    terms = FitTerms(smear=(vibration or bool(np.any(screened.jitter))) and not own)
+    pixels = np.zeros_like(good)
+    lines = np.zeros_like(good)
+    limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
+    dirty = not screened.clean or not np.array_equal(good, screened.good)
+    fit = _fitted(screened, good, noise, template, terms)
+    for _ in range(_ROUNDS if searched else 0):
+        before = (int(np.count_nonzero(good)), terms)
+        found = _outliers(mean, fit, good, CLOSER if dirty else limit)
+        stripes = _lines(mean, fit, good & ~found, screened.good & ~(good & ~found))
+        good = good & ~found & ~stripes
+        dirty = dirty or bool(np.any(found | stripes))
+        pixels, lines = pixels | found, lines | stripes
+        if np.any(found | stripes):
+            fit = _fitted(screened, good, noise, template, terms, fit)
+        if not own:
+            terms, fit = _uneven(screened, good, noise, template, terms, fit)
+            terms, fit = _others(screened, good, noise, template, terms, fit)
+        dirty = dirty or terms.background > 0 or bool(terms.others)
+        if (int(np.count_nonzero(good)), terms) == before:
+            break
+    bad = screened.good & ~good
+    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, lines, fit)))
+
+
+def refit(
+    examined: Examined, static: Mask, noise: NoiseModel, template: SpotTemplate, told: tuple[Finding, ...] = ()
+) -> Examined:
+    """The same with further pixels left out, that are bad in another state.
+
+    Args:
+        examined: a spot.
+        static: (H, W) pixels that are bad.
+        noise: of the detector.
+        template: the spot's one shape.
+        told: what is to be said of it.
+
+    Raises:
+        SpotError: too few pixels are left.
+    """
+    good = examined.good & ~static
+    terms = replace(examined.fit.terms, others=tuple((float(r), float(c)) for r, c, _ in examined.fit.others))
+    fit = _fitted(examined.screened, good, noise, template, terms, examined.fit)
+    return Examined(examined.screened, good, examined.static | static, fit, (*examined.findings, *told))
+
+
+def _fitted(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    near: ScreenedFit | None = None,
+) -> ScreenedFit:
+    start = None if near is None else (float(near.positions.row[0]), float(near.positions.column[0]))
+    return fit_screened(
+        screened.mean, screened.counts, good, noise, template, terms, start=start, jitter=screened.jitter
+    )
+
+
+def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
+    """Gross defects away from the spot, which would draw the first fit."""
+    filled = spot_image.filled(mean, screened.good)
+    smooth = ndimage.median_filter(filled, 5)
+    sigma = np.sqrt(noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth))
+    steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
+    out = np.abs(mean - smooth) > _ROUGH_SIGMAS * sigma + steep
+    top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
+    row, column = np.indices(mean.shape)
+    return np.asarray(out & screened.good & (np.hypot(row - top[0], column - top[1]) > _ROUGH_PX))
+
+
+def _outliers(mean: Array, fit: ScreenedFit, good: Mask, limit: float) -> Mask:
+    """Pixels that are not as those about them say, the worst of each neighbourhood first."""
+    use = good.copy()
+    variance = np.where(np.isfinite(fit.variance), fit.variance, 0.0)
+    found = np.zeros_like(good)
+    for _ in range(50):
+        residual = np.where(use, mean - fit.level, 0.0)
+        if not np.all(use):
+            residual = spot_image.filled(residual, use)
+        around = ndimage.convolve(residual, _PREDICTION, mode="nearest")
+        spread = variance + ndimage.convolve(np.where(use, variance, 0.0), _PREDICTION**2, mode="nearest")
+        spread += (_MISFIT * around) ** 2
+        z = np.where(use, np.abs(residual - around) / np.sqrt(np.maximum(spread, 1e-300)), 0.0)
+        new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _REACH + 1))
+        if not np.any(new):
+            break
+        found |= new
+        use &= ~new
+    return found
+
+
+def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
+    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted."""
+    out = np.zeros_like(good)
+    sigma = np.sqrt(np.where(np.isfinite(fit.variance), fit.variance, 1.0))
+    z = np.where(good, (mean - fit.level) / sigma, np.nan)
+    for axis in (0, 1):
+        size = z.shape[axis]
+        limit = float(norm.isf(FALSE_ALARM / (2.0 * z.shape[1 - axis])))
+        with np.errstate(invalid="ignore"):
+            count = np.count_nonzero(good, axis=axis)
+            middle = np.array([np.median(one[np.isfinite(one)]) if np.any(np.isfinite(one)) else 0.0
+                               for one in np.moveaxis(z, 1 - axis, 0)])  # fmt: skip
+        smooth = ndimage.median_filter(middle, 9, mode="nearest")
+        scale = np.sqrt(math.pi / 2.0 * (1.0 / np.maximum(count, 1) + 1.5 / (9.0 * size)))
+        off = (np.abs(middle - smooth) > limit * scale) & (count > 0.25 * size)
+        off |= np.count_nonzero(bad, axis=axis) > _LINE_SHARE * size
+        if np.count_nonzero(off) <= 0.2 * off.size:
+            out |= np.expand_dims(off, axis)
+    return np.asarray(out & good)
+
+
+def _uneven(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    fit: ScreenedFit,
+) -> tuple[FitTerms, ScreenedFit]:
+    """Slopes and curvature of the background, where they explain more than chance does."""
+    for order, more in ((1, 2), (2, 3)):
+        if terms.background >= order:
+            continue
+        wider = replace(terms, background=order)
+        tried = _fitted(screened, good, noise, template, wider, fit)
+        if fit.explains(screened.mean) - tried.explains(screened.mean) <= chi2.isf(FALSE_ALARM, more):
+            # a bend without a slope is tried as well
+            if order == 1:
+                continue
+            break
+        if (
+            order == 1
+            or terms.background == 1
+            or fit.explains(screened.mean) - tried.explains(screened.mean) > chi2.isf(FALSE_ALARM, 5)
+        ):
+            terms, fit = wider, tried
+    return terms, fit
+
+
+def _others(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    fit: ScreenedFit,
+) -> tuple[FitTerms, ScreenedFit]:
+    """Further spots, the brightest first, where they explain more than chance does."""
+    while len(terms.others) < MOST_OTHERS:
+        place = _second_light(screened.mean, fit, good, template)
+        if place is None:
+            break
+        wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), place))
+        try:
+            tried = _fitted(screened, good, noise, template, wider, fit)
+        except SpotError:
+            break
+        row, column, share = tried.others[-1]
+        away = math.hypot(row - tried.positions.row[0], column - tried.positions.column[0])
+        gain = fit.explains(screened.mean) - tried.explains(screened.mean)
+        if share <= 0.0 or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
+            break
+        terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
+        fit = tried
+    return terms, fit
+
+
+def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate) -> tuple[float, float] | None:
+    """Where the residuals look most like another spot; None where they do not."""
+    height, width = mean.shape
+    middle = (height // 2, width // 2)
+    stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
+    reach = min(20, *middle)
+    stamp = stamp[middle[0] - reach : middle[0] + reach + 1, middle[1] - reach : middle[1] + reach + 1]
+    weight = np.where(np.isfinite(fit.variance), 1.0 / fit.variance, 0.0)
+    turned = stamp[::-1, ::-1]
+    amplitude = signal.fftconvolve((mean - fit.level) * weight, turned, mode="same")
+    power = np.maximum(signal.fftconvolve(weight, turned**2, mode="same"), 1e-300)
+    score = np.where(power > 0.3 * np.median(power), amplitude / np.sqrt(power), 0.0)
+    row, column = np.indices(mean.shape)
+    away = np.hypot(row - fit.positions.row[0], column - fit.positions.column[0])
+    score = np.where(good & (away > NEAREST_PX), score, 0.0)
+    limit = float(norm.isf(FALSE_ALARM / mean.size))
+    for _ in range(5):
+        top = np.unravel_index(int(np.argmax(score)), score.shape)
+        if score[top] <= limit:
+            return None
+        # what a spot of another shape leaves over lies all around it
+        ring = (np.abs(away - away[top]) < 3.0) & (np.hypot(row - top[0], column - top[1]) > 8.0)
+        rest = 1.4826 * float(np.median(np.abs(score[ring]))) if np.count_nonzero(ring) > 20 else 1.0
+        if score[top] > _ABOVE_RING * max(rest, 1.0):
+            return float(top[0]), float(top[1])
+        score = np.where(np.hypot(row - top[0], column - top[1]) > 4.0, score, 0.0)
+    return None
+
+
+def _told(bad: Mask, lines: Mask, fit: ScreenedFit) -> list[Finding]:
+    """What was found, in words."""
+    out = []
+    full = [np.flatnonzero((lines & bad).sum(axis=axis) > 0.25 * bad.shape[axis]) for axis in (0, 1)]
+    single = int(np.count_nonzero(bad & ~lines))
+    if single:
+        where = np.argwhere(bad & ~lines)[:3]
+        shown = ", ".join(f"({r}, {c})" for r, c in where)
+        more = ", ..." if single > 3 else ""
+        out.append(Finding("bad pixels", f"{single} hot, dead or otherwise off are left out: {shown}{more}"))
+    for numbers, name in zip(full, ("columns", "rows"), strict=True):
+        if numbers.size:
+            shown = ", ".join(map(str, numbers[:5]))
+            out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are left out"))
+    if fit.terms.background:
+        what = "slopes" if fit.terms.background == 1 else "slopes and curvature"
+        rise = float(np.ptp(np.where(np.isfinite(fit.variance), fit.level, np.nan)[[0, 0, -1, -1], [0, -1, 0, -1]]))
+        size = f", {rise:.2g} DN between the corners" if math.isfinite(rise) else ""
+        out.append(Finding("uneven background", f"its {what} are fitted{size}"))
+    for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
+        out.append(
+            Finding(
+                "second light",
+                f"at row {row:.1f}, column {column:.1f} with {100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light; "
+                "it is fitted",
+            )
+        )
+    if fit.terms.smear:
+        rows, columns = (math.sqrt(max(fit.smear[k, k], 0.0)) for k in (0, 1))
+        out.append(Finding("smear", f"{rows:.2f} px along the rows' axis and {columns:.2f} px along the columns' rms"))
+    return out
