@@ -38,6 +38,9 @@ _UNLIKE = 0.01
 _FEWEST_UNLIKE = 40
 _BORDER_PX = 4
 _SATURATION_SIGMAS = 4.0
+_MOST_MOVES, _SMALL_PX, _LARGEST_PX = 4, 0.1, 5.0
+"""A frame that has moved by more than the second is compared with the reference there, so often at most, up to the
+third."""
 _MEDIAN = math.pi / 2.0
 """Variance of a median over that of a mean, of many normal numbers."""
 
@@ -227,7 +230,8 @@ class _Compared:
 
 def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Compared:
     count = len(values)
-    usable = finite & ~bad
+    # what is saturated does not follow the light
+    usable = finite & ~bad & ~_saturated(values, noise)
     threshold = float(norm.isf(FALSE_ALARM / (2.0 * values.size)))
     if count > 2:
         reference = np.broadcast_to(
@@ -241,15 +245,22 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
     z = np.empty_like(values)
     for k, frame in enumerate(values):
-        basis = _basis(reference[k])
         weight = usable[k] / (excess * noise.temporal_variance_dn2(reference[k], 1))
-        solution, inverse = _robust(basis, frame, weight)
+        place = np.zeros(2)
+        for _ in range(_MOST_MOVES):
+            shifted = ndimage.shift(reference[k], place, order=3, mode="nearest") if np.any(place) else reference[k]
+            basis = _basis(shifted)
+            solution, inverse = _robust(basis, frame, weight)
+            further = -solution[1:3] / solution[0]
+            if np.max(np.abs(further)) < _SMALL_PX or np.max(np.abs(place + further)) > _LARGEST_PX:
+                break
+            place = place + further
         model[k] = np.tensordot(solution, basis, 1)
         sigma = np.sqrt(excess * noise.temporal_variance_dn2(model[k], 1))
         z[k] = np.where(usable[k], (frame - model[k]) / sigma, 0.0)
         light[k], level[k] = solution[0], solution[-1]
         # a spot that has moved by d is its reference minus d times the slope
-        offset[k] = -solution[1:3] / solution[0]
+        offset[k] = place + further
         spread[k] = inverse[1:3, 1:3] / solution[0] ** 2
     # of two frames that differ the brighter one was struck
     struck = z > threshold if count == 2 else np.abs(z) > threshold
@@ -299,7 +310,9 @@ def _jitter(offset: Array, spread: Array, count: int) -> Array:
     if chi <= chi2.isf(FALSE_ALARM, 2 * (count - 1)):
         return np.zeros((2, 2))
     value, vector = np.linalg.eigh(away.T @ away / (count - 1) - spread.mean(axis=0))
-    return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
+    # known from few frames only: what makes the mean of the error's square over it 1 (Hotelling's T^2 in a plane)
+    few = (count - 1) / max(count - 4, 0.5)
+    return np.asarray((vector * np.maximum(value, 0.0) * few) @ vector.T)
 
 
 def _saturated(values: Array, noise: NoiseModel) -> Mask:

@@ -69,7 +69,9 @@ class ScreenedFit:
         level: (H, W) DN, the fitted image.
         variance: (H, W) DN^2 of the mean, infinite where a pixel is not used.
         core: reduced chi-square of the pixels in the spot's core, and their number.
-        cost: sigma of the place over what it would be if nothing were missing and nothing else were fitted, minus 1.
+        cost: sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot
+            stood still, minus 1.
+        missing: the same without what movement between frames does.
     """
 
     positions: SpotPositions
@@ -82,6 +84,7 @@ class ScreenedFit:
     variance: Array
     core: tuple[float, int]
     cost: float
+    missing: float
 
     def residual(self, mean: Array) -> Array:
         """(H, W) what the image has more than the model, in standard deviations; 0 where a pixel is not used.
@@ -221,6 +224,7 @@ def _fit(
         variance=np.where(use, 1.0 / np.where(use, weight, 1.0), np.inf).reshape(shape),
         core=(float(square[core].mean()) if np.any(core) else 0.0, int(np.count_nonzero(core))),
         cost=_cost(design[:4], level, many, noise, temporal + moved + fixed),
+        missing=_cost(design[:4], level, many, noise, temporal + fixed),
     )
 
 

@@ -24,7 +24,7 @@ from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
 from analysis.spots.spot_positions import SpotError
 from analysis.spots.spot_template import SpotTemplate
 
-__all__ = ["Examined", "examine", "refit"]
+__all__ = ["Examined", "examine", "lone_pixels", "refit"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,11 +38,21 @@ _REACH = 2
 _MISFIT = 0.05
 """Share of the residual around a pixel by which its prediction may be wrong."""
 _ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
+_BESIDE = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6.0
+"""Weights by which a line is predicted from those beside it: a parabola through them."""
+_NEAR_SPOT_PX = 15.0
+"""Pixels of a line so near to the spot do not judge it."""
 _LINE_SHARE = 0.4
 """Of the pixels of a column or row: if so many are bad, all are."""
 _ABOVE_RING = 6.0
 """Of a reflection over what else is left over at the same distance from the spot, in its own scatter."""
+_EDGE_LIGHT_PX = 12.0
+"""Radius of what is left out about a light that the shape cannot be fitted to."""
 _ROUNDS = 6
+_GROSS = 4.0
+"""Times the limit for a pixel while smear is not fitted yet."""
+_STEEP = 0.15
+"""Share of the rise about a pixel by which it may be off where no shape is known."""
 
 
 def _prediction() -> Array:
@@ -56,6 +66,7 @@ def _prediction() -> Array:
 
 
 _PREDICTION = _prediction()
+_ALONE = 0.4 * float(np.abs(_PREDICTION).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,29 +116,50 @@ def examine(
     """
     mean = screened.mean
     good = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
-    terms = FitTerms(smear=(vibration or bool(np.any(screened.jitter))) and not own)
-    pixels = np.zeros_like(good)
+    smeared = (vibration or bool(np.any(screened.jitter))) and not own
+    terms = FitTerms()
     lines = np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
     dirty = not screened.clean or not np.array_equal(good, screened.good)
     fit = _fitted(screened, good, noise, template, terms)
-    for _ in range(_ROUNDS if searched else 0):
-        before = (int(np.count_nonzero(good)), terms)
-        found = _outliers(mean, fit, good, CLOSER if dirty else limit)
-        stripes = _lines(mean, fit, good & ~found, screened.good & ~(good & ~found))
-        good = good & ~found & ~stripes
-        dirty = dirty or bool(np.any(found | stripes))
-        pixels, lines = pixels | found, lines | stripes
-        if np.any(found | stripes):
+    # what is gross first, lest it is taken for smear or for another spot
+    for rough in (True, False):
+        if not rough and smeared:
+            terms = replace(terms, smear=True)
             fit = _fitted(screened, good, noise, template, terms, fit)
-        if not own:
-            terms, fit = _uneven(screened, good, noise, template, terms, fit)
-            terms, fit = _others(screened, good, noise, template, terms, fit)
-        dirty = dirty or terms.background > 0 or bool(terms.others)
-        if (int(np.count_nonzero(good)), terms) == before:
-            break
+        for _ in range(_ROUNDS if searched else 0):
+            before = (int(np.count_nonzero(good)), terms)
+            least = (_GROSS if smeared else 1.0) * limit if rough else CLOSER if dirty else limit
+            found = _outliers(mean, fit, good, least)
+            stripes = _lines(mean, fit, good & ~found, screened.good & (~good | found))
+            good, lines = good & ~found & ~stripes, lines | stripes
+            dirty = dirty or bool(np.any(found | stripes))
+            if np.any(found | stripes):
+                fit = _fitted(screened, good, noise, template, terms, fit)
+            if not own and not rough:
+                terms, fit = _uneven(screened, good, noise, template, terms, fit)
+                terms, fit, good = _others(screened, good, noise, template, terms, fit)
+            dirty = dirty or terms.background > 0 or bool(terms.others)
+            if (int(np.count_nonzero(good)), terms) == before:
+                break
     bad = screened.good & ~good
     return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, lines, fit)))
+
+
+def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
+    """Pixels (H, W) that are not as those about them say, where no shape is known that they could be held against.
+
+    Args:
+        screened: frames of one state.
+        noise: of the detector.
+    """
+    mean, good = screened.mean, screened.good & ~_rough(screened.mean, screened, noise)
+    smooth = ndimage.median_filter(spot_image.filled(mean, good), 5)
+    steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
+    variance = noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth)
+    limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
+    found = _off(mean, variance + (_STEEP * steep / limit) ** 2, good, limit)
+    return np.asarray(screened.good & (~good | found))
 
 
 def refit(
@@ -178,18 +210,23 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
 
 
 def _outliers(mean: Array, fit: ScreenedFit, good: Mask, limit: float) -> Mask:
-    """Pixels that are not as those about them say, the worst of each neighbourhood first."""
+    """Pixels of which the residual is not as those about them say."""
+    return _off(mean - fit.level, np.where(np.isfinite(fit.variance), fit.variance, 0.0), good, limit)
+
+
+def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
+    """Pixels that are off by more than ``limit`` sigmas, the worst of each neighbourhood first."""
     use = good.copy()
-    variance = np.where(np.isfinite(fit.variance), fit.variance, 0.0)
     found = np.zeros_like(good)
     for _ in range(50):
-        residual = np.where(use, mean - fit.level, 0.0)
-        if not np.all(use):
-            residual = spot_image.filled(residual, use)
-        around = ndimage.convolve(residual, _PREDICTION, mode="nearest")
+        image = spot_image.filled(residual, use)
+        around = ndimage.convolve(image, _PREDICTION, mode="nearest")
         spread = variance + ndimage.convolve(np.where(use, variance, 0.0), _PREDICTION**2, mode="nearest")
         spread += (_MISFIT * around) ** 2
-        z = np.where(use, np.abs(residual - around) / np.sqrt(np.maximum(spread, 1e-300)), 0.0)
+        z = np.where(use, np.abs(image - around) / np.sqrt(np.maximum(spread, 1e-300)), 0.0)
+        # where most neighbours are missing themselves they predict nothing
+        alone = ndimage.convolve((~use).astype(np.float64), np.abs(_PREDICTION), mode="nearest") > _ALONE
+        z[alone] = 0.0
         new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _REACH + 1))
         if not np.any(new):
             break
@@ -199,23 +236,37 @@ def _outliers(mean: Array, fit: ScreenedFit, good: Mask, limit: float) -> Mask:
 
 
 def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
-    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted."""
+    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted.
+
+    A line is held against its neighbours, in the median of its pixels away from the spot.
+    """
     out = np.zeros_like(good)
     sigma = np.sqrt(np.where(np.isfinite(fit.variance), fit.variance, 1.0))
-    z = np.where(good, (mean - fit.level) / sigma, np.nan)
+    place = fit.positions.row[0], fit.positions.column[0]
     for axis in (0, 1):
-        size = z.shape[axis]
-        limit = float(norm.isf(FALSE_ALARM / (2.0 * z.shape[1 - axis])))
-        with np.errstate(invalid="ignore"):
-            count = np.count_nonzero(good, axis=axis)
-            middle = np.array([np.median(one[np.isfinite(one)]) if np.any(np.isfinite(one)) else 0.0
-                               for one in np.moveaxis(z, 1 - axis, 0)])  # fmt: skip
-        smooth = ndimage.median_filter(middle, 9, mode="nearest")
-        scale = np.sqrt(math.pi / 2.0 * (1.0 / np.maximum(count, 1) + 1.5 / (9.0 * size)))
-        off = (np.abs(middle - smooth) > limit * scale) & (count > 0.25 * size)
-        off |= np.count_nonzero(bad, axis=axis) > _LINE_SHARE * size
-        if np.count_nonzero(off) <= 0.2 * off.size:
-            out |= np.expand_dims(off, axis)
+        size, lines = good.shape[axis], good.shape[1 - axis]
+        far = np.abs(np.arange(size) - place[axis]) > _NEAR_SPOT_PX
+        z = np.moveaxis((mean - fit.level) / sigma, axis, 0)[far]
+        used = np.moveaxis(good, axis, 0)[far]
+        count = np.count_nonzero(used, axis=0)
+        middle = np.array([np.median(z[used[:, k], k]) if count[k] else 0.0 for k in range(lines)])
+        spread = np.sqrt(math.pi / 2.0 / np.maximum(count, 1))
+        limit = float(norm.isf(FALSE_ALARM / (2.0 * lines)))
+        use = count > 0.25 * len(z)
+        off = np.count_nonzero(bad, axis=axis) > _LINE_SHARE * size
+        for _ in range(lines // 10):
+            known = use & ~off
+            if np.count_nonzero(known) < 5:
+                break
+            filled = np.interp(np.arange(lines), np.flatnonzero(known), middle[known])
+            around = ndimage.convolve1d(filled, _BESIDE, mode="nearest")
+            noise = np.hypot(spread, np.sqrt(ndimage.convolve1d(spread**2, _BESIDE**2, mode="nearest")))
+            score = np.where(known, np.abs(middle - around) / np.hypot(noise, _MISFIT * around), 0.0)
+            worst = int(np.argmax(score))
+            if score[worst] <= limit:
+                break
+            off[worst] = True
+        out |= np.expand_dims(off, axis)
     return np.asarray(out & good)
 
 
@@ -254,12 +305,17 @@ def _others(
     template: SpotTemplate,
     terms: FitTerms,
     fit: ScreenedFit,
-) -> tuple[FitTerms, ScreenedFit]:
-    """Further spots, the brightest first, where they explain more than chance does."""
+) -> tuple[FitTerms, ScreenedFit, Mask]:
+    """Further spots, the brightest first, where they explain more than chance does; those at the edge are left out."""
     while len(terms.others) < MOST_OTHERS:
         place = _second_light(screened.mean, fit, good, template)
         if place is None:
             break
+        if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(place, template.supported(), strict=True)):
+            row, column = np.indices(good.shape)
+            good = good & (np.hypot(row - place[0], column - place[1]) > _EDGE_LIGHT_PX)
+            fit = _fitted(screened, good, noise, template, terms, fit)
+            continue
         wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), place))
         try:
             tried = _fitted(screened, good, noise, template, wider, fit)
@@ -272,7 +328,7 @@ def _others(
             break
         terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
         fit = tried
-    return terms, fit
+    return terms, fit, good
 
 
 def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate) -> tuple[float, float] | None:
@@ -333,5 +389,5 @@ def _told(bad: Mask, lines: Mask, fit: ScreenedFit) -> list[Finding]:
         )
     if fit.terms.smear:
         rows, columns = (math.sqrt(max(fit.smear[k, k], 0.0)) for k in (0, 1))
-        out.append(Finding("smear", f"{rows:.2f} px along the rows' axis and {columns:.2f} px along the columns' rms"))
+        out.append(Finding("smear", f"{rows:.2f} px in row and {columns:.2f} px in column, rms, is fitted"))
     return out

@@ -15,7 +15,7 @@ from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
-from analysis.spots.static_defects import Examined, examine, refit
+from analysis.spots.static_defects import Examined, examine, lone_pixels, refit
 from scenes.specs.measurement import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
@@ -135,9 +135,10 @@ class ChannelMeasurement:
         issues: list[Issue] = []
         for number, state in enumerate(self.channel.states):
             try:
-                self._screened.append(self._screen(state))
+                screened = self._screen(state)
                 if self.shape is None:
-                    self.shape = learn_template(self._screened[0], self.channel.noise)
+                    screened, self.shape = self._learn(screened)
+                self._screened.append(screened)
                 self._examined.append(self._examine(number, state))
             except FramesError as error:
                 issues.append(cannot_measure(self._test, state, self.channel.name, str(error), error.remedy))
@@ -177,6 +178,15 @@ class ChannelMeasurement:
         good = screened.good & ~part.bad
         return replace(screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *told))
 
+    def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, SpotTemplate]:
+        """The shape of the spot before, without the pixels that no shape could have."""
+        if self._searches:
+            lone = lone_pixels(screened, self.channel.noise)
+            if np.any(lone):
+                told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise off are left out")
+                screened = replace(screened, good=screened.good & ~lone, findings=(*screened.findings, told))
+        return screened, learn_template(screened, self.channel.noise)
+
     def _examine(self, number: int, state: StateFrames) -> Examined | None:
         """None where nothing is searched for."""
         screened, test = self._screened[number], self._test
@@ -214,11 +224,10 @@ class ChannelMeasurement:
             raise SpotError({0: f"{reason} ({examined.findings[0].kind}: {examined.findings[0].text})"})
         else:
             positions = examined.fit.positions
-            if examined.fit.cost > DEAREST:
+            if examined.fit.missing > DEAREST:
                 what = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
-                raise SpotError(
-                    {0: f"too much of the spot is missing ({what}): sigma would grow {examined.fit.cost:.1f}-fold"}
-                )
+                grown = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
+                raise SpotError({0: f"too much of the spot is missing ({what}): {grown}"})
         return self._on_ccd(positions, state)
 
     def _as_ever(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
