@@ -35,6 +35,8 @@ _REST_PX, _MOST_STEPS = 1e-6, 60
 _FLUX_SIGMAS = 5.0
 _SLOPE_PX = 0.25
 """Step of the second derivatives."""
+_MOST_SMEAR = 25.0
+"""Px^2; a spot that is smeared by more is another one."""
 _CORE_SHARE = 0.02
 """Of the peak: where the shape of the spot is judged."""
 _NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(3)
@@ -67,7 +69,8 @@ class ScreenedFit:
         smear: (2, 2) px^2, second moments of the smear; zeros where none was fitted.
         smear_sigma: (2, 2) px^2.
         level: (H, W) DN, the fitted image.
-        variance: (H, W) DN^2 of the mean, infinite where a pixel is not used.
+        variance: (H, W) DN^2 of the mean, also where a pixel is not used.
+        used: (H, W) pixels.
         core: reduced chi-square of the pixels in the spot's core, and their number.
         cost: sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot
             stood still, minus 1.
@@ -82,6 +85,7 @@ class ScreenedFit:
     smear_sigma: Array
     level: Array
     variance: Array
+    used: Mask
     core: tuple[float, int]
     cost: float
     missing: float
@@ -92,7 +96,7 @@ class ScreenedFit:
         Args:
             mean: the image, (H, W) DN.
         """
-        return np.asarray((mean - self.level) / np.sqrt(self.variance))
+        return np.asarray(np.where(self.used, (mean - self.level) / np.sqrt(self.variance), 0.0))
 
     def explains(self, mean: Array) -> float:
         """Chi-square of the image.
@@ -129,7 +133,7 @@ def fit_screened(
     noise: NoiseModel,
     template: SpotTemplate,
     terms: FitTerms | None = None,
-    start: tuple[float, float] | None = None,
+    near: ScreenedFit | None = None,
     jitter: Array | None = None,
     edge_px: float = EDGE_PX,
 ) -> ScreenedFit:
@@ -142,7 +146,7 @@ def fit_screened(
         noise: of the detector.
         template: the spot's one shape.
         terms: what else is fitted; None for nothing.
-        start: row and column to begin at, px; None to look for the brightest spot.
+        near: a fit to begin at; None to look for the brightest spot.
         jitter: (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
         edge_px: least distance of a centre from the image's outermost pixel centres.
 
@@ -151,7 +155,7 @@ def fit_screened(
     """
     terms = FitTerms() if terms is None else terms
     try:
-        return _fit(mean, counts, good, noise, template, terms, start, jitter, edge_px)
+        return _fit(mean, counts, good, noise, template, terms, near, jitter, edge_px)
     except TemplateRangeError as error:
         raise SpotError({0: "the fit left the range of the template; calibrate it with a larger margin"}) from error
     except np.linalg.LinAlgError as error:
@@ -165,12 +169,12 @@ def _fit(
     noise: NoiseModel,
     template: SpotTemplate,
     terms: FitTerms,
-    start: tuple[float, float] | None,
+    near: ScreenedFit | None,
     jitter: Array | None,
     edge_px: float,
 ) -> ScreenedFit:
     model = _Model(template, terms, mean.shape[0], mean.shape[1])
-    theta = _start(mean, counts, good, noise, model, start)
+    theta = _start(mean, counts, good, noise, model) if near is None else model.begun(near)
     spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
     flat, use, many = mean.ravel(), good.ravel(), counts.ravel()
     for _ in range(_MOST_STEPS):
@@ -221,7 +225,8 @@ def _fit(
         smear=smear,
         smear_sigma=smear_sigma,
         level=level.reshape(shape),
-        variance=np.where(use, 1.0 / np.where(use, weight, 1.0), np.inf).reshape(shape),
+        variance=_variance(level, many, noise).reshape(shape),
+        used=good,
         core=(float(square[core].mean()) if np.any(core) else 0.0, int(np.count_nonzero(core))),
         cost=_cost(design[:4], level, many, noise, temporal + moved + fixed),
         missing=_cost(design[:4], level, many, noise, temporal + fixed),
@@ -239,18 +244,15 @@ def _cost(design: Array, level: Array, counts: Array, noise: NoiseModel, covaria
     return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
 
 
-def _start(
-    mean: Array, counts: Array, good: Mask, noise: NoiseModel, model: _Model, start: tuple[float, float] | None
-) -> Array:
+def _start(mean: Array, counts: Array, good: Mask, noise: NoiseModel, model: _Model) -> Array:
     """Place of the brightest spot, then flux and level, in which the model is linear."""
     filled = spot_image.filled(mean, good)
     frames = max(int(np.median(counts)), 1)
     # what is saturated has been left out
     whole = replace(noise, saturation_dn=1e300)
     row, column, background, _, _ = spot_image.coarse(filled[None], frames, whole)
-    place = (float(row[0]), float(column[0])) if start is None else start
     flux = max(float((filled - background[0]).sum()), 1.0)
-    return model.first(place, flux, float(background[0]))
+    return model.first((float(row[0]), float(column[0])), flux, float(background[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +286,16 @@ class _Model:
             theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, 0.01 * flux
         return theta
 
+    def begun(self, near: ScreenedFit) -> Array:
+        """Where another fit has ended; what it had not is begun anew."""
+        p = near.positions
+        theta = self.first((float(p.row[0]), float(p.column[0])), float(p.flux[0]), float(p.background[0]))
+        for k, (row, column, share) in enumerate(near.others[: len(self.terms.others)]):
+            theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, share * theta[2]
+        if self.terms.smear:
+            theta[self._smear :] = near.smear[0, 0], near.smear[0, 1], near.smear[1, 1]
+        return theta
+
     def moved(self, theta: Array, step: Array) -> tuple[Array, float]:
         """The next parameters, and by how much the spot's place changes."""
         places = [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
@@ -295,7 +307,13 @@ class _Model:
         if self.terms.smear:
             # not more than the shape itself in one step
             change = np.clip(step[self._smear :], -2.0, 2.0)
-            out[self._smear :] = theta[self._smear :] + short * change
+            out[self._smear :] = np.clip(theta[self._smear :] + short * change, -_MOST_SMEAR, _MOST_SMEAR)
+        # another spot stays where the shape is known, smear included
+        reach = 1.0 + 1.8 * float(np.sqrt(np.square(self._spread(out)).sum()))
+        for k in range(len(self.terms.others)):
+            for axis, (low, high) in enumerate(self.template.supported()):
+                at = self._others + 3 * k + axis
+                out[at] = min(max(out[at], low + reach), high - reach)
         return out, length
 
     def _spread(self, theta: Array) -> Array:

@@ -48,7 +48,9 @@ _ABOVE_RING = 6.0
 """Of a reflection over what else is left over at the same distance from the spot, in its own scatter."""
 _EDGE_LIGHT_PX = 12.0
 """Radius of what is left out about a light that the shape cannot be fitted to."""
-_ROUNDS = 6
+_LEAST_SHARE = 5.0
+"""Sigmas of a further spot's light below which it is none."""
+_ROUNDS = 8
 _GROSS = 4.0
 """Times the limit for a pixel while smear is not fitted yet."""
 _STEEP = 0.15
@@ -115,10 +117,11 @@ def examine(
         SpotError: no spot, or it cannot be measured.
     """
     mean = screened.mean
-    good = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
+    start = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
+    good = start
     smeared = (vibration or bool(np.any(screened.jitter))) and not own
     terms = FitTerms()
-    lines = np.zeros_like(good)
+    lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
     dirty = not screened.clean or not np.array_equal(good, screened.good)
     fit = _fitted(screened, good, noise, template, terms)
@@ -128,22 +131,24 @@ def examine(
             terms = replace(terms, smear=True)
             fit = _fitted(screened, good, noise, template, terms, fit)
         for _ in range(_ROUNDS if searched else 0):
-            before = (int(np.count_nonzero(good)), terms)
+            before = good, terms
             least = (_GROSS if smeared else 1.0) * limit if rough else CLOSER if dirty else limit
-            found = _outliers(mean, fit, good, least)
-            stripes = _lines(mean, fit, good & ~found, screened.good & (~good | found))
-            good, lines = good & ~found & ~stripes, lines | stripes
-            dirty = dirty or bool(np.any(found | stripes))
-            if np.any(found | stripes):
+            # found anew every time: an earlier fit may have been wrong
+            found = _outliers(mean, fit, start, least)
+            lines = _lines(mean, fit, start & ~found, screened.good & (~start | found))
+            good = start & ~found & ~lines & ~edges
+            dirty = dirty or bool(np.any(found | lines))
+            if not np.array_equal(good, before[0]):
                 fit = _fitted(screened, good, noise, template, terms, fit)
             if not own and not rough:
                 terms, fit = _uneven(screened, good, noise, template, terms, fit)
-                terms, fit, good = _others(screened, good, noise, template, terms, fit)
-            dirty = dirty or terms.background > 0 or bool(terms.others)
-            if (int(np.count_nonzero(good)), terms) == before:
+                terms, fit, edge = _others(screened, good, noise, template, terms, fit)
+                edges, good = edges | edge, good & ~edge
+            dirty = dirty or terms.background > 0 or bool(terms.others) or bool(np.any(edges))
+            if np.array_equal(good, before[0]) and terms == before[1]:
                 break
-    bad = screened.good & ~good
-    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, lines, fit)))
+    bad = screened.good & ~good & ~edges
+    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit)))
 
 
 def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
@@ -191,10 +196,7 @@ def _fitted(
     terms: FitTerms,
     near: ScreenedFit | None = None,
 ) -> ScreenedFit:
-    start = None if near is None else (float(near.positions.row[0]), float(near.positions.column[0]))
-    return fit_screened(
-        screened.mean, screened.counts, good, noise, template, terms, start=start, jitter=screened.jitter
-    )
+    return fit_screened(screened.mean, screened.counts, good, noise, template, terms, near=near, jitter=screened.jitter)
 
 
 def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
@@ -211,7 +213,7 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
 
 def _outliers(mean: Array, fit: ScreenedFit, good: Mask, limit: float) -> Mask:
     """Pixels of which the residual is not as those about them say."""
-    return _off(mean - fit.level, np.where(np.isfinite(fit.variance), fit.variance, 0.0), good, limit)
+    return _off(mean - fit.level, fit.variance, good, limit)
 
 
 def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
@@ -241,7 +243,7 @@ def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
     A line is held against its neighbours, in the median of its pixels away from the spot.
     """
     out = np.zeros_like(good)
-    sigma = np.sqrt(np.where(np.isfinite(fit.variance), fit.variance, 1.0))
+    sigma = np.sqrt(fit.variance)
     place = fit.positions.row[0], fit.positions.column[0]
     for axis in (0, 1):
         size, lines = good.shape[axis], good.shape[1 - axis]
@@ -307,18 +309,20 @@ def _others(
     fit: ScreenedFit,
 ) -> tuple[FitTerms, ScreenedFit, Mask]:
     """Further spots, the brightest first, where they explain more than chance does; those at the edge are left out."""
+    edges = np.zeros_like(good)
+    terms, fit = _kept(screened, good, noise, template, terms, fit)
     while len(terms.others) < MOST_OTHERS:
-        place = _second_light(screened.mean, fit, good, template)
+        place = _second_light(screened.mean, fit, good & ~edges, template)
         if place is None:
             break
         if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(place, template.supported(), strict=True)):
             row, column = np.indices(good.shape)
-            good = good & (np.hypot(row - place[0], column - place[1]) > _EDGE_LIGHT_PX)
-            fit = _fitted(screened, good, noise, template, terms, fit)
+            edges = edges | (good & (np.hypot(row - place[0], column - place[1]) <= _EDGE_LIGHT_PX))
+            fit = _fitted(screened, good & ~edges, noise, template, terms, fit)
             continue
         wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), place))
         try:
-            tried = _fitted(screened, good, noise, template, wider, fit)
+            tried = _fitted(screened, good & ~edges, noise, template, wider, fit)
         except SpotError:
             break
         row, column, share = tried.others[-1]
@@ -328,7 +332,24 @@ def _others(
             break
         terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
         fit = tried
-    return terms, fit, good
+    return terms, fit, edges
+
+
+def _kept(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    fit: ScreenedFit,
+) -> tuple[FitTerms, ScreenedFit]:
+    """Without further spots that are no longer needed."""
+    bright = fit.others[:, 2] > _LEAST_SHARE * fit.others_sigma[:, 2]
+    if np.all(bright):
+        return terms, fit
+    terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in fit.others[bright]))
+    fit = replace(fit, others=fit.others[bright], others_sigma=fit.others_sigma[bright])
+    return terms, _fitted(screened, good, noise, template, terms, fit)
 
 
 def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate) -> tuple[float, float] | None:
@@ -338,7 +359,7 @@ def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTempl
     stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
     reach = min(20, *middle)
     stamp = stamp[middle[0] - reach : middle[0] + reach + 1, middle[1] - reach : middle[1] + reach + 1]
-    weight = np.where(np.isfinite(fit.variance), 1.0 / fit.variance, 0.0)
+    weight = np.where(fit.used, 1.0 / fit.variance, 0.0)
     turned = stamp[::-1, ::-1]
     amplitude = signal.fftconvolve((mean - fit.level) * weight, turned, mode="same")
     power = np.maximum(signal.fftconvolve(weight, turned**2, mode="same"), 1e-300)
@@ -360,13 +381,15 @@ def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTempl
     return None
 
 
-def _told(bad: Mask, lines: Mask, fit: ScreenedFit) -> list[Finding]:
+def _told(bad: Mask, edges: Mask, fit: ScreenedFit) -> list[Finding]:
     """What was found, in words."""
     out = []
-    full = [np.flatnonzero((lines & bad).sum(axis=axis) > 0.25 * bad.shape[axis]) for axis in (0, 1)]
-    single = int(np.count_nonzero(bad & ~lines))
+    full = [np.flatnonzero(bad.sum(axis=axis) > 0.5 * bad.shape[axis]) for axis in (0, 1)]
+    along = np.zeros_like(bad)
+    along[:, full[0]] = along[full[1]] = True
+    single = int(np.count_nonzero(bad & ~along))
     if single:
-        where = np.argwhere(bad & ~lines)[:3]
+        where = np.argwhere(bad & ~along)[:3]
         shown = ", ".join(f"({r}, {c})" for r, c in where)
         more = ", ..." if single > 3 else ""
         out.append(Finding("bad pixels", f"{single} hot, dead or otherwise off are left out: {shown}{more}"))
@@ -376,9 +399,8 @@ def _told(bad: Mask, lines: Mask, fit: ScreenedFit) -> list[Finding]:
             out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are left out"))
     if fit.terms.background:
         what = "slopes" if fit.terms.background == 1 else "slopes and curvature"
-        rise = float(np.ptp(np.where(np.isfinite(fit.variance), fit.level, np.nan)[[0, 0, -1, -1], [0, -1, 0, -1]]))
-        size = f", {rise:.2g} DN between the corners" if math.isfinite(rise) else ""
-        out.append(Finding("uneven background", f"its {what} are fitted{size}"))
+        rise = float(np.ptp(fit.level[[0, 0, -1, -1], [0, -1, 0, -1]]))
+        out.append(Finding("uneven background", f"its {what} are fitted, {rise:.2g} DN between the corners"))
     for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
         out.append(
             Finding(
@@ -387,6 +409,8 @@ def _told(bad: Mask, lines: Mask, fit: ScreenedFit) -> list[Finding]:
                 "it is fitted",
             )
         )
+    if np.any(edges):
+        out.append(Finding("second light", "near the edge of the frames; what surrounds it is left out"))
     if fit.terms.smear:
         rows, columns = (math.sqrt(max(fit.smear[k, k], 0.0)) for k in (0, 1))
         out.append(Finding("smear", f"{rows:.2f} px in row and {columns:.2f} px in column, rms, is fitted"))
