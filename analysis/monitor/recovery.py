@@ -28,6 +28,7 @@ __all__ = [
     "joint",
     "measure_spots",
     "recover",
+    "recovery_of",
 ]
 
 Array = NDArray[np.float64]
@@ -149,12 +150,36 @@ def recover(
             alone.
         keep_parts: of the noise, which are large.
     """
-    states, spots, frames = after.shape[0], after.shape[1], after.shape[2]
+    spots, frames = after.shape[1], after.shape[2]
     if spots != calibration.spots or before.shape[-4] != spots:
         raise ValueError(f"recovery: the calibration has {calibration.spots} spots, the images {spots}")
     first = measure_spots(_flat(mean_frames(before)), before.shape[-3], calibration, centroid, threads)
     second = measure_spots(_flat(mean_frames(after)), frames, calibration, centroid, threads)
-    spread = joint(difference_covariance(first, second, calibration.noise).reshape(states, spots, 2, 2))
+    spread = difference_covariance(first, second, calibration.noise)
+    return recovery_of(first, second, spread, calibration, disturbances, keep_parts)
+
+
+def recovery_of(
+    first: SpotPositions,
+    second: SpotPositions,
+    covariance: Array,
+    calibration: MonitorCalibration,
+    disturbances: Disturbances | None = None,
+    keep_parts: bool = False,
+) -> Recovery:
+    """What spots say that have been measured already.
+
+    Args:
+        first: C spots of the nominal state, or S C, with their maps.
+        second: S C spots of the states to be measured, state by state, likewise.
+        covariance: (S C, 2, 2) px^2 of their differences.
+        calibration: of the nominal instrument; C must be its number of spots.
+        disturbances: as of `recover`.
+        keep_parts: of the noise, which are large.
+    """
+    spots = calibration.spots
+    states = second.row.size // spots
+    spread = joint(covariance.reshape(states, spots, 2, 2))
     start = np.broadcast_to(first.position.reshape(-1, spots, 2), (states, spots, 2))
     end = second.position.reshape(states, spots, 2)
     found = estimates(start, end, spread, calibration.cameras, disturbances, calibration.ground)

@@ -12,6 +12,7 @@ from dataclasses import fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
@@ -335,3 +336,26 @@ def positions(
         gain_maps=maps if keep_maps else None,
         light_dn=noise.light_signal_dn(image) if keep_maps else None,
     )
+
+
+def filled(mean: Array, good: NDArray[np.bool_]) -> Array:
+    """An image (H, W) in which pixels that are not good have the value of those around them.
+
+    Args:
+        mean: grey values, (H, W), DN.
+        good: which of them can be used, (H, W).
+    """
+    if np.all(good):
+        return mean
+    out = np.where(good, mean, 0.0)
+    weight = good.astype(np.float64)
+    value, width = out.copy(), 1.0
+    left = ~good
+    # wider and wider, until every hole is bridged
+    while np.any(left) and width < max(mean.shape):
+        near = ndimage.gaussian_filter(weight, width, mode="nearest")
+        some = left & (near > 1e-3)
+        value[some] = ndimage.gaussian_filter(out, width, mode="nearest")[some] / near[some]
+        left &= ~some
+        width *= 2.0
+    return np.asarray(np.where(left, np.median(mean[good]) if np.any(good) else 0.0, value))

@@ -17,7 +17,7 @@ from docs.site.markdown import anchor, code, prose, sentence, table
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("twin", "analysis", "scenes", "optics")
-FIRST = ("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design")
+FIRST = ("twin.render", "twin.recover", "twin.lab", "twin.orbit", "twin.study", "twin.design")
 """Programs that stand first; the others follow by name."""
 NOT_FOR_USERS = {"twin.run.probe": "the doctor's own helper"}
 """Modules that can be run and are no commands, with the reason."""

@@ -13,6 +13,7 @@ from scenes.specs.load import SCENES
 FOLDER = "reference/files"
 READ_BY = {
     "job": "`python -m twin.render FILE`; in a script `twin.load(FILE)`; a study's base `render`",
+    "measurement": "`python -m twin.recover FILE`",
     "instrument": 'jobs and tests, which name it: `instrument: gf7_pair`; in a script `twin.load("gf7_pair")`',
     "camera": "`python -m twin.camera FILE`; instruments, tests and designs, which name it: `camera: gf7`",
     "camera_design": "`python -m twin.design FILE`",

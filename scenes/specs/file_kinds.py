@@ -12,6 +12,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measurement import MeasurementSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
@@ -58,6 +59,7 @@ _VALIDATED = "the checks of `python -m twin.validate`"
 
 FILE_KINDS = (
     FileKind("job", JobSpec, "a job of the monitor", "twin.render"),
+    FileKind("measurement", MeasurementSpec, "a measurement of a monitor", "twin.recover"),
     FileKind("instrument", InstrumentSpec, "an instrument", place="a job's `instrument: FILE`"),
     FileKind(
         "camera",

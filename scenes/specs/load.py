@@ -15,6 +15,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measurement import MeasurementSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_scene import LineImageSpec
@@ -150,6 +151,11 @@ def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
 def path_of_detector(instrument: InstrumentSpec) -> Path:
     """The file of the area CCD's data sheet. Raises InputError if there is none."""
     return _find(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
+
+
+def find_area_detector(measurement: MeasurementSpec) -> Path:
+    """The file of the data sheet that a measurement names for its area CCDs. Raises InputError if there is none."""
+    return _find(DETECTORS, measurement.detector or "", measurement, ("detector",))
 
 
 def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> CameraSpec:

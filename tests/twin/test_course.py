@@ -21,7 +21,7 @@ from scenes.specs.job import check_nodes
 from scenes.specs.load import EXAMPLES, load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
-from twin.main_job.render_results import stated
+from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth

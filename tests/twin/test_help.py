@@ -14,6 +14,7 @@ from twin.validation.registry import GROUPS, select
 
 PROGRAMS = (
     "twin.render",
+    "twin.recover",
     "twin.lab",
     "twin.orbit",
     "twin.study",

@@ -21,7 +21,7 @@ from optics.geometry import zernike
 from optics.numerics import array_math, quadrature
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
-from twin.main_job.render_results import stated
+from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_path import MAP_TERMS
 
 KERNELS = {

@@ -17,7 +17,7 @@ from analysis.monitor.monitoring import PARAMETERS
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, parse_yaml
-from twin.main_job.render_results import stated
+from twin.main_job.monitor_reading import stated
 from twin.monitor.truth import trace_truth
 from twin.study.runs.setup import study_from_text
 from twin.study.scripted import config_text

@@ -316,9 +316,9 @@ def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
     truth = run.truth_dict()
     for p, values in ((ANGLE, truth["intersection_angle"]), *((p, truth["ground"]) for p in GROUND)):
         # second order of 10 arcsec: 5e-5 of it
-        assert combination(run, "", p) @ true == pytest.approx(values[p.key], rel=2e-3)
+        assert combination(run.reading, "", p) @ true == pytest.approx(values[p.key], rel=2e-3)
     for k, p in enumerate(PARAMETERS):
-        row = combination(run, "backward", p)
+        row = combination(run.reading, "backward", p)
         assert row @ true == pytest.approx(truth["cameras"]["backward"][p.key], rel=1e-12)
         assert np.count_nonzero(row) == 1
         assert row[4 + k] != 0.0
@@ -344,7 +344,7 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         assert 5.0 < times < 300.0
         assert recovered_numbers(run)["warnings"] == list(told.warnings)
         assert not recovered_numbers(run)["disturbances"]["agrees"]
-        assert "contradict them" in assumed(run)
+        assert "contradict them" in assumed(run.reading)
 
 
 def test_a_body_of_which_nothing_is_stated_is_named_as_such(job) -> None:

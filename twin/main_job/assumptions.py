@@ -6,15 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
 from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, Split, quantities, split
 from scenes.specs.channel import BASE
 from scenes.specs.course import moment
+from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, Parameter
 from twin.run.artefact import plain, significant
 
-__all__ = ["NOISE", "NOISE_ALONE", "assumed", "combination", "contradiction", "limits", "share_text"]
+__all__ = ["NOISE", "NOISE_ALONE", "assumed", "combination", "contradicted", "contradiction", "limits", "share_text"]
 
 NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""
@@ -22,9 +23,9 @@ NOISE = "the noise of the images"
 """How the part of the variance is called that more frames lower."""
 
 
-def assumed(run: RenderRun) -> str:
+def assumed(reading: MonitorReading) -> str:
     """What the sigmas assume, and whether the measured shifts agree with it; a sentence without its end."""
-    stated, found = run.experiment.disturbances, run.consistency
+    stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
         return NOISE_ALONE
     agree = "agree with them" if found.agrees else "contradict them"
@@ -37,13 +38,27 @@ def assumed(run: RenderRun) -> str:
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
     """A warning where the measured shifts contradict what is stated to move; of a course at the worst of its times."""
-    stated, found, when = run.experiment.disturbances, run.consistency, ""
+    found, when, rate = run.consistency, "", f"{FALSE_ALARM:g}"
     if run.worst_of_course is not None and run.series is not None:
         k, found = run.worst_of_course
         when = f" at {moment(float(run.series.times[k]))}, the worst of {len(run.series.times)} times"
+        rate += " for the course"
+    return contradicted(run.experiment.disturbances, found, when, rate)
+
+
+def contradicted(
+    stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
+) -> tuple[str, ...]:
+    """The same of one measurement.
+
+    Args:
+        stated: what is stated to move, None for nothing.
+        found: whether its shifts agree with that.
+        when: which measurement it is, where there are several.
+        rate: of false alarms.
+    """
     if stated is None or found is None or found.agrees:
         return ()
-    rate = f"{FALSE_ALARM:g}" if run.series is None else f"{FALSE_ALARM:g} for the course"
     return (
         f"the shifts of the spots contradict the stated disturbances {stated.name}{when}: chi-square "
         f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with a "
@@ -67,27 +82,27 @@ def _suspected(found: Consistency, stated: Sequence[str]) -> str:
     )
 
 
-def combination(run: RenderRun, camera: str, parameter: Parameter) -> np.ndarray:
+def combination(reading: MonitorReading, camera: str, parameter: Parameter) -> np.ndarray:
     """(4 x cameras,) what a change is made of: its unit per SI of all cameras' parameters, to first order.
 
     Args:
-        run: the run.
+        reading: of the instrument.
         camera: whose change; empty for the angle and the ground.
         parameter: which.
     """
     group = camera or (ANGLE_GROUP if parameter == ANGLE else GROUND_GROUP)
-    found = quantities(run.experiment.cameras, run.experiment.ground)
+    found = quantities(reading.cameras, reading.ground)
     return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, parameter.key))
 
 
-def limits(run: RenderRun, camera: str, parameter: Parameter) -> tuple[str, float]:
+def limits(reading: MonitorReading, camera: str, parameter: Parameter) -> tuple[str, float]:
     """What the judged estimator leaves most of the variance of a change's error to, and its share: a body without the
-    base, or NOISE. Of a run that states disturbances; arguments as of `combination`.
+    base, or NOISE. Of a reading under stated disturbances; arguments as of `combination`.
     """
-    stated = run.experiment.disturbances
+    stated = reading.disturbances
     assert stated is not None
-    row, noise = combination(run, camera, parameter)[None], run.recovery.shift_covariance[0]
-    found = split(row, stated, noise, run.gains[run.judged])
+    row, noise = combination(reading, camera, parameter)[None], reading.recovery.shift_covariance[0]
+    found = split(row, stated, noise, reading.gains[reading.judged])
     variances = {NOISE: found.noise, **Split.by(found.after, stated.bodies)}
     shares = {body: float(variance[0]) for body, variance in variances.items()}
     worst = max(shares, key=lambda body: shares[body])

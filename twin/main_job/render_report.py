@@ -117,7 +117,7 @@ def render_report(
         labels=report_labels,
         estimators=run.estimators,
         judged=run.judged,
-        assumed=assumptions.assumed(run),
+        assumed=assumptions.assumed(run.reading),
         stated=report_content.stated(run),
         family="; ".join(e.title for e in run.estimators.values() if not e.stated),
         far=f"{FAR:g}",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, consistency
-from analysis.monitor.estimators import Estimator, applicable, judged
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, consistency
+from analysis.monitor.estimators import Estimator
 from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import Recovery
@@ -19,7 +18,8 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.specs.resolved import ResolvedJob
-from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
+from twin.main_job.monitor_reading import MonitorReading
+from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries
@@ -112,30 +112,40 @@ class RenderRun:
             out["ground"] = {f"{axis}_m": float(value) + 0.0 for axis, value in zip(AXES, error, strict=True)}
         return out
 
+    @cached_property
+    def reading(self) -> MonitorReading:
+        """What the images say, without the truth."""
+        experiment = self.experiment
+        return MonitorReading(
+            channels=tuple((channel.camera, channel.side) for channel in experiment.path.channels),
+            cameras=experiment.cameras,
+            ground=experiment.ground,
+            disturbances=experiment.disturbances,
+            recovery=self.recovery,
+            crosstalk=self.crosstalk,
+            frames=self.frames,
+            centroid=self.resolved.job.analysis.centroid,
+        )
+
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Those that stand in the results, by their names there: all but those that need what is not stated."""
-        return applicable(self.experiment.cameras, self.experiment.disturbances)
+        """As the reading's."""
+        return self.reading.estimators
 
     @property
     def judged(self) -> str:
-        """The estimator that the verdict is about: `posterior` where disturbances are stated, else `model`."""
-        return judged(self.estimators)
+        """As the reading's."""
+        return self.reading.judged
 
-    @cached_property
+    @property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, at this measurement."""
-        return estimator_gains(self.experiment, self.recovery.shift_covariance[0])
+        """As the reading's."""
+        return self.reading.gains
 
-    @cached_property
+    @property
     def consistency(self) -> Consistency | None:
-        """Do the shifts agree with the stated disturbances? None where none are stated, and where shifts have no noise:
-        a body that is stated to stand still would then be a contradiction by rounding.
-        """
-        stated = self.experiment.disturbances
-        if stated is None or not np.any(self.recovery.shift_covariance):
-            return None
-        return self.recovery.consistency(stated, others=self._any_motions(stated))
+        """As the reading's."""
+        return self.reading.consistency
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
@@ -151,20 +161,8 @@ class RenderRun:
         found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(series.shift, noise, strict=True)]
         worst = int(np.argmax(found))
         return worst, consistency(
-            series.shift[worst], noise[worst], stated, self._any_motions(stated), false_alarm=false_alarm
+            series.shift[worst], noise[worst], stated, self.reading.any_motions(stated), false_alarm=false_alarm
         )
-
-    def _any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
-        """Body -> what its motions do to all spots, px per table unit, stated or not."""
-        columns: dict[tuple[str, str, int], np.ndarray] = {}
-        for name, table in self.crosstalk.items():
-            own = self.experiment.instrument.coordinates_of(name)
-            for motion, moved in zip(table.motions, table.spot_shift.T, strict=True):
-                # what both cameras look at stands in both tables
-                key = (motion.body, motion.kind, motion.axis)
-                columns.setdefault(key, np.zeros(len(stated.spots)))[own] = moved
-        bodies = dict.fromkeys(body for body, _, _ in columns)
-        return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     @cached_property
     def limits(self) -> MonitorLimits | None:
@@ -177,87 +175,7 @@ class RenderRun:
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""
-        cameras = {
-            name: {estimator: _first(p.to_dict()) for estimator, p in estimators.items()}
-            for name, estimators in self.recovery.parameters.items()
-        }
-        spots: dict[str, Any] = {}
-        r = self.recovery
-        for i, channel in enumerate(self.experiment.path.channels):
-            spots.setdefault(channel.camera, {})[channel.side] = {
-                "before": _spot(r.before[0, i], r.sigma_before[0, i]),
-                "after": _spot(r.after[0, i], r.sigma_after[0, i]),
-            }
-        out: dict[str, Any] = {"cameras": cameras, "spots": spots}
-        if r.angle:
-            out["intersection_angle"] = {e: _first(a.to_dict()) for e, a in r.angle.items()}
-        if r.ground:
-            out["ground"] = {e: _first(g.to_dict()) for e, g in r.ground.items()}
-        if self.consistency is not None:
-            out["disturbances"] = self._stated(self.consistency)
-        out["centroid"] = self.resolved.job.analysis.centroid
-        out["frames"] = self.frames
-        return out
-
-    def _stated(self, found: Consistency) -> dict[str, Any]:
-        """What the total sigmas rest on, and whether the shifts agree with it."""
-        assert self.experiment.disturbances is not None
-        return {
-            "name": self.experiment.disturbances.name,
-            "chi_square": _to_digits(found.chi_square),
-            "chi_square_sigma_noise": found.sigma_noise,
-            "degrees_of_freedom": found.degrees,
-            "limit": _to_digits(found.limit),
-            "false_alarm": found.false_alarm,
-            "chance": _to_digits(found.chance),
-            "chance_sigma_noise": found.chance_sigma_noise,
-            "agrees": found.agrees,
-            "suspects": [
-                {
-                    "body": one.body,
-                    "times_stated": _to_digits(one.times),
-                    "log_likelihood_gain": _to_digits(one.gain),
-                }
-                for one in found.suspects
-            ],
-        }
-
-
-STATED = 6
-"""Decimals of a reading's sigma to which files state the reading."""
-STATED_SIGMA = 8
-"""Significant digits of a sigma, and of a chi-square."""
-_SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
-"""Endings of the keys of sigmas."""
-
-
-def _to_digits(value: float) -> float:
-    return float(f"{value:.{STATED_SIGMA - 1}e}")
-
-
-def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """Readings with as many digits as files state: each to a millionth of its sigma, the sigmas to eight digits.
-
-    What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
-
-    Args:
-        readings: nested; the sigma of ``x`` is ``x_sigma_noise``, ``x_sigma`` or ``sigma_x`` beside it, the first that
-            is there. Other numbers stay as they are.
-    """
-    out: dict[str, Any] = {}
-    for key, value in readings.items():
-        names = (f"{key}_sigma_noise", f"{key}_sigma", f"sigma_{key}")
-        sigma = next((readings[name] for name in names if name in readings), None)
-        if isinstance(value, Mapping):
-            out[key] = stated(value)
-        elif isinstance(value, float) and (key.endswith(_SIGMAS) or key.startswith("sigma_")):
-            out[key] = _to_digits(value)
-        elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
-            # adding 0.0 turns a negative zero into a plain one
-            out[key] = round(value, STATED - math.floor(math.log10(sigma))) + 0.0
-        else:
-            out[key] = value
-    return out
+        return self.reading.recovered_dict()
 
 
 def quality_dict(quality: ImageQuality) -> dict[str, Any]:
@@ -277,17 +195,3 @@ def quality_dict(quality: ImageQuality) -> dict[str, Any]:
         "mtf": light,
     }
     return {**after, "before": before, **about}
-
-
-def _first(arrays: Mapping[str, Any]) -> dict[str, float]:
-    """The only state's values."""
-    return {key: float(np.ravel(value)[0]) for key, value in arrays.items()}
-
-
-def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:
-    return {
-        "row": float(position[0]),
-        "column": float(position[1]),
-        "sigma_row": float(sigma[0]),
-        "sigma_column": float(sigma[1]),
-    }

@@ -109,6 +109,6 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
                 axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
     y = count + 0.7
     limit = f" {limited(run)}." if limited(run) else ""
-    for line in (f"{assumed(run)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"):
+    for line in (f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"):
         axes.text(0.01, y, line, fontsize=10.5, ha="left", va="center", color=GREY)
         y += 0.85

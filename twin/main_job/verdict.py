@@ -15,7 +15,8 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.course import moment
 from twin.main_job.assumptions import NOISE, combination, contradiction, limits, share_text
-from twin.main_job.render_results import RenderRun, stated
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import joined, systematics
 from twin.monitor.image_quality import ImageQuality
@@ -285,7 +286,7 @@ def limited(run: RenderRun) -> str:
         return ""
     found = readings(run, run.judged)
     about = next((r for r in found if r.parameter == ANGLE), max(found, key=lambda r: abs(r.ratio)))
-    body, share = limits(run, about.camera, about.parameter)
+    body, share = limits(run.reading, about.camera, about.parameter)
     what = body if body == NOISE else f"motions of {body}"
     return (
         f"σ of {about.name}, {significant(about.sigma, 2)} {about.parameter.unit}, is limited by {what} "
@@ -328,7 +329,7 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     cameras = list(run.crosstalk)
     found = {name: systematics(run, name) for name in cameras}
     # a change of one camera, or what the angle and the ground are made of, per unit of the results
-    weights = combination(run, worst.camera, worst.parameter).reshape(-1, 4) / PER_SI
+    weights = combination(run.reading, worst.camera, worst.parameter).reshape(-1, 4) / PER_SI
     used = [name for name, weight in zip(cameras, weights, strict=True) if np.any(weight)]
     bias = sum(float(w @ found[name].bias[run.judged]) for name, w in zip(cameras, weights, strict=True))
     chance = _chance(worst.ratio, count)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from analysis.monitor import model_fit
+from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.model_fit import ObservabilityReport
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
@@ -124,19 +126,21 @@ class CameraCrosstalk:
         return tuple(out)
 
 
-def estimator_gains(experiment: MonitorExperiment, covariance: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def estimator_gains(
+    cameras: Mapping[str, CameraCalibration], stated: Disturbances | None, covariance: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, to first order.
 
     Args:
-        experiment: the instrument, with what its job states to move.
+        cameras: what is calibrated of each.
+        stated: what is stated to move, None for nothing.
         covariance: (2 x spots, 2 x spots) px^2 of their shifts, which weighs them; None for no noise.
     """
-    spots = len(experiment.path.channels)
+    spots = sum(len(camera.channels) for camera in cameras.values())
     still = np.zeros((1, spots, 2))
     spread = np.zeros((2 * spots, 2 * spots)) if covariance is None else covariance
-    shifts = Shifts(still, still, spread[None], experiment.cameras, experiment.disturbances)
-    used = applicable(experiment.cameras, experiment.disturbances)
-    return {name: one.gain(shifts)[0] for name, one in used.items()}
+    shifts = Shifts(still, still, spread[None], cameras, stated)
+    return {name: one.gain(shifts)[0] for name, one in applicable(cameras, stated).items()}
 
 
 def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray]) -> dict[str, CameraCrosstalk]:
@@ -151,7 +155,7 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
     every = [motion for motions in sets.values() for motion in motions]
     all_spots = spot_jacobian(experiment.path, every)
     all_truth = truth_jacobian(instrument, experiment.backend, every)
-    gains = estimator_gains(experiment)
+    gains = estimator_gains(experiment.cameras, experiment.disturbances)
     out = {}
     for k, (name, motions) in enumerate(sets.items()):
         own = slice(len(motions) * k, len(motions) * (k + 1))

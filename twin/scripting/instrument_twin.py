@@ -226,7 +226,7 @@ class InstrumentTwin:
         size = np.array([motion.unit_size for motion in chosen])
         spots = spot_jacobian(experiment.path, chosen)
         truth = truth_jacobian(experiment.instrument, self._bench.backend, chosen)
-        gains = estimator_gains(experiment)
+        gains = estimator_gains(experiment.cameras, experiment.disturbances)
         moved = spots.reshape(-1, len(chosen))
         readings = [
             [PER_SI[:, None] * (gain[4 * k : 4 * k + 4] @ moved) * size for gain in gains.values()]

@@ -1,0 +1,79 @@
+"""The calibrated shape of a spot learnt from frames of the spot itself, where its optics are not modelled.
+
+The mean image without its level is low-passed where it holds more noise than light: a radial Wiener filter of its own
+power spectrum, real and even, so that it moves nothing. Beyond the image the shape is zero. What is left of the noise
+stands in the covariance of a shift: the image that the shape is from is fitted with it as one of two that differ.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.spots import spot_image
+from analysis.spots.frame_screening import ScreenedFrames
+from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_template import SpotTemplate
+
+__all__ = ["MARGIN_PX", "learn_template"]
+
+Array = NDArray[np.float64]
+MARGIN_PX = 40
+"""By which the shape is larger than the image, so that it can be shifted over it."""
+_TAPER_PX = 4
+_CORE = 0.05
+
+
+def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> SpotTemplate:
+    """The shape of the spot in one state's frames.
+
+    Args:
+        screened: frames of the state.
+        noise: of the detector.
+
+    Raises:
+        SpotError: there is no spot.
+    """
+    image = spot_image.filled(screened.mean, screened.good)
+    frames = max(int(np.median(screened.counts)), 1)
+    _, _, background, peak, _ = spot_image.coarse(image[None], frames, noise)
+    edge = np.ones(image.shape, dtype=bool)
+    edge[_TAPER_PX:-_TAPER_PX, _TAPER_PX:-_TAPER_PX] = False
+    level = float(np.median(image[edge & screened.good])) if np.any(edge & screened.good) else float(background[0])
+    light = _without_noise(image - level, noise.temporal_variance_dn2(image, 1) / screened.counts)
+    wide = np.pad(light * _taper(light.shape), MARGIN_PX)
+    core = np.where(wide > _CORE * wide.max(), wide, 0.0)
+    if not core.sum() > 0.0:
+        raise SpotError({0: "no spot: no light is left to learn its shape from"})
+    row = float(core.sum(axis=1) @ np.arange(wide.shape[0]) / core.sum())
+    column = float(core.sum(axis=0) @ np.arange(wide.shape[1]) / core.sum())
+    share = math.sqrt(float(np.median(noise.temporal_variance_dn2(image, 1) / screened.counts))) / float(peak[0])
+    return SpotTemplate.from_image(wide, row, column, light.shape, tolerance=min(0.1 * share, 1e-3))
+
+
+def _taper(shape: tuple[int, ...]) -> Array:
+    """1 inside, falling to 0 at the edge like a raised cosine."""
+    parts = []
+    for size in shape:
+        away = np.minimum(np.arange(size) + 1, size - np.arange(size)) / (_TAPER_PX + 1.0)
+        parts.append(0.5 - 0.5 * np.cos(np.pi * np.minimum(away, 1.0)))
+    return np.outer(*parts)
+
+
+def _without_noise(light: Array, variance: Array) -> Array:
+    """The image in the frequencies in which it stands above its noise."""
+    transform = np.fft.fft2(light)
+    power = np.abs(transform) ** 2
+    floor = float(variance.sum())
+    frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
+    ring = np.rint(frequency * min(light.shape)).astype(np.intp)
+    mean = np.bincount(ring.ravel(), power.ravel()) / np.maximum(np.bincount(ring.ravel()), 1)
+    # beyond the optics' cut-off there is nothing: the first rings that are noise end it
+    noisy = np.flatnonzero(mean < 2.0 * floor)
+    last = int(noisy[0]) if noisy.size else mean.size
+    gain = np.clip(1.0 - floor / np.maximum(mean, 1e-300), 0.0, 1.0)
+    gain[last:] = 0.0
+    return np.real(np.fft.ifft2(transform * gain[ring]))

@@ -1,0 +1,395 @@
+"""Fit of the calibrated shape to a mean image of which pixels may be missing, beside what else is in the light: an
+uneven background, further spots (reflections), and smear by vibration.
+
+Pixels that are not good have no weight; one that is the mean of fewer frames has more noise. The model is
+
+    background + slopes + sum over spots of flux x (shape convolved with a normal distribution)
+
+fitted by Fisher scoring as `likelihood` does, whose result it is for a clean image. All parameters are fitted together,
+so that what is not known of the others stands in the covariance of the place. Reflections have the shape of the spot:
+they are seen by the same optics; interference with it is not modelled.
+
+Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from analysis.spots import spot_image
+from analysis.spots.likelihood import EDGE_PX
+from analysis.spots.noise import NoiseModel
+from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
+
+__all__ = ["FitTerms", "ScreenedFit", "fit_screened", "one_shape"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+_REST_PX, _MOST_STEPS = 1e-6, 60
+_FLUX_SIGMAS = 5.0
+_SLOPE_PX = 0.25
+"""Step of the second derivatives."""
+_MOST_SMEAR = 25.0
+"""Px^2; a spot that is smeared by more is another one."""
+_CORE_SHARE = 0.02
+"""Of the peak: where the shape of the spot is judged."""
+_NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(3)
+
+
+@dataclass(frozen=True)
+class FitTerms:
+    """What is fitted beside place, flux and level.
+
+    Attributes:
+        background: 0 for an even background, 1 with slopes, 2 with curvature.
+        others: (row, column) where further spots are looked for, px.
+        smear: whether the shape is convolved with a normal distribution.
+    """
+
+    background: int = 0
+    others: tuple[tuple[float, float], ...] = ()
+    smear: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenedFit:
+    """A spot and what was fitted beside it.
+
+    Attributes:
+        positions: of the one spot.
+        terms: that were fitted.
+        others: (G, 3) row, column (px) and flux over that of the spot.
+        others_sigma: (G, 3) their standard deviations.
+        smear: (2, 2) px^2, second moments of the smear; zeros where none was fitted.
+        smear_sigma: (2, 2) px^2.
+        level: (H, W) DN, the fitted image.
+        variance: (H, W) DN^2 of the mean, also where a pixel is not used.
+        used: (H, W) pixels.
+        core: reduced chi-square of the pixels in the spot's core, and their number.
+        cost: sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot
+            stood still, minus 1.
+        missing: the same without what movement between frames does.
+    """
+
+    positions: SpotPositions
+    terms: FitTerms
+    others: Array
+    others_sigma: Array
+    smear: Array
+    smear_sigma: Array
+    level: Array
+    variance: Array
+    used: Mask
+    core: tuple[float, int]
+    cost: float
+    missing: float
+
+    def residual(self, mean: Array) -> Array:
+        """(H, W) what the image has more than the model, in standard deviations; 0 where a pixel is not used.
+
+        Args:
+            mean: the image, (H, W) DN.
+        """
+        return np.asarray(np.where(self.used, (mean - self.level) / np.sqrt(self.variance), 0.0))
+
+    def explains(self, mean: Array) -> float:
+        """Chi-square of the image.
+
+        Args:
+            mean: the image, (H, W) DN.
+        """
+        return float(np.square(self.residual(mean)).sum())
+
+    @property
+    def core_fits(self) -> bool:
+        """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6."""
+        value, count = self.core
+        return value * count <= chi2.isf(1e-6, max(count - 4, 1))
+
+
+def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
+    """One of the shapes of a template, for images of another size.
+
+    Args:
+        template: T shapes.
+        index: which.
+        shape: (H, W) of the images.
+    """
+    own = slice(index, index + 1)
+    rows, columns = template.row_factors[own], template.column_factors[own]
+    return replace(template, row_factors=rows, column_factors=columns, centre=template.centre[own], shape=shape)
+
+
+def fit_screened(
+    mean: Array,
+    counts: Array,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms | None = None,
+    near: ScreenedFit | None = None,
+    jitter: Array | None = None,
+    edge_px: float = EDGE_PX,
+) -> ScreenedFit:
+    """Fit one spot.
+
+    Args:
+        mean: (H, W) DN.
+        counts: (H, W) frames that each pixel is the mean of.
+        good: (H, W) pixels that are used.
+        noise: of the detector.
+        template: the spot's one shape.
+        terms: what else is fitted; None for nothing.
+        near: a fit to begin at; None to look for the brightest spot.
+        jitter: (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
+        edge_px: least distance of a centre from the image's outermost pixel centres.
+
+    Raises:
+        SpotError: no spot, or it cannot be fitted.
+    """
+    terms = FitTerms() if terms is None else terms
+    try:
+        return _fit(mean, counts, good, noise, template, terms, near, jitter, edge_px)
+    except TemplateRangeError as error:
+        raise SpotError({0: "the fit left the range of the template; calibrate it with a larger margin"}) from error
+    except np.linalg.LinAlgError as error:
+        raise SpotError({0: "too few good pixels are left to fit the spot"}) from error
+
+
+def _fit(
+    mean: Array,
+    counts: Array,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    near: ScreenedFit | None,
+    jitter: Array | None,
+    edge_px: float,
+) -> ScreenedFit:
+    model = _Model(template, terms, mean.shape[0], mean.shape[1])
+    theta = _start(mean, counts, good, noise, model) if near is None else model.begun(near)
+    spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
+    flat, use, many = mean.ravel(), good.ravel(), counts.ravel()
+    for _ in range(_MOST_STEPS):
+        design, level = model.design(theta)
+        weight = use / _variance(level, many, noise)
+        weighted = design * weight
+        normal = weighted @ design.T
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+        step = inverse @ (weighted @ (flat - level))
+        theta, length = model.moved(theta, step)
+        spot_image.check_edge(theta[None, :2], *template.shape, 2.0)
+        if length < _REST_PX:
+            break
+    design, level = model.design(theta)
+    spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
+    weak = theta[2] < _FLUX_SIGMAS * np.sqrt(inverse[2, 2])
+    spot_image.reject(np.array([weak]), f"no spot: the flux is not significant (below {_FLUX_SIGMAS:g} sigma)")
+    influence = inverse[:2] @ weighted
+    temporal_variance = noise.temporal_variance_dn2(level, 1) / many
+    temporal = (influence * temporal_variance) @ influence.T
+    fixed = (influence * noise.fixed_variance_dn2(level)) @ influence.T
+    moved = np.zeros((2, 2)) if jitter is None else jitter / float(np.median(many))
+    square = np.square(flat - level) * weight
+    used = int(np.count_nonzero(use))
+    shape = mean.shape
+    core = use & (model.light(theta) > _CORE_SHARE * model.light(theta).max())
+    places = [model.other(theta, inverse, k) for k in range(len(terms.others))]
+    smear, smear_sigma = model.smear_of(theta, inverse)
+    positions = SpotPositions(
+        row=theta[0:1],
+        column=theta[1:2],
+        temporal_covariance=(temporal + moved)[None],
+        fixed_covariance=fixed[None],
+        flux=theta[2:3],
+        background=theta[3:4],
+        converged=np.array([length < _REST_PX]),
+        iterations=0,
+        reduced_chi_square=np.array([square.sum() / max(used - len(theta), 1)]),
+        gain_maps=influence.reshape(1, 2, *shape),
+        light_dn=noise.light_signal_dn(level).reshape(1, *shape),
+    )
+    return ScreenedFit(
+        positions=positions,
+        terms=terms,
+        others=np.array([place for place, _ in places]).reshape(-1, 3),
+        others_sigma=np.array([sigma for _, sigma in places]).reshape(-1, 3),
+        smear=smear,
+        smear_sigma=smear_sigma,
+        level=level.reshape(shape),
+        variance=_variance(level, many, noise).reshape(shape),
+        used=good,
+        core=(float(square[core].mean()) if np.any(core) else 0.0, int(np.count_nonzero(core))),
+        cost=_cost(design[:4], level, many, noise, temporal + moved + fixed),
+        missing=_cost(design[:4], level, many, noise, temporal + fixed),
+    )
+
+
+def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
+    return np.asarray(noise.temporal_variance_dn2(level, 1) / counts + noise.fixed_variance_dn2(level))
+
+
+def _cost(design: Array, level: Array, counts: Array, noise: NoiseModel, covariance: Array) -> float:
+    """Sigma of the place over that of an image with nothing missing and nothing else in it, minus 1."""
+    weighted = design / _variance(level, np.full_like(counts, counts.max()), noise)
+    ideal = np.linalg.inv(weighted @ design.T)[:2, :2]
+    return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
+
+
+def _start(mean: Array, counts: Array, good: Mask, noise: NoiseModel, model: _Model) -> Array:
+    """Place of the brightest spot, then flux and level, in which the model is linear."""
+    filled = spot_image.filled(mean, good)
+    frames = max(int(np.median(counts)), 1)
+    # what is saturated has been left out
+    whole = replace(noise, saturation_dn=1e300)
+    row, column, background, _, _ = spot_image.coarse(filled[None], frames, whole)
+    flux = max(float((filled - background[0]).sum()), 1.0)
+    return model.first((float(row[0]), float(column[0])), flux, float(background[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Parameters: row, column, flux, level; slopes and curvature of the background; row, column and flux of each other
+    spot; second moments of the smear (rows, across, columns).
+    """
+
+    template: SpotTemplate
+    terms: FitTerms
+    height: int
+    width: int
+
+    @property
+    def _slopes(self) -> int:
+        return (0, 2, 5)[self.terms.background]
+
+    @property
+    def _others(self) -> int:
+        """Where the other spots begin."""
+        return 4 + self._slopes
+
+    @property
+    def _smear(self) -> int:
+        return self._others + 3 * len(self.terms.others)
+
+    def first(self, place: tuple[float, float], flux: float, level: float) -> Array:
+        theta = np.zeros(self._smear + 3 * self.terms.smear)
+        theta[:4] = *place, flux, level
+        for k, (row, column) in enumerate(self.terms.others):
+            theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, 0.01 * flux
+        return theta
+
+    def begun(self, near: ScreenedFit) -> Array:
+        """Where another fit has ended; what it had not is begun anew."""
+        p = near.positions
+        theta = self.first((float(p.row[0]), float(p.column[0])), float(p.flux[0]), float(p.background[0]))
+        for k, (row, column, share) in enumerate(near.others[: len(self.terms.others)]):
+            theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, share * theta[2]
+        if self.terms.smear:
+            theta[self._smear :] = near.smear[0, 0], near.smear[0, 1], near.smear[1, 1]
+        return theta
+
+    def moved(self, theta: Array, step: Array) -> tuple[Array, float]:
+        """The next parameters, and by how much the spot's place changes."""
+        places = [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
+        length = max(float(np.abs(step[places]).max()), 1e-300)
+        short = min(1.0, 1.0 / length)
+        if step[2] < -0.9 * theta[2]:
+            short = min(short, -0.9 * theta[2] / step[2])
+        out = theta + short * step
+        if self.terms.smear:
+            # not more than the shape itself in one step
+            change = np.clip(step[self._smear :], -2.0, 2.0)
+            out[self._smear :] = np.clip(theta[self._smear :] + short * change, -_MOST_SMEAR, _MOST_SMEAR)
+        # another spot stays where the shape is known, smear included
+        reach = 1.0 + 1.8 * float(np.sqrt(np.square(self._spread(out)).sum()))
+        for k in range(len(self.terms.others)):
+            for axis, (low, high) in enumerate(self.template.supported()):
+                at = self._others + 3 * k + axis
+                out[at] = min(max(out[at], low + reach), high - reach)
+        return out, length
+
+    def _spread(self, theta: Array) -> Array:
+        """Square root of the positive part of the smear, (2, 2) px."""
+        if not self.terms.smear:
+            return np.zeros((2, 2))
+        rows, across, columns = theta[self._smear :]
+        value, vector = np.linalg.eigh(np.array([[rows, across], [across, columns]]))
+        return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
+
+    def _shape(self, row: float, column: float, spread: Array) -> Array:
+        """(3, P): the shape and its derivatives by row and column."""
+        if not np.any(spread):
+            return np.stack(self.template.evaluate(row, column)).reshape(3, -1)
+        out = np.zeros((3, self.height * self.width))
+        for (x, wx), (y, wy) in product(zip(_NODES, _NODE_WEIGHTS, strict=True), repeat=2):
+            d = spread @ (x, y)
+            part = np.stack(self.template.evaluate(row + d[0], column + d[1])).reshape(3, -1)
+            out += wx * wy / (2.0 * np.pi) * part
+        return out
+
+    def _second(self, row: float, column: float, spread: Array) -> Array:
+        """(3, P): half the second derivatives by rows, across (twice the half) and columns."""
+        h = _SLOPE_PX
+        up, down = self._shape(row + h, column, spread), self._shape(row - h, column, spread)
+        right, left = self._shape(row, column + h, spread), self._shape(row, column - h, spread)
+        across = 0.5 * ((up[2] - down[2]) + (right[1] - left[1])) / (2.0 * h)
+        return np.stack([0.5 * (up[1] - down[1]) / (2.0 * h), across, 0.5 * (right[2] - left[2]) / (2.0 * h)])
+
+    def _spots(self, theta: Array) -> list[tuple[int, int, int]]:
+        """Numbers of the parameters row, column and flux of every spot."""
+        first = [0, *(self._others + 3 * k for k in range(len(self.terms.others)))]
+        return [(k, k + 1, k + 2) for k in first]
+
+    def light(self, theta: Array) -> Array:
+        """(P,) DN of the spot itself."""
+        return np.asarray(theta[2] * self._shape(theta[0], theta[1], self._spread(theta))[0])
+
+    def design(self, theta: Array) -> tuple[Array, Array]:
+        """Derivatives (K, P) and level (P,)."""
+        design = np.zeros((len(theta), self.height * self.width))
+        level = np.full(self.height * self.width, theta[3])
+        design[3] = 1.0
+        v, u = np.meshgrid(np.linspace(-1, 1, self.height), np.linspace(-1, 1, self.width), indexing="ij")
+        bends = [v, u, v * v - 1.0 / 3.0, u * v, u * u - 1.0 / 3.0]
+        for k in range(self._slopes):
+            design[4 + k] = bends[k].ravel()
+            level += theta[4 + k] * design[4 + k]
+        spread = self._spread(theta)
+        for row, column, flux in self._spots(theta):
+            shape = self._shape(theta[row], theta[column], spread)
+            design[flux] = shape[0]
+            design[row], design[column] = theta[flux] * shape[1], theta[flux] * shape[2]
+            level += theta[flux] * shape[0]
+            if self.terms.smear:
+                design[self._smear :] += theta[flux] * self._second(theta[row], theta[column], spread)
+        if self.terms.smear:
+            # the part that is no smear, by its first order: noise may make a moment negative
+            rest = theta[self._smear :] - self._positive(spread)
+            level += rest @ design[self._smear :]
+        return design, level
+
+    @staticmethod
+    def _positive(spread: Array) -> Array:
+        whole = spread @ spread.T
+        return np.array([whole[0, 0], whole[0, 1], whole[1, 1]])
+
+    def other(self, theta: Array, inverse: Array, k: int) -> tuple[Array, Array]:
+        """Row, column and share of another spot's light, and their standard deviations."""
+        own = slice(self._others + 3 * k, self._others + 3 * k + 3)
+        scale = np.array([1.0, 1.0, 1.0 / theta[2]])
+        return theta[own] * scale, np.sqrt(np.diag(inverse)[own]) * scale
+
+    def smear_of(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
+        """Moments and their standard deviations, (2, 2)."""
+        if not self.terms.smear:
+            return np.zeros((2, 2)), np.zeros((2, 2))
+        a, b = theta[self._smear :], np.sqrt(np.diag(inverse)[self._smear :])
+        return np.array([[a[0], a[1]], [a[1], a[2]]]), np.array([[b[0], b[1]], [b[1], b[2]]])

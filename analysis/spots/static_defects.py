@@ -1,0 +1,417 @@
+"""What is the same in all frames of a spot and is not the spot: bad pixels, columns and rows, an uneven background,
+reflections.
+
+Everything is looked for in the residuals of the fitted shape. A pixel is bad when it differs from what the pixels about
+it predict: light comes through the optics and has no detail of one pixel. Whether an uneven background or a reflection
+is there is decided by what it explains of chi-square. Each test finds something in one of 1 / FALSE_ALARM clean images;
+where something was found, pixels are then left out from `CLOSER` sigmas on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, signal
+from scipy.stats import chi2, norm
+
+from analysis.spots import spot_image
+from analysis.spots.frame_screening import FALSE_ALARM, Finding, ScreenedFrames
+from analysis.spots.noise import NoiseModel
+from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
+from analysis.spots.spot_positions import SpotError
+from analysis.spots.spot_template import SpotTemplate
+
+__all__ = ["Examined", "examine", "lone_pixels", "refit"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+CLOSER = 4.5
+"""Sigmas of a pixel from which it is left out of an image that is known to hold defects."""
+MOST_OTHERS = 3
+"""Reflections that are fitted."""
+NEAREST_PX = 4.0
+"""Nearer lights are not told from the spot."""
+_REACH = 2
+_MISFIT = 0.05
+"""Share of the residual around a pixel by which its prediction may be wrong."""
+_ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
+_BESIDE = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6.0
+"""Weights by which a line is predicted from those beside it: a parabola through them."""
+_NEAR_SPOT_PX = 15.0
+"""Pixels of a line so near to the spot do not judge it."""
+_LINE_SHARE = 0.4
+"""Of the pixels of a column or row: if so many are bad, all are."""
+_ABOVE_RING = 6.0
+"""Of a reflection over what else is left over at the same distance from the spot, in its own scatter."""
+_EDGE_LIGHT_PX = 12.0
+"""Radius of what is left out about a light that the shape cannot be fitted to."""
+_LEAST_SHARE = 5.0
+"""Sigmas of a further spot's light below which it is none."""
+_ROUNDS = 8
+_GROSS = 4.0
+"""Times the limit for a pixel while smear is not fitted yet."""
+_STEEP = 0.15
+"""Share of the rise about a pixel by which it may be off where no shape is known."""
+
+
+def _prediction() -> Array:
+    """(5, 5) weights by which a pixel is predicted from those about it, by a quadratic surface through them."""
+    row, column = np.mgrid[-_REACH : _REACH + 1, -_REACH : _REACH + 1].reshape(2, -1).astype(np.float64)
+    around = (row != 0) | (column != 0)
+    design = np.stack([np.ones_like(row), row, column, row * row, row * column, column * column])[:, around]
+    out = np.zeros(row.size)
+    out[around] = np.linalg.pinv(design.T)[0]
+    return out.reshape(2 * _REACH + 1, -1)
+
+
+_PREDICTION = _prediction()
+_ALONE = 0.4 * float(np.abs(_PREDICTION).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """A spot in one state.
+
+    Attributes:
+        screened: its frames.
+        good: (H, W) pixels that are used.
+        static: (H, W) pixels that were found bad here, which are bad in all states.
+        fit: of the spot.
+        findings: of the frames and here.
+    """
+
+    screened: ScreenedFrames
+    good: Mask
+    static: Mask
+    fit: ScreenedFit
+    findings: tuple[Finding, ...]
+
+    @property
+    def clean(self) -> bool:
+        """Whether the measurement is that of clean frames."""
+        return not any(finding.corrects for finding in self.findings)
+
+
+def examine(
+    screened: ScreenedFrames,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    vibration: bool = False,
+    own: bool = False,
+    searched: bool = True,
+) -> Examined:
+    """Find what is in an image beside the spot.
+
+    Args:
+        screened: frames of one state.
+        noise: of the detector.
+        template: the spot's one shape.
+        vibration: whether smear is fitted.
+        own: whether the shape was learnt from this very image, so that residuals of it say nothing.
+        searched: whether anything is looked for; else what is known already is left out and fitted.
+
+    Raises:
+        SpotError: no spot, or it cannot be measured.
+    """
+    mean = screened.mean
+    start = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
+    good = start
+    smeared = (vibration or bool(np.any(screened.jitter))) and not own
+    terms = FitTerms()
+    lines, edges = np.zeros_like(good), np.zeros_like(good)
+    limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
+    dirty = not screened.clean or not np.array_equal(good, screened.good)
+    fit = _fitted(screened, good, noise, template, terms)
+    # what is gross first, lest it is taken for smear or for another spot
+    for rough in (True, False):
+        if not rough and smeared:
+            terms = replace(terms, smear=True)
+            fit = _fitted(screened, good, noise, template, terms, fit)
+        for _ in range(_ROUNDS if searched else 0):
+            before = good, terms
+            least = (_GROSS if smeared else 1.0) * limit if rough else CLOSER if dirty else limit
+            # found anew every time: an earlier fit may have been wrong
+            found = _outliers(mean, fit, start, least)
+            lines = _lines(mean, fit, start & ~found, screened.good & (~start | found))
+            good = start & ~found & ~lines & ~edges
+            dirty = dirty or bool(np.any(found | lines))
+            if not np.array_equal(good, before[0]):
+                fit = _fitted(screened, good, noise, template, terms, fit)
+            if not own and not rough:
+                terms, fit = _uneven(screened, good, noise, template, terms, fit)
+                terms, fit, edge = _others(screened, good, noise, template, terms, fit)
+                edges, good = edges | edge, good & ~edge
+            dirty = dirty or terms.background > 0 or bool(terms.others) or bool(np.any(edges))
+            if np.array_equal(good, before[0]) and terms == before[1]:
+                break
+    bad = screened.good & ~good & ~edges
+    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit)))
+
+
+def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
+    """Pixels (H, W) that are not as those about them say, where no shape is known that they could be held against.
+
+    Args:
+        screened: frames of one state.
+        noise: of the detector.
+    """
+    mean, good = screened.mean, screened.good & ~_rough(screened.mean, screened, noise)
+    smooth = ndimage.median_filter(spot_image.filled(mean, good), 5)
+    steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
+    variance = noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth)
+    limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
+    found = _off(mean, variance + (_STEEP * steep / limit) ** 2, good, limit)
+    return np.asarray(screened.good & (~good | found))
+
+
+def refit(
+    examined: Examined, static: Mask, noise: NoiseModel, template: SpotTemplate, told: tuple[Finding, ...] = ()
+) -> Examined:
+    """The same with further pixels left out, that are bad in another state.
+
+    Args:
+        examined: a spot.
+        static: (H, W) pixels that are bad.
+        noise: of the detector.
+        template: the spot's one shape.
+        told: what is to be said of it.
+
+    Raises:
+        SpotError: too few pixels are left.
+    """
+    good = examined.good & ~static
+    terms = replace(examined.fit.terms, others=tuple((float(r), float(c)) for r, c, _ in examined.fit.others))
+    fit = _fitted(examined.screened, good, noise, template, terms, examined.fit)
+    return Examined(examined.screened, good, examined.static | static, fit, (*examined.findings, *told))
+
+
+def _fitted(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    near: ScreenedFit | None = None,
+) -> ScreenedFit:
+    return fit_screened(screened.mean, screened.counts, good, noise, template, terms, near=near, jitter=screened.jitter)
+
+
+def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
+    """Gross defects away from the spot, which would draw the first fit."""
+    filled = spot_image.filled(mean, screened.good)
+    smooth = ndimage.median_filter(filled, 5)
+    sigma = np.sqrt(noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth))
+    steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
+    out = np.abs(mean - smooth) > _ROUGH_SIGMAS * sigma + steep
+    top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
+    row, column = np.indices(mean.shape)
+    return np.asarray(out & screened.good & (np.hypot(row - top[0], column - top[1]) > _ROUGH_PX))
+
+
+def _outliers(mean: Array, fit: ScreenedFit, good: Mask, limit: float) -> Mask:
+    """Pixels of which the residual is not as those about them say."""
+    return _off(mean - fit.level, fit.variance, good, limit)
+
+
+def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
+    """Pixels that are off by more than ``limit`` sigmas, the worst of each neighbourhood first."""
+    use = good.copy()
+    found = np.zeros_like(good)
+    for _ in range(50):
+        image = spot_image.filled(residual, use)
+        around = ndimage.convolve(image, _PREDICTION, mode="nearest")
+        spread = variance + ndimage.convolve(np.where(use, variance, 0.0), _PREDICTION**2, mode="nearest")
+        spread += (_MISFIT * around) ** 2
+        z = np.where(use, np.abs(image - around) / np.sqrt(np.maximum(spread, 1e-300)), 0.0)
+        # where most neighbours are missing themselves they predict nothing
+        alone = ndimage.convolve((~use).astype(np.float64), np.abs(_PREDICTION), mode="nearest") > _ALONE
+        z[alone] = 0.0
+        new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _REACH + 1))
+        if not np.any(new):
+            break
+        found |= new
+        use &= ~new
+    return found
+
+
+def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
+    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted.
+
+    A line is held against its neighbours, in the median of its pixels away from the spot.
+    """
+    out = np.zeros_like(good)
+    sigma = np.sqrt(fit.variance)
+    place = fit.positions.row[0], fit.positions.column[0]
+    for axis in (0, 1):
+        size, lines = good.shape[axis], good.shape[1 - axis]
+        far = np.abs(np.arange(size) - place[axis]) > _NEAR_SPOT_PX
+        z = np.moveaxis((mean - fit.level) / sigma, axis, 0)[far]
+        used = np.moveaxis(good, axis, 0)[far]
+        count = np.count_nonzero(used, axis=0)
+        middle = np.array([np.median(z[used[:, k], k]) if count[k] else 0.0 for k in range(lines)])
+        spread = np.sqrt(math.pi / 2.0 / np.maximum(count, 1))
+        limit = float(norm.isf(FALSE_ALARM / (2.0 * lines)))
+        use = count > 0.25 * len(z)
+        off = np.count_nonzero(bad, axis=axis) > _LINE_SHARE * size
+        for _ in range(lines // 10):
+            known = use & ~off
+            if np.count_nonzero(known) < 5:
+                break
+            filled = np.interp(np.arange(lines), np.flatnonzero(known), middle[known])
+            around = ndimage.convolve1d(filled, _BESIDE, mode="nearest")
+            noise = np.hypot(spread, np.sqrt(ndimage.convolve1d(spread**2, _BESIDE**2, mode="nearest")))
+            score = np.where(known, np.abs(middle - around) / np.hypot(noise, _MISFIT * around), 0.0)
+            worst = int(np.argmax(score))
+            if score[worst] <= limit:
+                break
+            off[worst] = True
+        out |= np.expand_dims(off, axis)
+    return np.asarray(out & good)
+
+
+def _uneven(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    fit: ScreenedFit,
+) -> tuple[FitTerms, ScreenedFit]:
+    """Slopes and curvature of the background, where they explain more than chance does."""
+    for order, more in ((1, 2), (2, 3)):
+        if terms.background >= order:
+            continue
+        wider = replace(terms, background=order)
+        tried = _fitted(screened, good, noise, template, wider, fit)
+        if fit.explains(screened.mean) - tried.explains(screened.mean) <= chi2.isf(FALSE_ALARM, more):
+            # a bend without a slope is tried as well
+            if order == 1:
+                continue
+            break
+        if (
+            order == 1
+            or terms.background == 1
+            or fit.explains(screened.mean) - tried.explains(screened.mean) > chi2.isf(FALSE_ALARM, 5)
+        ):
+            terms, fit = wider, tried
+    return terms, fit
+
+
+def _others(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    fit: ScreenedFit,
+) -> tuple[FitTerms, ScreenedFit, Mask]:
+    """Further spots, the brightest first, where they explain more than chance does; those at the edge are left out."""
+    edges = np.zeros_like(good)
+    terms, fit = _kept(screened, good, noise, template, terms, fit)
+    while len(terms.others) < MOST_OTHERS:
+        place = _second_light(screened.mean, fit, good & ~edges, template)
+        if place is None:
+            break
+        if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(place, template.supported(), strict=True)):
+            row, column = np.indices(good.shape)
+            edges = edges | (good & (np.hypot(row - place[0], column - place[1]) <= _EDGE_LIGHT_PX))
+            fit = _fitted(screened, good & ~edges, noise, template, terms, fit)
+            continue
+        wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), place))
+        try:
+            tried = _fitted(screened, good & ~edges, noise, template, wider, fit)
+        except SpotError:
+            break
+        row, column, share = tried.others[-1]
+        away = math.hypot(row - tried.positions.row[0], column - tried.positions.column[0])
+        gain = fit.explains(screened.mean) - tried.explains(screened.mean)
+        if share <= 0.0 or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
+            break
+        terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
+        fit = tried
+    return terms, fit, edges
+
+
+def _kept(
+    screened: ScreenedFrames,
+    good: Mask,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    terms: FitTerms,
+    fit: ScreenedFit,
+) -> tuple[FitTerms, ScreenedFit]:
+    """Without further spots that are no longer needed."""
+    bright = fit.others[:, 2] > _LEAST_SHARE * fit.others_sigma[:, 2]
+    if np.all(bright):
+        return terms, fit
+    terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in fit.others[bright]))
+    fit = replace(fit, others=fit.others[bright], others_sigma=fit.others_sigma[bright])
+    return terms, _fitted(screened, good, noise, template, terms, fit)
+
+
+def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate) -> tuple[float, float] | None:
+    """Where the residuals look most like another spot; None where they do not."""
+    height, width = mean.shape
+    middle = (height // 2, width // 2)
+    stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
+    reach = min(20, *middle)
+    stamp = stamp[middle[0] - reach : middle[0] + reach + 1, middle[1] - reach : middle[1] + reach + 1]
+    weight = np.where(fit.used, 1.0 / fit.variance, 0.0)
+    turned = stamp[::-1, ::-1]
+    amplitude = signal.fftconvolve((mean - fit.level) * weight, turned, mode="same")
+    power = np.maximum(signal.fftconvolve(weight, turned**2, mode="same"), 1e-300)
+    score = np.where(power > 0.3 * np.median(power), amplitude / np.sqrt(power), 0.0)
+    row, column = np.indices(mean.shape)
+    away = np.hypot(row - fit.positions.row[0], column - fit.positions.column[0])
+    score = np.where(good & (away > NEAREST_PX), score, 0.0)
+    limit = float(norm.isf(FALSE_ALARM / mean.size))
+    for _ in range(5):
+        top = np.unravel_index(int(np.argmax(score)), score.shape)
+        if score[top] <= limit:
+            return None
+        # what a spot of another shape leaves over lies all around it
+        ring = (np.abs(away - away[top]) < 3.0) & (np.hypot(row - top[0], column - top[1]) > 8.0)
+        rest = 1.4826 * float(np.median(np.abs(score[ring]))) if np.count_nonzero(ring) > 20 else 1.0
+        if score[top] > _ABOVE_RING * max(rest, 1.0):
+            return float(top[0]), float(top[1])
+        score = np.where(np.hypot(row - top[0], column - top[1]) > 4.0, score, 0.0)
+    return None
+
+
+def _told(bad: Mask, edges: Mask, fit: ScreenedFit) -> list[Finding]:
+    """What was found, in words."""
+    out = []
+    full = [np.flatnonzero(bad.sum(axis=axis) > 0.5 * bad.shape[axis]) for axis in (0, 1)]
+    along = np.zeros_like(bad)
+    along[:, full[0]] = along[full[1]] = True
+    single = int(np.count_nonzero(bad & ~along))
+    if single:
+        where = np.argwhere(bad & ~along)[:3]
+        shown = ", ".join(f"({r}, {c})" for r, c in where)
+        more = ", ..." if single > 3 else ""
+        out.append(Finding("bad pixels", f"{single} hot, dead or otherwise off are left out: {shown}{more}"))
+    for numbers, name in zip(full, ("columns", "rows"), strict=True):
+        if numbers.size:
+            shown = ", ".join(map(str, numbers[:5]))
+            out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are left out"))
+    if fit.terms.background:
+        what = "slopes" if fit.terms.background == 1 else "slopes and curvature"
+        rise = float(np.ptp(fit.level[[0, 0, -1, -1], [0, -1, 0, -1]]))
+        out.append(Finding("uneven background", f"its {what} are fitted, {rise:.2g} DN between the corners"))
+    for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
+        out.append(
+            Finding(
+                "second light",
+                f"at row {row:.1f}, column {column:.1f} with {100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light; "
+                "it is fitted",
+            )
+        )
+    if np.any(edges):
+        out.append(Finding("second light", "near the edge of the frames; what surrounds it is left out"))
+    if fit.terms.smear:
+        rows, columns = (math.sqrt(max(fit.smear[k, k], 0.0)) for k in (0, 1))
+        out.append(Finding("smear", f"{rows:.2f} px in row and {columns:.2f} px in column, rms, is fitted"))
+    return out

@@ -1,0 +1,92 @@
+"""``python -m twin.recover``: measured frames of a monitor, and what they say."""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenes.specs.file_kinds import read_for
+from scenes.specs.measurement_setup import MeasurementSetup, resolve_measurement
+from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
+from twin.run.command import Result, Session, print_report, run_command
+from twin.run.reference_frames import described
+
+PROGRAM = "twin.recover"
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    measurement: Annotated[
+        Path, typer.Argument(readable=False, help="YAML file of the measurement, or the config.yaml of a run.")
+    ],
+    out: Out = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Recover what moved from measured frames of a monitor's area CCDs, before and after: the centroids and estimators
+    of `python -m twin.render`, with total sigmas and without a truth.
+
+    The measurement's file names the instrument and the frames:
+
+        instrument: gf7_pair
+
+        frames: run/images
+
+    A folder holds CAMERA_SIDE_before.tiff and CAMERA_SIDE_after.tiff, as twin.render writes them; or the files are
+    named for each channel, in a CSV table, or as a series with times. TIFF (also packed), FITS and PNG are read.
+
+    Without a model of the instrument its geometry will do: then the shape of the spots is learnt from the frames
+    before, and nothing is known of what disturbances do.
+
+    Frames are searched for what is no spot: hot, dead and flickering pixels, bad columns, cosmic rays, frames without
+    light, saturation, uneven background, reflections, movement between frames. What is found is left out or fitted,
+    told with its cost in sigma, or refused by name. Clean frames give what twin.render gives, to the last digit.
+
+    The run folder gets recovered.json, report.html, config.yaml, and figures and tables in artefacts/.
+
+    Example: `python -m twin.recover scenes/examples/measured_frames.yaml --out runs/measured`
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+
+    def work(setup: MeasurementSetup, session: Session) -> Result:
+        from twin.recover.recover_report import KIND, recover_numbers, recover_report
+        from twin.recover.recover_run import run_recover
+        from twin.run.page import RunFacts, write_test
+
+        run = run_recover(setup, session.backend, session.advance)
+        shown, numbers = recover_report(run), recover_numbers(run)
+        facts = RunFacts(
+            setup.to_yaml(),
+            str(measurement),
+            session.backend.name,
+            None,
+            session.started,
+            session.seconds,
+            PROGRAM,
+            "",
+        )
+        write_test(KIND, numbers, shown, facts, session.folder)
+        return Result(described(KIND, numbers), lambda console: print_report(shown, console))
+
+    run_command(
+        measurement.stem,
+        Options(out, None, backend, force, as_json, quiet),
+        lambda: read_for(PROGRAM, measurement, resolve_measurement),
+        work,
+    )
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,269 @@
+"""One channel of a measurement: its frames searched for defects, its spot measured in every state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from analysis.monitor.calibration import MonitorCalibration
+from analysis.monitor.recovery import measure_spots
+from analysis.spots.centroid import mean_frames
+from analysis.spots.frame_screening import Finding, FramesError, ScreenedFrames, screen_frames
+from analysis.spots.learnt_template import learn_template
+from analysis.spots.photon_transfer import PixelCorrection
+from analysis.spots.screened_fit import one_shape
+from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_template import SpotTemplate
+from analysis.spots.static_defects import Examined, examine, lone_pixels, refit
+from scenes.specs.measurement import MeasurementSpec
+from scenes.yaml.errors import Issue
+from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
+
+__all__ = ["ChannelMeasurement", "ChannelResult", "SpotResult", "remedy"]
+
+DEAREST = 4.0
+"""Times that sigma may grow by what is missing, before a spot counts as lost."""
+_REMEDIES = (
+    (
+        "too near the edge",
+        "frames in which the spot stands 10 pixels or more inside; another crop, or a shifted window",
+    ),
+    ("saturated", "frames with less light or a shorter exposure"),
+    ("no spot", "frames that hold the channel's spot: the right file, with the light on"),
+    ("range of the template", "a spot nearer to where the calibrated one stands"),
+    ("missing", "frames with less light, or with fewer bad pixels at the spot"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SpotResult:
+    """One channel in one state.
+
+    Attributes:
+        frames: as recorded.
+        mean: (H, W) DN that was measured.
+        used: (H, W) pixels that were used.
+        residual: (H, W) mean over the fitted shape, in standard deviations; None where no shape was fitted.
+        findings: what was found in the frames and what became of it.
+        cost: sigma of the place over what it would be without what was found, minus 1.
+        core: reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
+        fits: whether the core has the calibrated shape.
+    """
+
+    frames: StateFrames
+    mean: np.ndarray
+    used: np.ndarray
+    residual: np.ndarray | None
+    findings: tuple[Finding, ...]
+    cost: float
+    core: tuple[float, int] | None = None
+    fits: bool = True
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was corrected."""
+        return not any(finding.corrects for finding in self.findings)
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelResult:
+    """One channel.
+
+    Attributes:
+        channel: its frames and what is known of its CCD.
+        before: in the nominal state.
+        after: in each of the others.
+    """
+
+    channel: ChannelFrames
+    before: SpotResult
+    after: tuple[SpotResult, ...]
+
+    def states(self) -> tuple[tuple[str, SpotResult], ...]:
+        """Name and result of each: before, after, or after with its number."""
+        many = len(self.after) > 1
+        return (
+            ("before", self.before),
+            *((f"after {k + 1}" if many else "after", one) for k, one in enumerate(self.after)),
+        )
+
+
+def remedy(reason: str) -> str:
+    """What to do where a spot cannot be measured for that reason."""
+    return next((remedy for word, remedy in _REMEDIES if word in reason), "other frames of this channel")
+
+
+class ChannelMeasurement:
+    """The work on one channel: search its frames, then measure its spots.
+
+    Args:
+        test: the measurement.
+        channel: its frames.
+        shape: of its spot on the whole CCD; None to learn it from the frames before.
+    """
+
+    def __init__(self, test: MeasurementSpec, channel: ChannelFrames, shape: SpotTemplate | None) -> None:
+        self._test, self.channel, self.shape = test, channel, shape
+        self._learnt = shape is None
+        self._screened: list[ScreenedFrames] = []
+        self._examined: list[Examined | None] = []
+        self.positions: list[SpotPositions] = []
+
+    @property
+    def _searches(self) -> bool:
+        return self._test.corrections == "automatic"
+
+    @property
+    def plain(self) -> bool:
+        """Whether the main job could measure these frames as they are."""
+        channel = self.channel
+        whole = all(state.shape == channel.ccd and not any(state.offset) for state in channel.states)
+        same = len({len(state.frames) for state in channel.after}) == 1
+        integers = all(np.issubdtype(state.frames.dtype, np.integer) for state in channel.states)
+        known = channel.correction is None and channel.transfer is None
+        untouched = all(screened.clean for screened in self._screened)
+        untouched &= all(one is None or one.clean for one in self._examined)
+        return whole and same and integers and known and untouched and self._test.vibration == "none"
+
+    def _template(self, state: StateFrames) -> SpotTemplate:
+        assert self.shape is not None
+        return one_shape(self.shape, 0, state.shape)
+
+    def search(self) -> list[Issue]:
+        """Compare frames with each other, and images with the shape of the spot; what is refused."""
+        issues: list[Issue] = []
+        for number, state in enumerate(self.channel.states):
+            try:
+                screened = self._screen(state)
+                if self.shape is None:
+                    screened, self.shape = self._learn(screened)
+                self._screened.append(screened)
+                self._examined.append(self._examine(number, state))
+            except FramesError as error:
+                issues.append(cannot_measure(self._test, state, self.channel.name, str(error), error.remedy))
+            except SpotError as error:
+                issues.append(self._lost(state, error))
+            if issues and number == 0:
+                break
+        return issues
+
+    def _lost(self, state: StateFrames, error: SpotError) -> Issue:
+        reason = "; ".join(error.reasons.values())
+        return cannot_measure(self._test, state, self.channel.name, reason, remedy(reason))
+
+    def _screen(self, state: StateFrames) -> ScreenedFrames:
+        channel = self.channel
+        bad = np.zeros(state.shape, dtype=bool)
+        if channel.bad is not None:
+            bad |= state.of_ccd(channel.bad)
+        if not self._searches:
+            values = state.frames
+            mean = mean_frames(values) if np.issubdtype(values.dtype, np.integer) else np.mean(values, axis=0)
+            counts, still = np.full(state.shape, float(len(values))), np.zeros((2, 2))
+            screened = ScreenedFrames(np.asarray(mean, np.float64), counts, ~bad, len(values), still, ())
+        else:
+            screened = screen_frames(state.frames, channel.raw_noise, bad)
+        if channel.correction is None:
+            return screened
+        known = channel.correction
+        dark, response, unusable = (state.of_ccd(one) for one in (known.dark, known.response, known.bad))
+        part = PixelCorrection(dark, response, unusable, known.noise)
+        told: tuple[Finding, ...] = (
+            Finding("dark frames" if self._test.flat is None else "dark and flat frames", "are taken off"),
+        )
+        worse = np.count_nonzero(part.bad & screened.good)
+        if worse:
+            told += (Finding("bad pixels", f"{worse} that dark and flat frames show are left out"),)
+        good = screened.good & ~part.bad
+        return replace(screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *told))
+
+    def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, SpotTemplate]:
+        """The shape of the spot before, without the pixels that no shape could have."""
+        if self._searches:
+            lone = lone_pixels(screened, self.channel.noise)
+            if np.any(lone):
+                told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise off are left out")
+                screened = replace(screened, good=screened.good & ~lone, findings=(*screened.findings, told))
+        return screened, learn_template(screened, self.channel.noise)
+
+    def _examine(self, number: int, state: StateFrames) -> Examined | None:
+        """None where nothing is searched for."""
+        screened, test = self._screened[number], self._test
+        fitted = test.vibration == "fitted"
+        if not self._searches and not fitted and np.all(screened.good):
+            return None
+        own = self._learnt and number == 0
+        return examine(screened, self.channel.noise, self._template(state), fitted, own, self._searches)
+
+    def measure(self) -> list[Issue]:
+        """Measure the spot in every state; what is refused."""
+        issues: list[Issue] = []
+        static = np.zeros(self.channel.ccd, dtype=bool)
+        for state, examined in zip(self.channel.states, self._examined, strict=True):
+            if examined is not None:
+                state.of_ccd(static)[...] |= examined.static
+        for number, state in enumerate(self.channel.states):
+            try:
+                self.positions.append(self._position(number, state, state.of_ccd(static)))
+            except SpotError as error:
+                issues.append(self._lost(state, error))
+        return issues
+
+    def _position(self, number: int, state: StateFrames, static: np.ndarray) -> SpotPositions:
+        examined, screened = self._examined[number], self._screened[number]
+        if examined is not None and np.any(static & examined.good):
+            more = np.count_nonzero(static & examined.good)
+            told = Finding("bad pixels", f"{more} that are bad in another state are left out here as well")
+            examined = refit(examined, static, self.channel.noise, self._template(state), (told,))
+            self._examined[number] = examined
+        if examined is None or examined.clean:
+            positions = self._as_ever(screened, state)
+        elif self._test.analysis.centroid != "ml":
+            reason = f"defects are fitted with the spot's shape, not by the {self._test.analysis.centroid} centroid"
+            raise SpotError({0: f"{reason} ({examined.findings[0].kind}: {examined.findings[0].text})"})
+        else:
+            positions = examined.fit.positions
+            if examined.fit.missing > DEAREST:
+                what = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
+                grown = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
+                raise SpotError({0: f"too much of the spot is missing ({what}): {grown}"})
+        return self._on_ccd(positions, state)
+
+    def _as_ever(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
+        calibration = MonitorCalibration({}, self._template(state), self.channel.noise)
+        return measure_spots(screened.mean[None], screened.frames, calibration, self._test.analysis.centroid)
+
+    def _on_ccd(self, positions: SpotPositions, state: StateFrames) -> SpotPositions:
+        """In pixels of the CCD."""
+        if state.shape == self.channel.ccd:
+            return positions
+        assert positions.gain_maps is not None
+        assert positions.light_dn is not None
+        gain, light = np.zeros((1, 2, *self.channel.ccd)), np.zeros((1, *self.channel.ccd))
+        for axis in (0, 1):
+            state.of_ccd(gain[0, axis])[...] = positions.gain_maps[0, axis]
+        state.of_ccd(light[0])[...] = positions.light_dn[0]
+        row, column = positions.row + state.offset[0], positions.column + state.offset[1]
+        return replace(positions, row=row, column=column, gain_maps=gain, light_dn=light)
+
+    def result(self) -> ChannelResult:
+        """What was found."""
+        spots = []
+        for number, state in enumerate(self.channel.states):
+            examined, screened = self._examined[number], self._screened[number]
+            fit = None if examined is None else examined.fit
+            findings = screened.findings if examined is None else examined.findings
+            spots.append(
+                SpotResult(
+                    frames=state,
+                    mean=screened.mean,
+                    used=screened.good if examined is None else examined.good,
+                    residual=None if fit is None else fit.residual(screened.mean),
+                    findings=findings,
+                    cost=0.0 if fit is None or examined is None or examined.clean else fit.cost,
+                    core=None if fit is None else fit.core,
+                    fits=fit is None or (self._learnt and number == 0) or fit.core_fits,
+                )
+            )
+        return ChannelResult(self.channel, spots[0], tuple(spots[1:]))

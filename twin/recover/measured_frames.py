@@ -1,0 +1,242 @@
+"""The files of a measurement, read: frames of every channel in every state, and what is known of its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.images.image_file import ImageError, ImageFile
+from analysis.spots.frame_screening import FramesError
+from analysis.spots.noise import NoiseModel
+from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
+from scenes.specs.measurement import MeasurementSpec, per_channel
+from scenes.specs.measurement_setup import AFTER, BEFORE, MeasurementSetup
+from scenes.yaml.errors import InputError, Issue, KeyPath
+from scenes.yaml.spec import Spec
+
+__all__ = ["ChannelFrames", "StateFrames", "cannot_measure", "read_measurement"]
+
+Shape = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class StateFrames:
+    """Frames of one channel in one state.
+
+    Attributes:
+        files: they are from, by their paths.
+        frames: (N, H, W) grey values as recorded.
+        offset: row and column of the CCD at which they begin.
+        key: where they stand in the measurement's file.
+    """
+
+    files: tuple[str, ...]
+    frames: np.ndarray
+    offset: Shape
+    key: KeyPath
+
+    @property
+    def shape(self) -> Shape:
+        """Rows and columns."""
+        return self.frames.shape[1], self.frames.shape[2]
+
+    def of_ccd(self, whole: np.ndarray) -> np.ndarray:
+        """The part of a map of the whole CCD, (rows, columns), that the frames show."""
+        (row, column), (height, width) = self.offset, self.shape
+        return whole[row : row + height, column : column + width]
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelFrames:
+    """All frames of one channel.
+
+    Attributes:
+        name: ``CAMERA/SIDE``.
+        ccd: rows and columns of its CCD.
+        before: of the nominal state.
+        after: of each state to be measured.
+        bad: (rows, columns) of the CCD: pixels of the bad-pixel map; None for none.
+        correction: of its pixels by dark and flat frames; None without.
+        transfer: measured photon transfer; None where the data sheet's is used.
+        noise: of the detector, as the corrected frames have it.
+        raw_noise: as the frames as recorded have it.
+    """
+
+    name: str
+    ccd: Shape
+    before: StateFrames
+    after: tuple[StateFrames, ...]
+    bad: np.ndarray | None
+    correction: PixelCorrection | None
+    transfer: PhotonTransfer | None
+    noise: NoiseModel
+    raw_noise: NoiseModel
+
+    @property
+    def states(self) -> tuple[StateFrames, ...]:
+        """Before, then all after."""
+        return (self.before, *self.after)
+
+
+def read_measurement(
+    setup: MeasurementSetup, noise: NoiseModel, ccd: Shape | None, advance: Callable[[int], None]
+) -> tuple[ChannelFrames, ...]:
+    """Read all files of a measurement.
+
+    Args:
+        setup: the measurement.
+        noise: of the CCDs by their data sheet.
+        ccd: rows and columns of the instrument's CCDs; None to take those of the frames before.
+        advance: told how many channels are read.
+
+    Raises:
+        InputError: files that cannot be read or do not fit; one issue for each channel.
+    """
+    out: list[ChannelFrames] = []
+    issues: list[Issue] = []
+    for number, name in enumerate(setup.channels):
+        try:
+            out.append(_channel(setup.test, name, noise, ccd))
+        except InputError as error:
+            issues += error.issues
+        advance(number + 1)
+    if issues:
+        raise InputError(*issues)
+    return tuple(out)
+
+
+def _channel(test: MeasurementSpec, name: str, noise: NoiseModel, ccd: Shape | None) -> ChannelFrames:
+    assert not isinstance(test.frames, str)
+    files = test.frames[name]
+    key: KeyPath = ("frames", name)
+    before = _state(test, files.before, files.offset, (*key, BEFORE))
+    offset = files.offset if files.offset_after is None else files.offset_after
+    after = tuple(_state(test, one, offset, (*key, AFTER)) for one in test.states(files))
+    if ccd is None:
+        every = (before, *after)
+        ccd = (
+            max(state.offset[0] + state.shape[0] for state in every),
+            max(state.offset[1] + state.shape[1] for state in every),
+        )
+    for state in (before, *after):
+        _check_place(test, state, ccd)
+    dark, flat = (_maps(test, what, name, ccd, before) for what in ("dark", "flat"))
+    bad = _bad(test, name, ccd, before)
+    transfer = correction = None
+    raw = noise
+    try:
+        if test.photon_transfer == "measured":
+            assert dark is not None
+            assert flat is not None
+            transfer = photon_transfer(dark, flat)
+            raw = transfer.noise_model(noise)
+        if dark is not None:
+            correction = pixel_correction(raw, dark, flat)
+    except FramesError as error:
+        which = "flat" if "flat" in str(error) else "dark"
+        raise _told(test, (which,), str(error), error.remedy) from error
+    if correction is not None and correction.dark.shape != ccd:
+        correction = _placed(correction, ccd, before)
+    corrected = raw if correction is None else correction.noise
+    return ChannelFrames(name, ccd, before, after, bad, correction, transfer, corrected, raw)
+
+
+def _told(test: Spec, key: KeyPath, problem: str, remedy: str) -> InputError:
+    return test.error(problem, key, allowed=remedy)
+
+
+def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> StateFrames:
+    frames = _stacked(test, files, key)
+    if min(frames.shape[1:]) < 24:
+        text = f"{files[0]} has frames of {frames.shape[1]} x {frames.shape[2]} pixels"
+        raise _told(test, key, text, "24 rows and columns or more, to measure a spot in")
+    return StateFrames(files, frames, offset, key)
+
+
+def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
+    """Frames of all files one after the other, (N, H, W)."""
+    parts: list[np.ndarray] = []
+    for file in files:
+        try:
+            image = ImageFile.open(Path(file), choose="")
+            if image.header.turned:
+                raise ImageError(
+                    f"{file} is stored turned or mirrored ({image.header.turned}): save it as it was read out"
+                )
+            if image.header.coded:
+                raise ImageError(f"{file}: {image.header.coded}, which is not linear in light: give raw frames")
+            parts.append(image.frames())
+        except ImageError as error:
+            raise _told(test, key, str(error), "raw frames of a CCD: TIFF, FITS, 16-bit PNG") from error
+        except OSError as error:
+            raise _told(test, key, f"{file}: {error.strerror or error}", "a file that can be read") from error
+        if parts[-1].shape[1:] != parts[0].shape[1:]:
+            sizes = (" x ".join(map(str, part.shape[1:])) for part in (parts[0], parts[-1]))
+            text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"
+            raise _told(test, key, text, "frames of one size in one state")
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
+    ends = [first + size for first, size in zip(state.offset, state.shape, strict=True)]
+    if ends[0] > ccd[0] or ends[1] > ccd[1]:
+        text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels"
+        where = f" from row {state.offset[0]} and column {state.offset[1]} on" if any(state.offset) else ""
+        raise _told(
+            test, state.key, f"{text}{where} do not lie on the CCD of {ccd[0]} x {ccd[1]} pixels",
+            "frames of the instrument's area CCD or a part of it with its offset; or rows and columns of area_ccd in"
+            " the instrument that are those of the frames",
+        )  # fmt: skip
+
+
+def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: StateFrames) -> np.ndarray | None:
+    """Dark or flat frames of a channel, of the whole CCD or of the part that the frames before show."""
+    given: Any = getattr(test, what)
+    files = per_channel(given, name)
+    if not files:
+        return None
+    key: KeyPath = (what, name if name in given else "all")
+    stack = _stacked(test, files, key)
+    if stack.shape[1:] not in (ccd, before.shape):
+        text = f"{files[0]} has frames of {stack.shape[1]} x {stack.shape[2]} pixels"
+        raise _told(test, key, text, f"frames of the CCD, {ccd[0]} x {ccd[1]}, or of the same part as the others")
+    return stack
+
+
+def _placed(correction: PixelCorrection, ccd: Shape, before: StateFrames) -> PixelCorrection:
+    """On the whole CCD; pixels that were not calibrated are bad."""
+    dark, response, bad = np.zeros(ccd), np.ones(ccd), np.ones(ccd, dtype=bool)
+    before.of_ccd(dark)[...] = correction.dark
+    before.of_ccd(response)[...] = correction.response
+    before.of_ccd(bad)[...] = correction.bad
+    return PixelCorrection(dark, response, bad, correction.noise)
+
+
+def _bad(test: MeasurementSpec, name: str, ccd: Shape, before: StateFrames) -> np.ndarray | None:
+    stack = _maps(test, "bad_pixels", name, ccd, before)
+    if stack is None:
+        return None
+    marked = np.asarray((stack != 0).any(axis=0))
+    if marked.shape == ccd:
+        return marked
+    whole = np.zeros(ccd, dtype=bool)
+    before.of_ccd(whole)[...] = marked
+    return whole
+
+
+def cannot_measure(test: Spec, state: StateFrames, channel: str, reason: str, remedy: str) -> Issue:
+    """What is said of frames in which no spot can be measured.
+
+    Args:
+        test: the measurement.
+        state: the frames.
+        channel: whose.
+        reason: why not.
+        remedy: what to do about it.
+    """
+    files = state.files[0] + (f" and {len(state.files) - 1} more" if len(state.files) > 1 else "")
+    return test.issue(f"the spot of {channel} cannot be measured in {files}: {reason}", state.key, allowed=remedy)

@@ -1,0 +1,335 @@
+"""What a measurement gave, as numbers, as a table in the terminal and as a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scenes.specs.course import moment
+from twin.main_job.assumptions import NOISE, assumed, contradicted, limits, share_text
+from twin.main_job.monitor_reading import MonitorReading, stated
+from twin.main_job.report_labels import ANGLE, CENTROID_NOTES, GROUND, PARAMETERS, Parameter
+from twin.recover.channel_measurement import ChannelResult, SpotResult
+from twin.recover.recover_plots import changes_svg, residuals_svg, spots_svg
+from twin.recover.recover_run import RecoverRun
+from twin.run.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
+from twin.run.report import Report, Section, one_sentence
+
+__all__ = ["KIND", "recover_numbers", "recover_report"]
+
+KIND = "recovered"
+
+
+@dataclass(frozen=True)
+class Read:
+    """One change as the judged estimator reads it, in the parameter's unit.
+
+    Attributes:
+        camera: whose; empty for the angle between the cameras and for errors on the ground.
+        parameter: which.
+        value: read.
+        sigma: total.
+        noise: of sigma what the noise of the images does.
+    """
+
+    camera: str
+    parameter: Parameter
+    value: float
+    sigma: float
+    noise: float
+
+    @property
+    def ratio(self) -> float:
+        """Value in sigmas."""
+        return self.value / self.sigma if self.sigma > 0.0 else 0.0
+
+    @property
+    def name(self) -> str:
+        """``Δα of forward``."""
+        if self.parameter in GROUND:
+            return f"{self.parameter.symbol} on the ground"
+        return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
+
+    @property
+    def text(self) -> str:
+        """Value, sigma and unit."""
+        places = decimals_for(self.sigma)
+        return f"{fixed(self.value, places)} ± {fixed(self.sigma, places)} {self.parameter.unit}"
+
+
+def _reads(reading: MonitorReading, estimator: str) -> Iterator[Read]:
+    found = reading.recovered_dict()
+    for camera, estimators in found["cameras"].items():
+        for p in PARAMETERS:
+            yield _read(camera, p, estimators[estimator])
+    if "intersection_angle" in found:
+        yield _read("", ANGLE, found["intersection_angle"][estimator])
+    if "ground" in found:
+        for p in GROUND:
+            yield _read("", p, found["ground"][estimator])
+
+
+def _read(camera: str, p: Parameter, found: Mapping[str, float]) -> Read:
+    return Read(camera, p, found[p.key], found[f"{p.key}_sigma"], found[f"{p.key}_sigma_noise"])
+
+
+def recover_numbers(run: RecoverRun) -> dict[str, Any]:
+    """Contents of recovered.json: as the main job's, of the last state; then what was found in the frames, and of a
+    series all states.
+    """
+    out: dict[str, Any] = {**stated(run.last.recovered_dict())}
+    out["verdict"] = _verdict(run)
+    out["warnings"] = list(_warnings(run))
+    out["channels"] = {
+        result.channel.name: {name.replace(" ", "_"): _spot_numbers(spot) for name, spot in result.states()}
+        for result in run.channels
+    }
+    transfers = {r.channel.name: r.channel.transfer for r in run.channels if r.channel.transfer is not None}
+    if transfers:
+        out["photon_transfer"] = {name: vars(one) for name, one in transfers.items()}
+    if run.times is not None:
+        out["times_s"] = list(run.times)
+        out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
+    return out
+
+
+def _spot_numbers(spot: SpotResult) -> dict[str, Any]:
+    return {
+        "frames": len(spot.frames.frames),
+        "first_pixel": list(spot.frames.offset),
+        "pixels_left_out": int(np.count_nonzero(~spot.used)),
+        "found": [
+            {"kind": finding.kind, "text": finding.text, "corrected": finding.corrects} for finding in spot.findings
+        ],
+        "sigma_cost": round(spot.cost, 6),
+    }
+
+
+def _name(run: RecoverRun) -> str:
+    return run.setup.model.instrument.name if run.setup.model is not None else ", ".join(run.last.cameras)
+
+
+def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
+    """Sets of frames that were corrected, of how many, the dearest of them and whose it is."""
+    every = [(result.channel.name, name, spot) for result in run.channels for name, spot in result.states()]
+    dirty = [one for one in every if not one[2].clean]
+    if not dirty:
+        return 0, len(every), None, ""
+    channel, name, worst = max(dirty, key=lambda one: one[2].cost)
+    return len(dirty), len(every), worst, f"{channel} {name}"
+
+
+def _verdict(run: RecoverRun) -> str:
+    reading = run.last
+    found = list(_reads(reading, reading.judged))
+    title = reading.estimators[reading.judged].title
+    out = [one for one in found if abs(one.ratio) > FAR]
+    when = f" at {moment(run.times[-1])}, the last of {len(run.times)} times" if run.times else ""
+    basis = "noise alone" if reading.disturbances is None else f"noise and disturbances {reading.disturbances.name}"
+    if out:
+        clearest = max(out, key=lambda one: abs(one.ratio))
+        stand = "stands" if len(out) == 1 else "stand"
+        first = (
+            f"{len(out)} of {len(found)} changes that the {title} reads{when} {stand} out of {FAR:g} σ (σ: {basis}), "
+            f"the clearest is {clearest.name}, {clearest.text}"
+        )
+    else:
+        parts = []
+        for p in PARAMETERS:
+            worst = max((one for one in found if one.parameter == p), key=lambda one: one.sigma)
+            parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
+        first = (
+            f"No change is seen{when}: none of the {len(found)} that the {title} reads stands out of {FAR:g} σ (σ: "
+            f"{basis}), which hides changes below {', '.join(parts)}"
+        )
+    about = next((one for one in found if one.parameter == ANGLE), max(found, key=lambda one: abs(one.ratio)))
+    limit = ""
+    if reading.disturbances is not None:
+        body, share = limits(reading, about.camera, about.parameter)
+        what = body if body == NOISE else f"motions of {body}"
+        size = f"{significant(about.sigma, 2)} {about.parameter.unit}"
+        limit = f"σ of {about.name}, {size}, is limited by {what} ({share_text(share)} of its variance)"
+    count, total, worst_spot, where = _corrected(run)
+    cleaned = "the frames were taken as they are" if run.setup.test.corrections == "none" else "the frames are clean"
+    if worst_spot is not None:
+        cost = plain(round(100.0 * worst_spot.cost, 1), 3)
+        cleaned = (
+            f"{count} of {total} sets of frames were corrected, which costs up to {cost} % of σ by noise ({where})"
+        )
+    return one_sentence(first, limit, cleaned)
+
+
+def recover_report(run: RecoverRun) -> Report:
+    """Report of the command."""
+    reading = run.last
+    facts = [
+        ("instrument", _name(run) if run.setup.model is not None else f"geometry of {_name(run)}"),
+        ("spot's shape", "from the model" if run.setup.test.template == "twin" else "learnt from the frames before"),
+        ("centroid", CENTROID_NOTES[reading.centroid]),
+        ("area CCD", f"{run.setup.detector.name}, pixels of {plain(1e6 * run.pitch)} µm"),
+        ("frames", _frames_text(run)),
+    ]
+    sections = [_spots(run), _estimators(run)]
+    if run.times is not None:
+        sections.insert(0, _series(run))
+    transfers = [result for result in run.channels if result.channel.transfer is not None]
+    if transfers:
+        sections.append(_transfer(transfers))
+    return Report(
+        title=f"{_name(run)}: what measured frames say",
+        verdict=_verdict(run),
+        lead=(f"{assumed(reading)}.",),
+        facts=tuple(facts),
+        summary=_summary(run),
+        sections=tuple(sections),
+        warnings=_warnings(run),
+    )
+
+
+def _warnings(run: RecoverRun) -> tuple[str, ...]:
+    return (*run.warnings, *contradicted(run.last.disturbances, run.last.consistency))
+
+
+def _frames_text(run: RecoverRun) -> str:
+    counts = {
+        name: sorted(
+            {len(spot.frames.frames) for r in run.channels for n, spot in r.states() if (n == "before") == name}
+        )
+        for name in (True, False)
+    }
+    before, after = ("–".join(map(str, sorted({c[0], c[-1]}))) for c in counts.values())
+    return f"{before} before and {after} after of each of {len(run.channels)} channels"
+
+
+def _summary(run: RecoverRun) -> Table:
+    """What every estimator reads, with sigma of the judged one."""
+    reading = run.last
+    names = list(reading.estimators)
+    every = {name: list(_reads(reading, name)) for name in names}
+    heads = ["camera", "change", *(reading.estimators[name].title for name in names), "σ", "σ of noise", "in σ"]
+    rows: list[list[Cell]] = []
+    for k, own in enumerate(every[reading.judged]):
+        group = own.camera or ("ground" if own.parameter in GROUND else "both")
+        places = decimals_for(own.sigma, 3)
+        values = [fixed(every[name][k].value, places) for name in names]
+        sigmas = [significant(own.sigma, 3, floor=0.0), significant(own.noise, 3, floor=0.0)]
+        label = f"{own.parameter.symbol} [{own.parameter.unit}]"
+        rows.append([group, label, *values, *sigmas, fixed(own.ratio, 1, sign=True)])
+    at = f" at {moment(run.times[-1])}" if run.times else ""
+    title = f"{_name(run)}: recovered from measured frames{at}"
+    caption = f"σ and the last column are those of the {reading.estimators[reading.judged].title}."
+    return Table("changes", title, caption, heads, rows)
+
+
+def _spots(run: RecoverRun) -> Section:
+    """What was found in the frames, the spots, the figures."""
+    heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "found and corrected", "cost in σ [%]"]
+    rows: list[list[Cell]] = []
+    for i, result in enumerate(run.channels):
+        for k, (name, spot) in enumerate(result.states()):
+            r = run.readings[max(k - 1, 0)].recovery
+            place, sigma = (r.before, r.sigma_before) if k == 0 else (r.after, r.sigma_after)
+            digits = decimals_for(float(sigma[0, i].min()))
+            told = "; ".join(f"{finding.kind}: {finding.text}" for finding in spot.findings) or "nothing"
+            spread = float(np.sqrt(np.mean(np.square(sigma[0, i]))))
+            rows.append(
+                [
+                    result.channel.name,
+                    name,
+                    len(spot.frames.frames),
+                    fixed(float(place[0, i, 0]), digits),
+                    fixed(float(place[0, i, 1]), digits),
+                    significant(spread, 2, floor=0.0),
+                    told,
+                    fixed(100.0 * spot.cost, 1),
+                ]
+            )
+    caption = (
+        "Rows and columns count on the whole CCD, from the centre of its first pixel. The cost is that of the place of "
+        "this spot: its sigma over what it would be with the same light and nothing left out or fitted beside it."
+    )
+    cameras = list(run.last.cameras)
+    figures = [
+        SvgFigure(
+            f"spots-{name}",
+            f"Spots of {name}",
+            "Mean frames, stretched to show what is faint, with the centres before and after; pixels that were left "
+            "out are marked.",
+            spots_svg(run, name),
+        )
+        for name in cameras
+    ]
+    fitted = [name for name in cameras if any(s.residual is not None for r in _of(run, name) for _, s in r.states())]
+    figures += [
+        SvgFigure(
+            f"residuals-{name}",
+            f"What the fitted shape leaves over, {name}",
+            "Mean frame minus fitted spot and background in standard deviations of each pixel; pixels that were left "
+            "out are marked.",
+            residuals_svg(run, name),
+        )
+        for name in fitted
+    ]
+    text = () if run.setup.test.corrections == "automatic" else ("The frames were not searched for defects.",)
+    return Section("Spots", text, (Table("spots", "What was found in the frames", caption, heads, rows), *figures))
+
+
+def _of(run: RecoverRun, camera: str) -> list[ChannelResult]:
+    return [result for result in run.channels if result.channel.name.split("/")[0] == camera]
+
+
+def _estimators(run: RecoverRun) -> Section:
+    """All readings with their sigmas."""
+    reading = run.last
+    heads = ["camera", "change", "unit"]
+    for estimator in reading.estimators.values():
+        heads += [estimator.title, f"{estimator.title} σ", f"{estimator.title} σ of noise"]
+    every = [list(_reads(reading, name)) for name in reading.estimators]
+    rows: list[list[Cell]] = []
+    for same in zip(*every, strict=True):
+        row: list[Cell] = [same[0].camera or "both", same[0].parameter.symbol, same[0].parameter.unit]
+        for one in same:
+            row += [one.value, one.sigma, one.noise]
+        rows.append(row)
+    notes = [f"{one.title}: {one.note}." for one in reading.estimators.values()]
+    table = Table("estimators", "All estimators", " ".join(notes), heads, rows, digits=5)
+    return Section("Estimators", (), (table,), 1)
+
+
+def _series(run: RecoverRun) -> Section:
+    assert run.times is not None
+    heads = ["time [s]", "camera", "change", "unit", "value", "σ", "σ of noise"]
+    rows: list[list[Cell]] = [
+        [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
+        for time, reading in zip(run.times, run.readings, strict=True)
+        for one in _reads(reading, reading.judged)
+    ]
+    title = run.last.estimators[run.last.judged].title
+    caption = f"As the {title} reads it; every time is measured against the same frames before."
+    series = [
+        (time, {(one.camera, one.parameter.symbol): (one.value, one.sigma) for one in _reads(reading, reading.judged)})
+        for time, reading in zip(run.times, run.readings, strict=True)
+    ]
+    figure = SvgFigure("series", "Changes over time", "Bars are one total standard deviation.", changes_svg(series))
+    return Section("Series", (), (figure, Table("times", "Every time", caption, heads, rows)), 1)
+
+
+def _transfer(results: list[ChannelResult]) -> Section:
+    heads = ["channel", "gain [DN/e]", "dark noise [e]", "dark level [DN]", "PRNU [%]", "DSNU [e]"]
+    rows: list[list[Cell]] = []
+    for result in results:
+        t = result.channel.transfer
+        assert t is not None
+        pairs = (
+            (t.gain_dn_per_e, t.gain_sigma),
+            (t.dark_noise_e, t.dark_noise_sigma),
+            (100.0 * t.prnu, 100.0 * t.prnu_sigma),
+            (t.dsnu_e, t.dsnu_sigma),
+        )
+        gain, noise, prnu, dsnu = (f"{fixed(v, decimals_for(s))} ± {fixed(s, decimals_for(s))}" for v, s in pairs)
+        rows.append([result.channel.name, gain, noise, fixed(t.dark_level_dn, 2), prnu, dsnu])
+    caption = "By the variances of dark and flat frames, over the frames and over the pixels."
+    return Section("Photon transfer", (), (Table("photon_transfer", "Measured noise", caption, heads, rows),))
