@@ -28,7 +28,8 @@ ONLY_IN_ANALYSIS = {"analysis", "numpy", "scipy", "cv2"} | sys.stdlib_module_nam
 ANALYSIS_MAY: dict[str, set[str]] = {
     "turntable/angle_network.py": {"sklearn"},
     "mtf/__main__.py": {"typer", "rich", "matplotlib"},
-    "mtf/image_file.py": {"tifffile"},
+    "images/tiff_image.py": {"tifffile"},
+    "images/fits_image.py": {"astropy"},
 }
 LONGEST_FILE = 500
 MOST_FILES = 28

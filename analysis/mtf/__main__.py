@@ -32,9 +32,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from analysis.images.image_file import ImageError, ImageFile, Region, tone_curve
 from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
 from analysis.mtf.edge_mtf import EdgeMtf
-from analysis.mtf.image_file import ImageError, ImageFile, Region, tone_curve
 from analysis.mtf.slanted_edge import EdgeError, measure_edge
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ class _Wrong(Exception):
 @app.command()
 def main(
     image: Annotated[
-        Path, typer.Argument(help="TIFF, PNG or JPEG, 8 or 16 bit (or floating-point TIFF).", show_default=False)
+        Path, typer.Argument(help="TIFF, FITS, PNG or JPEG; integers or real numbers.", show_default=False)
     ],
     roi: Annotated[
         str, typer.Option(help="Region ROW,COLUMN,HEIGHT,WIDTH in pixels; the first pixel is 0,0.", show_default=False)
@@ -78,10 +78,17 @@ def main(
     ] = None,
     offset: Annotated[float, typer.Option(help="Grey value without light; taken off levels and contrast.")] = 0.0,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="Average this many pages of a multi-page TIFF. Default: all.")
+        int | None,
+        typer.Option(
+            min=1, help="Average this many pages of a multi-page TIFF or planes of a FITS cube. Default: all."
+        ),
     ] = None,
     page: Annotated[
-        int | None, typer.Option(min=0, help="Read this page of a TIFF only; the first is 0. Default: the mean of all.")
+        int | None,
+        typer.Option(
+            min=0,
+            help="Read this page of a TIFF or plane of a FITS cube only; the first is 0. Default: the mean of all.",
+        ),
     ] = None,
     gamma: Annotated[
         str | None,
@@ -108,7 +115,7 @@ def main(
 
     Grey values must be linear in light: raw frames. Of a picture with a tone curve state --gamma; a JPEG without it is
     taken as it is, with a warning. Colour becomes the luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B). Pages
-    of a TIFF are averaged. --saturation and --offset are grey values linear in light.
+    of a TIFF and planes of a FITS cube are averaged. --saturation and --offset are grey values linear in light.
 
     Example, with images of `python -m twin.render scenes/examples/targets.yaml --out runs/targets`:
     `python -m analysis.mtf runs/targets/images/forward_centre_knife_edge_along_before.tiff --roi 24,24,64,64
@@ -127,13 +134,14 @@ def main(
         _check_bar_options(frequency is not None, dark, bright, plot, csv_file)
         source = ImageFile.open(image, frames, page)
         # wrong curves are told before the pixels are read
-        tone_curve(gamma, source.full_scale)
+        tone_curve(gamma, source.header.full_scale)
         regions = {"--roi": _region(roi, "--roi")}
         fields: dict[str, ImageFile] = {}
         for option, text in (("--dark", dark), ("--bright", bright)):
             if text is not None and _NUMBERS.fullmatch(text) is None and Path(text).is_file():
                 fields[option] = ImageFile.open(Path(text), frames, page)
-                if (fields[option].rows, fields[option].columns) != (source.rows, source.columns):
+                sizes = [(image.header.rows, image.header.columns) for image in (fields[option], source)]
+                if sizes[0] != sizes[1]:
                     raise _Wrong(f"{option} {text} and {image} have different numbers of rows or columns")
             elif text is not None:
                 regions[option] = _region(text, option)
@@ -142,8 +150,8 @@ def main(
             read[option] = other.read({"--roi": regions["--roi"]}, gamma, saturation)["--roi"]
         warnings = _warnings([source, *fields.values()], gamma)
         region = read["--roi"]
-        if saturation is None and np.any(region >= source.full_scale):
-            saturation = source.full_scale
+        if saturation is None and np.any(region >= source.header.full_scale):
+            saturation = source.header.full_scale
         found: BarMtf | EdgeMtf
         if frequency is not None:
             found = measure_bars(
@@ -204,10 +212,10 @@ def _warnings(images: list[ImageFile], gamma: str | None) -> list[str]:
     if gamma is not None:
         return []
     return [
-        f"{image.path}: {image.coded}, so that its grey values probably follow a tone curve. Taken as linear they make"
-        " the MTF wrong: state --gamma srgb (or the curve's exponent), or --gamma 1 if they are linear"
+        f"{image.path}: {image.header.coded}, so that its grey values probably follow a tone curve. Taken as linear"
+        " they make the MTF wrong: state --gamma srgb (or the curve's exponent), or --gamma 1 if they are linear"
         for image in images
-        if image.coded
+        if image.header.coded
     ]
 
 

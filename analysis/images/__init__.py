@@ -1,0 +1,1 @@
+"""Image files as grey values: TIFF, FITS, PNG and JPEG."""

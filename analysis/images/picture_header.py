@@ -1,0 +1,86 @@
+"""Headers of PNG and JPEG, and what they say of a tone curve."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from analysis.images.image_header import ImageError, ImageHeader, full_scale
+
+__all__ = ["JPEG_MAGIC", "PNG_MAGIC", "jpeg_header", "png_header"]
+
+PNG_MAGIC, JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
+"""Colour type of a PNG -> channels that it is decoded to."""
+
+
+def png_header(path: Path) -> ImageHeader:
+    """Size, type and named tone curve of a PNG.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ImageError: it is cut off or damaged.
+    """
+    rows = columns = depth = colour = 0
+    coded, ended = "", False
+    with path.open("rb") as file:
+        file.seek(8)
+        while head := file.read(8):
+            length, name = struct.unpack(">I4s", head)
+            if name == b"IHDR":
+                columns, rows, depth, colour = struct.unpack(">IIBB", file.read(10))
+                length -= 10
+            elif name == b"gAMA":
+                gamma = struct.unpack(">I", file.read(4))[0] * 1e-5
+                length -= 4
+                if not coded and abs(gamma - 1.0) > 0.01:
+                    coded = f"it says gamma {gamma:.4g}"
+            elif name in (b"sRGB", b"iCCP"):
+                coded = "it has a colour profile" if name == b"iCCP" else "it says sRGB"
+            elif name == b"IEND":
+                ended = True
+                break
+            # the checksum is four bytes
+            file.seek(length + 4, 1)
+    if not (rows and columns and ended):
+        raise ImageError(f"{path} cannot be read as an image: it is cut off or damaged")
+    if colour not in _PNG_CHANNELS:
+        raise ImageError(f"{path} cannot be read as an image: PNG has no colour type {colour}")
+    channels = _PNG_CHANNELS[colour]
+    dtype = np.dtype(np.uint16 if depth == 16 else np.uint8)
+    size = rows * columns * channels * dtype.itemsize
+    return ImageHeader("PNG", (0,), rows, columns, channels, size, full_scale(dtype), coded)
+
+
+def jpeg_header(path: Path) -> ImageHeader:
+    """Size of a JPEG; wherever its tables stand.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ImageError: it is cut off, damaged, or not of 8 bits.
+    """
+    data = path.read_bytes()
+    place = 2
+    while place + 9 < len(data):
+        if data[place] != 0xFF:
+            break
+        marker = data[place + 1]
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
+            place += 1 if marker == 0xFF else 2
+            continue
+        # start of frame, but not the tables of Huffman and arithmetic coding
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            depth, rows, columns, channels = struct.unpack(">BHHB", data[place + 4 : place + 10])
+            if not (rows and columns and depth == 8) or data.rfind(b"\xff\xd9") < place:
+                break
+            # three channels, also of four
+            size = rows * columns * min(channels, 3)
+            return ImageHeader("JPEG", (0,), rows, columns, min(channels, 3), size, 255.0, "it is a JPEG of 8 bits")
+        place += 2 + struct.unpack(">H", data[place + 2 : place + 4])[0]
+    raise ImageError(f"{path} cannot be read as an image: it is cut off or damaged, or not a JPEG of 8 bits")

@@ -1,0 +1,263 @@
+"""Image files by other writers (Pillow, OpenCV, GDAL, astropy, its test files) are read to the same pixels."""
+
+import gzip
+import json
+import math
+import shutil
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from PIL import Image
+from typer.testing import CliRunner
+
+from analysis.images.image_file import ImageError, ImageFile, Region
+from analysis.mtf.__main__ import app
+
+FRAMES = np.random.default_rng(1).integers(0, 65536, (3, 20, 31)).astype(np.uint16)
+
+
+def read(path):
+    return ImageFile.open(path).frames()
+
+
+def frames_or_sentence(path):
+    """Frames, or the one sentence that names the file; anything else fails."""
+    try:
+        return read(path)
+    except ImageError as error:
+        told = str(error)
+    assert "\n" not in told
+    assert path.name in told
+    return told
+
+
+@pytest.mark.parametrize("compression", [None, "lzw", "zlib", "deflate", "lzma", "zstd", "packbits"])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("big", [False, True])
+def test_tiff_of_every_kind_is_the_same_pixels(tmp_path, compression, order, big):
+    path = tmp_path / "a.tif"
+    for dtype in ("u1", "u2", "u4", "i2", "f4", "f8"):
+        frames = (FRAMES // 3).astype(dtype)
+        tifffile.imwrite(path, frames, byteorder=order, bigtiff=big, compression=compression, photometric="minisblack")
+        found = read(path)
+        assert found.dtype == np.dtype(dtype)
+        assert found.dtype.isnative
+        np.testing.assert_array_equal(found, frames)
+
+
+def test_lzw_and_deflate_by_pillow_opencv_and_gdal(tmp_path):
+    frame = FRAMES[0]
+    for name in ("tiff_lzw", "tiff_adobe_deflate", "tiff_deflate", "packbits"):
+        Image.fromarray(frame).save(tmp_path / "a.tif", compression=name)
+        np.testing.assert_array_equal(read(tmp_path / "a.tif")[0], frame)
+    pages = [Image.fromarray(one) for one in FRAMES]
+    pages[0].save(tmp_path / "p.tif", compression="tiff_lzw", save_all=True, append_images=pages[1:])
+    np.testing.assert_array_equal(read(tmp_path / "p.tif"), FRAMES)
+    for number in (1, 5, 8, 32946):
+        cv2.imwrite(str(tmp_path / "b.tif"), frame, [cv2.IMWRITE_TIFF_COMPRESSION, number])
+        np.testing.assert_array_equal(read(tmp_path / "b.tif")[0], frame)
+    rasterio = pytest.importorskip("rasterio")
+    profile = {"driver": "GTiff", "height": 20, "width": 31, "count": 1, "dtype": "uint16"}
+    for more in ({"compress": "lzw", "predictor": 2}, {"compress": "deflate", "tiled": True, "blockxsize": 16,
+                  "blockysize": 16}, {"BIGTIFF": "YES", "ENDIANNESS": "BIG"}):  # fmt: skip
+        with rasterio.open(tmp_path / "c.tif", "w", **profile, **more) as file:
+            file.write(frame, 1)
+        np.testing.assert_array_equal(read(tmp_path / "c.tif")[0], frame)
+    with rasterio.open(tmp_path / "d.tif", "w", **profile | {"dtype": "float32"}, compress="lzw", predictor=3) as file:
+        file.write(frame.astype(np.float32), 1)
+    np.testing.assert_array_equal(read(tmp_path / "d.tif")[0], frame)
+
+
+def test_packed_bits_have_their_own_full_scale(tmp_path):
+    """12 bits of a camera saturate at 4095 and not at 65535."""
+    rasterio = pytest.importorskip("rasterio")
+    frame = FRAMES[0] >> 4
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", height=20, width=31, count=1, dtype="uint16",
+                       NBITS=12) as file:  # fmt: skip
+        file.write(frame, 1)
+    image = ImageFile.open(tmp_path / "a.tif")
+    assert image.header.full_scale == 4095
+    np.testing.assert_array_equal(image.frames()[0], frame)
+
+
+def test_what_is_not_grey_is_told(tmp_path):
+    """White that is zero is turned around, indices of a palette are refused, a turned image says that it is."""
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, FRAMES[0], photometric="miniswhite")
+    np.testing.assert_array_equal(read(path)[0], 65535 - FRAMES[0])
+    mean = ImageFile.open(path).read({"a": Region(0, 0, 20, 31)})["a"]
+    np.testing.assert_array_equal(mean, 65535.0 - FRAMES[0])
+    tifffile.imwrite(path, FRAMES[0].astype(np.float32), photometric="miniswhite")
+    with pytest.raises(ImageError, match="largest value is black"):
+        read(path)
+    Image.fromarray((FRAMES[0] >> 8).astype(np.uint8)).convert("P").save(path)
+    with pytest.raises(ImageError, match="palette"):
+        read(path)
+    Image.fromarray(np.dstack([(FRAMES[0] >> 8).astype(np.uint8)] * 4), "CMYK").save(path)
+    with pytest.raises(ImageError, match=r"inks \(CMYK\)"):
+        read(path)
+    tifffile.imwrite(path, FRAMES[0], extratags=[(274, "H", 1, 3, True)])
+    assert ImageFile.open(path).header.turned == "orientation 3"
+    cv2.imwrite(str(tmp_path / "a.png"), np.dstack([FRAMES[0]] * 3))
+    with pytest.raises(ImageError, match="3 colours"):
+        read(tmp_path / "a.png")
+
+
+def test_fits_primary_extension_cube_and_scaling(tmp_path):
+    path = tmp_path / "a.fits"
+    for frames in (FRAMES, FRAMES[0], FRAMES.astype(np.int16), FRAMES.astype(np.float32), FRAMES.astype(np.int32),
+                   FRAMES[None, None], (FRAMES >> 8).astype(np.uint8), FRAMES.astype(np.uint32)):  # fmt: skip
+        for units in ([fits.PrimaryHDU(frames)], [fits.PrimaryHDU(), fits.ImageHDU(frames)]):
+            fits.HDUList(units).writeto(path, overwrite=True)
+            found = read(path)
+            assert found.dtype == frames.dtype
+            np.testing.assert_array_equal(found, frames.reshape(-1, 20, 31))
+    fits.HDUList([fits.PrimaryHDU(), *(fits.ImageHDU(f) for f in FRAMES)]).writeto(path, overwrite=True)
+    np.testing.assert_array_equal(read(path), FRAMES)
+    assert ImageFile.open(path).header.full_scale == 65535
+    unit = fits.PrimaryHDU(FRAMES.astype(np.float64) / 4 + 100)
+    unit.scale("int16", bzero=100 + 8191.75, bscale=0.25)
+    unit.writeto(path, overwrite=True)
+    # the first pixel is at BZERO + BSCALE * stored, bytes as astropy wrote them, read here by hand
+    raw = path.read_bytes()
+    first = struct.unpack(">h", raw[2880:2882])[0]
+    assert read(path)[0, 0, 0] == 100 + 8191.75 + 0.25 * first == FRAMES[0, 0, 0] / 4 + 100
+    np.testing.assert_array_equal(read(path), FRAMES / 4 + 100)
+    assert ImageFile.open(path).header.full_scale == math.inf
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(FRAMES, compression_type="RICE_1")]).writeto(
+        path, overwrite=True
+    )
+    np.testing.assert_array_equal(read(path), FRAMES)
+
+
+def test_fits_extensions_that_go_with_an_image_are_no_frames(tmp_path):
+    path = tmp_path / "a.fits"
+    other = np.zeros((9, 9), np.uint8)
+    units = [fits.PrimaryHDU(), fits.ImageHDU(FRAMES, name="SCI"), fits.ImageHDU(other, name="MINE")]
+    fits.HDUList(units).writeto(path)
+    np.testing.assert_array_equal(read(path), FRAMES)
+    fits.HDUList([fits.PrimaryHDU(FRAMES), fits.ImageHDU(other, name="DQ")]).writeto(path, overwrite=True)
+    np.testing.assert_array_equal(read(path), FRAMES)
+    fits.HDUList([fits.PrimaryHDU(FRAMES), fits.ImageHDU(other, name="MINE")]).writeto(path, overwrite=True)
+    with pytest.raises(ImageError, match=r"20 x 31 uint16 \(first: 0\), 9 x 9 uint8 \(first: 3\)"):
+        read(path)
+    one = ImageFile.open(path, page=1)
+    np.testing.assert_array_equal(one.frames(), FRAMES[1:2])
+
+
+def test_undefined_pixels_of_integers_are_not_numbers(tmp_path):
+    header = fits.Header({"BLANK": -32768})
+    data = FRAMES[0].astype(np.int16)
+    data[3, 4] = -32768
+    fits.PrimaryHDU(data, header).writeto(tmp_path / "a.fits")
+    found = read(tmp_path / "a.fits")[0]
+    assert math.isnan(found[3, 4])
+    assert np.isnan(found).sum() == np.sum(data == -32768)
+
+
+def test_fits_files_that_nobody_here_wrote():
+    """Those of astropy's own tests: every one is an image or refused in one sentence."""
+    folder = Path(fits.__file__).parent / "tests" / "data"
+    if not folder.is_dir():
+        pytest.skip("this astropy came without its test files")
+    read_ones = {}
+    for path in sorted(folder.rglob("*.fits")):
+        frames = frames_or_sentence(path)
+        if not isinstance(frames, str):
+            read_ones[path.name] = frames
+    # by the NAXISn of their headers, columns first
+    assert read_ones["test0.fits"].shape == (4, 40, 40)
+    assert read_ones["comp.fits"].shape == (1, 300, 440)
+    assert read_ones["scale.fits"].dtype.kind == "f"
+    assert "btable.fits" not in read_ones
+
+
+def test_mtf_of_a_packed_tiff_and_of_a_fits_cube_is_that_of_the_plain_file(tmp_path):
+    """An LZW TIFF was refused."""
+    row, column = np.indices((80, 80))
+    edge = np.where(column - 40 + (row - 40) * 0.08 > 0, 9000.0, 1000.0)
+    edge = cv2.GaussianBlur(edge, (0, 0), 0.8)
+    pages = np.stack([edge + np.random.default_rng(k).normal(0, 20, edge.shape) for k in range(3)]).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "plain.tif", pages, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "lzw.tif", pages, photometric="minisblack", compression="lzw", predictor=True)
+    fits.PrimaryHDU(pages).writeto(tmp_path / "cube.fits")
+    found = []
+    for name in ("plain.tif", "lzw.tif", "cube.fits"):
+        words = [str(tmp_path / name), "--roi", "8,8,64,64", "--pixel-size", "7 um", "--json"]
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, result.stderr
+        found.append(json.loads(result.stdout))
+    assert found[0] == found[1] == found[2]
+
+
+def test_only_what_is_asked_for_is_decoded(tmp_path):
+    part = Region(2, 3, 5, 7)
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
+    fits.PrimaryHDU(FRAMES).writeto(tmp_path / "a.fits")
+    for name in ("a.tif", "a.fits"):
+        np.testing.assert_array_equal(ImageFile.open(tmp_path / name).frames(part), FRAMES[:, 2:7, 3:10])
+        with pytest.raises(ImageError, match="does not lie in the image of 20 rows and 31 columns"):
+            ImageFile.open(tmp_path / name).frames(Region(0, 0, 21, 31))
+    tifffile.imwrite(tmp_path / "b.tif", shape=(40, 4000, 4000), dtype=np.uint16, photometric="minisblack")
+    with pytest.raises(ImageError, match=r"40 frames of 4000 x 4000 pixels, 1.3 GB, more than 0.5 GB: cut"):
+        ImageFile.open(tmp_path / "b.tif").frames()
+    assert ImageFile.open(tmp_path / "b.tif").frames(Region(0, 0, 8, 8)).shape == (40, 8, 8)
+
+
+def test_spoilt_files_are_refused_in_one_sentence(tmp_path):
+    """Random bytes changed, and files cut off: pixels or an ImageError, nothing else."""
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "lzw.tif", FRAMES, photometric="minisblack", compression="lzw")
+    tifffile.imwrite(tmp_path / "zip.tif", FRAMES, photometric="minisblack", compression="zlib", bigtiff=True)
+    fits.PrimaryHDU(FRAMES).writeto(tmp_path / "a.fits")
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(FRAMES)]).writeto(tmp_path / "c.fits")
+    cv2.imwrite(str(tmp_path / "a.png"), FRAMES[0])
+    random, refused, count = np.random.default_rng(7), 0, 0
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        head = min(len(whole), 6000)
+        for trial in range(60):
+            data = bytearray(whole)
+            if trial % 6 == 5:
+                data = data[: random.integers(1, len(data))]
+            else:
+                for place in random.integers(0, head, 1 + trial % 5):
+                    data[place] = random.integers(256)
+            spoilt = tmp_path / f"spoilt{path.suffix}"
+            spoilt.write_bytes(data)
+            count += 1
+            refused += isinstance(frames_or_sentence(spoilt), str)
+        spoilt.unlink()
+    assert refused > count / 10
+
+
+def test_a_cut_off_or_packed_fits_is_named(tmp_path):
+    fits.PrimaryHDU(FRAMES).writeto(tmp_path / "a.fits")
+    data = (tmp_path / "a.fits").read_bytes()
+    (tmp_path / "b.fits").write_bytes(data[: len(data) // 2])
+    with pytest.raises(ImageError, match="cut off"):
+        read(tmp_path / "b.fits")
+    with gzip.open(tmp_path / "c.fits.gz", "wb") as file:
+        file.write(data)
+    with pytest.raises(ImageError, match=r"unpack it first, gunzip c\.fits\.gz"):
+        read(tmp_path / "c.fits.gz")
+    shutil.copy(tmp_path / "a.fits", tmp_path / "d.tif")
+    # by content, not by name
+    np.testing.assert_array_equal(read(tmp_path / "d.tif"), FRAMES)
+
+
+def test_astropy_is_loaded_only_for_fits(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", compression="lzw")
+    code = (
+        "import sys; from pathlib import Path; from analysis.images.image_file import ImageFile;"
+        f"ImageFile.open(Path({str(tmp_path / 'a.tif')!r})).frames(); print('astropy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
