@@ -9,7 +9,7 @@ if __name__ == "__main__":
 
 import typer
 
-from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
+from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
 from twin.laboratory.laboratory_tests import LABORATORY_TESTS
 from twin.run.command import add_test
 
@@ -38,7 +38,7 @@ add_test(
     app,
     PROGRAM,
     "focus",
-    resolve_focus,
+    resolve_focus_test,
     LABORATORY_TESTS["focus"],
     """Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
     shims, and the same again.
@@ -54,7 +54,7 @@ add_test(
     app,
     PROGRAM,
     "distortion",
-    resolve_distortion,
+    resolve_distortion_test,
     LABORATORY_TESTS["distortion"],
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
@@ -71,7 +71,7 @@ add_test(
     app,
     PROGRAM,
     "turntable",
-    resolve_turntable,
+    resolve_turntable_test,
     LABORATORY_TESTS["turntable"],
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
 

@@ -12,6 +12,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measured_lab import MeasuredDistortionSpec, MeasuredFocusSpec, MeasuredTurntableSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
@@ -80,6 +81,9 @@ FILE_KINDS = (
     FileKind("focus_test", FocusTestSpec, "a focus test", "twin.lab focus"),
     FileKind("distortion_test", DistortionTestSpec, "a distortion test", "twin.lab distortion"),
     FileKind("turntable_test", TurntableTestSpec, "a turntable test", "twin.lab turntable"),
+    FileKind("measured_focus", MeasuredFocusSpec, "a focus test on measurements", "twin.lab focus"),
+    FileKind("measured_distortion", MeasuredDistortionSpec, "a distortion test on measurements", "twin.lab distortion"),
+    FileKind("measured_turntable", MeasuredTurntableSpec, "a turntable test on measurements", "twin.lab turntable"),
     FileKind("orbit_angle", OrbitAngleSpec, "a test of intersection angles", "twin.orbit angle"),
     FileKind("orbit_calibration", OrbitCalibrationSpec, "an in-orbit calibration", "twin.orbit calibrate"),
     FileKind("orbit_simulate", OrbitSimulateSpec, "a simulation of images of the ground", "twin.orbit simulate"),

@@ -23,10 +23,15 @@ def _distortion() -> Test[Any]:
 
 
 def _turntable() -> Test[Any]:
+    from twin.laboratory.turntable_measured_report import measured_turntable_report
     from twin.laboratory.turntable_numbers import TURNTABLE
     from twin.laboratory.turntable_report import turntable_report
+    from twin.laboratory.turntable_run import MeasuredTurntable
 
-    return TURNTABLE, turntable_report
+    return (
+        TURNTABLE,
+        lambda run: measured_turntable_report(run) if isinstance(run, MeasuredTurntable) else turntable_report(run),
+    )
 
 
 LABORATORY_TESTS: dict[str, Callable[[], Test[Any]]] = {
