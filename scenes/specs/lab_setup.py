@@ -124,21 +124,21 @@ def resolve_turntable(path: str | Path) -> TurntableSetup:
 
 
 def resolve_focus_test(path: str | Path) -> FocusSetup | MeasuredFocusSetup:
-    """A focal-plane alignment on the simulated bench or, with `measured:` in its file, on measurements; errors as `resolve_focus`."""
+    """As `resolve_focus`, for a simulated bench or, with `measured:` in the file, for measurements."""
     if is_measured(path):
         return _measured(MeasuredFocusSetup, MeasuredFocusSpec, path)
     return resolve_focus(path)
 
 
 def resolve_distortion_test(path: str | Path) -> DistortionSetup | MeasuredDistortionSetup:
-    """A distortion test on the simulated bench or, with `measured:` in its file, on measurements; errors as `resolve_distortion`."""
+    """As `resolve_distortion`, for a simulated bench or, with `measured:` in the file, for measurements."""
     if is_measured(path):
         return _measured(MeasuredDistortionSetup, MeasuredDistortionSpec, path)
     return resolve_distortion(path)
 
 
 def resolve_turntable_test(path: str | Path) -> TurntableSetup | MeasuredTurntableSetup:
-    """A turntable test on the simulated bench or, with `measured:` in its file, on measurements; errors as `resolve_turntable`."""
+    """As `resolve_turntable`, for a simulated bench or, with `measured:` in the file, for measurements."""
     if is_measured(path):
         return _measured(MeasuredTurntableSetup, MeasuredTurntableSpec, path)
     return resolve_turntable(path)

@@ -16,10 +16,15 @@ def _focus() -> Test[Any]:
 
 
 def _distortion() -> Test[Any]:
+    from twin.laboratory.distortion_measured_report import measured_distortion_report
     from twin.laboratory.distortion_numbers import DISTORTION
     from twin.laboratory.distortion_report import distortion_report
+    from twin.laboratory.distortion_run import MeasuredDistortion
 
-    return DISTORTION, distortion_report
+    return (
+        DISTORTION,
+        lambda run: measured_distortion_report(run) if isinstance(run, MeasuredDistortion) else distortion_report(run),
+    )
 
 
 def _turntable() -> Test[Any]:

@@ -46,7 +46,7 @@ def _measured_fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         f"Fits of the means, {judged}. Cross-validation on the calibration points alone chooses the "
         f"{FIT_NAMES[chosen]}.",
         "A compensated angle keeps an error, the same whenever its reading comes back: the noise of the calibration "
-        "that the fit passes on, and three misfits beyond it, in the table. The repeatability of a reading in use comes "
+        "that the fit passes on, and three misfits beyond it. The repeatability of a reading in use comes "
         "on top and averages out.",
     ]
     text += [f"The {FIT_NAMES[name]} failed: {failure}." for name, failure in result["failed"].items()]
@@ -67,7 +67,7 @@ def _measured_fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     left = Table(
         "turntable-sigma",
         "What is left of a compensated angle, σ",
-        "Noise: of the calibration, mean over its readings. Common: a constant, which differences of angles do not see. "
+        "Noise: of the calibration, mean over its readings. Common: a constant, which no difference sees. "
         "Smooth: along the curve over one step. White: new from reading to reading, as the subdivision error is.",
         ("part", "arcsec"),
         (
