@@ -1,4 +1,6 @@
-"""``python -m twin.lab``: laboratory tests of a camera, rendered and measured (paper 004)."""
+"""``python -m twin.lab``: laboratory tests of a camera, rendered or from files of measurements, and measured (paper
+004).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ if __name__ == "__main__":
 import typer
 
 from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
-from twin.laboratory.laboratory_tests import LABORATORY_TESTS
+from twin.laboratory.laboratory_tests import LABORATORY_EXPORTS, LABORATORY_TESTS
 from twin.run.command import add_test
 
 PROGRAM = "twin.lab"
@@ -25,8 +27,12 @@ def main() -> None:
     """Test a camera in the laboratory as paper 004 does: every image is rendered through the traced camera, noise
     included, and only images and readings reach the analysis.
 
-    Examples of all three files are in scenes/lab. The run folder gets config.yaml, the numbers as JSON, a
-    self-contained report.html, figures and tables in artefacts/ and recorded frames in images/.
+    With `measured:` in the test's file, tables and images of a real bench go through the same analysis
+    (docs/measured_laboratory.md); `--export DIR` writes a simulated bench's as such files.
+
+    Examples of all three files are in scenes/lab, and of measurements in scenes/lab/measured. The run folder gets
+    config.yaml, the numbers as JSON, a self-contained report.html, figures and tables in artefacts/ and recorded
+    frames in images/.
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml`
 
@@ -48,6 +54,7 @@ add_test(
 
     Example: `python -m twin.lab focus scenes/lab/focus.yaml`
     """,
+    LABORATORY_EXPORTS["focus"],
 )
 
 add_test(
@@ -65,6 +72,7 @@ add_test(
 
     Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
     """,
+    LABORATORY_EXPORTS["distortion"],
 )
 
 add_test(
@@ -77,6 +85,7 @@ add_test(
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
     """,
+    LABORATORY_EXPORTS["turntable"],
 )
 
 

@@ -198,6 +198,7 @@ class MeasuredFocusSpec(Spec):
         description: for people.
         measured: the series.
         mount: how the assembly is mounted.
+        shims: thickness of each hole's shim now, metres; by default all are as thick as `mount` says.
         vertex_error: error that the form of the through-focus curve leaves in all vertices alike, metres; its default
             is that of F/8 to F/10 and wavefronts of 0.2 waves.
         vertex_trend: by how much that error changes from the middle to the ends of the places, metres.
@@ -208,6 +209,14 @@ class MeasuredFocusSpec(Spec):
     description: Text = ""
     measured: FocusFiles
     mount: MountSpec
+    shims: tuple[PositiveLength, ...] | None = None
     vertex_error: LengthSigma = 0.5e-6
     vertex_trend: LengthSigma = 0.15e-6
     seed: Seed = 1
+
+    @model_validator(mode="after")
+    def _shim_for_each_hole(self) -> "MeasuredFocusSpec":
+        if self.shims is not None and len(self.shims) != len(self.mount.holes):
+            found, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
+            raise Problem("another number of shims than of holes", found, allowed, within=("shims",))
+        return self

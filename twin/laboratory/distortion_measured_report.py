@@ -76,16 +76,16 @@ def _shares(run: MeasuredDistortion) -> dict[str, float]:
 
 
 def _verdict(run: MeasuredDistortion, data: Mapping[str, Any]) -> str:
-    noise = data["noise"]
+    noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
     expected = noise["rejected_expected_of_good"]
+    known = 1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2)))
     return one_sentence(
-        f"The principal distance is {data['principal_distance_mm']:.4f} ± {data['principal_distance_mm_sigma']:.4f} mm, "
-        f"limited by {_limit(run)}",
-        f"distortion is known to {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm, and points lie within "
-        f"{data['rms_compensated_um']:.2f} µm rms of a smooth curve",
-        f"chi-square {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with the stated noise, "
-        f"{noise['rejected']} of {int(np.sum(run.present))} spots rejected where {expected:.0f} are expected of good ones, "
-        "see the noise",
+        f"The principal distance is {f:.4f} ± {sigma:.4f} mm, limited by {_limit(run)}",
+        f"distortion is known to {known:.2f} µm, and points lie within {data['rms_compensated_um']:.2f} µm rms of a "
+        "smooth curve",
+        f"chi-square {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise, "
+        f"{noise['rejected']} of {int(np.sum(run.present))} spots rejected where {expected:.0f} are expected of good "
+        "ones, see the noise",
     )
 
 
@@ -104,8 +104,8 @@ def _warnings(run: MeasuredDistortion, data: Mapping[str, Any]) -> tuple[str, ..
     f = fit.value("principal_distance")
     if abs(f / run.spec.focal_length - 1.0) > 0.05:
         out.append(
-            f"the principal distance is {f:.4g} m, but `focal_length` says {run.spec.focal_length:.4g} m: are the units "
-            "of angles and places right?"
+            f"the principal distance is {f:.4g} m, but `focal_length` says {run.spec.focal_length:.4g} m: are the "
+            "units of angles and places right?"
         )
     if data["probability"] < DOUBTFUL:
         out.append(
@@ -202,19 +202,19 @@ def _estimates(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
     ]
     heads = ("estimate", "f [mm]", "sigma of f [mm]", "p [mm]", "sigma of p [mm]", "D [µm rms]")
     terms = data["covariance_terms"]
-    covariance = [
+    covariance: list[tuple[Cell, ...]] = [
         (name.replace("_", " "), *(f"{value:.6g}" for value in row))
         for name, row in zip(terms, data["covariance_mm2"], strict=True)
     ]
     smooth = run.compensated.smooth
-    correlation = [
+    correlation: list[tuple[Cell, ...]] = [
         (name.replace("_", " "), *(float(v) for v in row))
         for name, row in zip(smooth.terms, smooth.correlation, strict=True)
     ]
     text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
-        f"direction that is imaged to the line's middle. The constant finds it {run.compensated.zero / ARCSEC:.3f} arcsec "
-        "from the zero that was given.",
+        f"direction that is imaged to the line's middle. The constant finds it "
+        f"{run.compensated.zero / ARCSEC:.3f} arcsec from the zero that was given.",
         typeset(run.compensated.fit.point.statement),
     )
     return Section(
@@ -255,7 +255,7 @@ def _noise(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
         f"One spot scatters by {noise['exposure_um']:.3f} µm "
         + ("between the sets" if run.reading.shape[1] > 1 else "by its stated sigmas")
         + (f"; the table of spots states {stated:.3f} µm of it" if stated > 0.0 else "")
-        + f". Beyond all that is stated, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve.",
+        + f". Beyond what is stated, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve.",
     ]
     if data["across_range_um"] is not None:
         text.append(f"Across the line the spots range over {data['across_range_um']:.0f} µm.")

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from twin.run.command import Test
+from twin.run.command import Export, Test
 
 
 def _focus() -> Test[Any]:
+    from twin.laboratory.focus_measured_report import measured_focus_report
     from twin.laboratory.focus_numbers import FOCUS
     from twin.laboratory.focus_report import focus_report
+    from twin.laboratory.measured_focus import MeasuredAlignment
 
-    return FOCUS, focus_report
+    return FOCUS, lambda run: measured_focus_report(run) if isinstance(run, MeasuredAlignment) else focus_report(run)
 
 
 def _distortion() -> Test[Any]:
@@ -45,3 +47,29 @@ LABORATORY_TESTS: dict[str, Callable[[], Test[Any]]] = {
     "turntable": _turntable,
 }
 """Subcommand -> imports what runs the test and what shows it; only the test that is asked for is imported."""
+
+
+def _export_focus() -> Export[Any]:
+    from twin.laboratory.export import export_focus
+
+    return export_focus
+
+
+def _export_distortion() -> Export[Any]:
+    from twin.laboratory.export import export_distortion
+
+    return export_distortion
+
+
+def _export_turntable() -> Export[Any]:
+    from twin.laboratory.export import export_turntable
+
+    return export_turntable
+
+
+LABORATORY_EXPORTS: dict[str, Callable[[], Export[Any]]] = {
+    "focus": _export_focus,
+    "distortion": _export_distortion,
+    "turntable": _export_turntable,
+}
+"""Subcommand -> imports what writes its simulated measurements as files."""

@@ -43,6 +43,14 @@ Seed = Annotated[
 BackendName = Annotated[str, typer.Option("--backend", help=BACKEND_HELP)]
 Force = Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else.")]
+Export = Annotated[
+    Path | None,
+    typer.Option(
+        "--export",
+        readable=False,
+        help="Folder to make with what the simulated bench measured, as files, and a test's file that reads them.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 
 
@@ -57,6 +65,7 @@ class Options:
         force: replace the run folder.
         as_json: print the numbers as JSON.
         quiet: print nothing.
+        export: folder for the simulated measurements, None for none.
     """
 
     out: Path | None
@@ -65,6 +74,7 @@ class Options:
     force: bool
     as_json: bool
     quiet: bool
+    export: Path | None = None
 
 
 class InputErrorText(Exception):

@@ -36,9 +36,10 @@ from twin.run.cli import (
     progress_columns,
     result_table,
 )
+from twin.run.cli import Export as ExportTo
 from twin.run.procedure import Advance, Procedure, Run
 from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, chosen
+from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
@@ -94,6 +95,10 @@ Test: TypeAlias = "tuple[Procedure[Any, Run], Callable[[Run], Report]]"
 """A test, and what makes the report of its run. A command imports them when it has read the file: its help and what is
 wrong with a file wait for neither.
 """
+
+
+Export: TypeAlias = "Callable[[Run, RunFolder], None]"
+"""Writes what a simulated bench measured into an open folder, as files that the same command reads."""
 
 
 def run_command(
@@ -160,6 +165,7 @@ def add_test(
     resolve: Callable[[Path], Any],
     load: Callable[[], Test[Run]],
     about: str,
+    export: Callable[[], Export[Run]] | None = None,
 ) -> None:
     """Add a test to a program as a subcommand with the options that all tests have.
 
@@ -170,9 +176,9 @@ def add_test(
         resolve: reads the test's file, as its procedure does.
         load: imports the test and its report.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+        export: imports what writes the measurements of a simulated bench as files; the command then has ``--export``.
     """
 
-    @app.command(command, help=about)
     def test(
         file: File,
         out: Out = None,
@@ -184,6 +190,21 @@ def add_test(
     ) -> None:
         run_test(program, command, file, resolve, load, Options(out, seed, backend, force, as_json, quiet))
 
+    def exporting(
+        file: File,
+        out: Out = None,
+        seed: Seed = None,
+        backend: BackendName = "llvm",
+        force: Force = False,
+        as_json: AsJson = False,
+        quiet: Quiet = False,
+        export_to: ExportTo = None,
+    ) -> None:
+        options = Options(out, seed, backend, force, as_json, quiet, export_to)
+        run_test(program, command, file, resolve, load, options, export)
+
+    app.command(command, help=about)(test if export is None else exporting)
+
 
 def run_test(
     program: str,
@@ -192,6 +213,7 @@ def run_test(
     resolve: Callable[[Path], Any],
     load: Callable[[], Test[Run]],
     options: Options,
+    export: Callable[[], Export[Run]] | None = None,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
@@ -202,6 +224,7 @@ def run_test(
         resolve: reads it, as the test's procedure does; ``test`` of the set-up has a ``seed``.
         load: imports the test and its report.
         options: what the user chose.
+        export: imports what writes the measurements of a simulated bench as files, for ``--export``.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -212,6 +235,7 @@ def run_test(
         from twin.run.report import with_warnings
 
         procedure, report = load()
+        beside = None if options.export is None else _export_folder(setup, procedure, options.export, options.force)
         number = setup.test.seed if options.seed is None else options.seed
         run, given = procedure.performed(setup, session.backend, number, session.advance)
         shown = with_warnings(report(run), given)
@@ -220,9 +244,29 @@ def run_test(
         drawn = number if procedure.seeded else None
         facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
         write_test(procedure.kind, numbers, shown, facts, session.folder)
+        if beside is not None and export is not None:
+            with beside:
+                export()(run, beside)
+                write_manifest(beside, program, session.started, session.seconds, test=procedure.kind, seed=number)
         return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console))
 
     run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
+
+
+def _export_folder(setup: Any, procedure: Procedure[Any, Any], target: Path, force: bool) -> RunFolder:
+    """The folder of ``--export``, checked before anything is computed.
+
+    Raises:
+        InputError: the test is one of measurements, which are files already.
+        RunFolderError: the folder cannot be made.
+    """
+    if not isinstance(setup, procedure.setup):
+        text = "measurements are files already; --export writes those of a simulated bench"
+        raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
+    try:
+        return RunFolder(target, force)
+    except RunFolderError as error:
+        raise RunFolderError(str(error).replace("--out", "--export")) from None
 
 
 def print_report(report: Report, console: Console) -> None:
