@@ -120,7 +120,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
         (f"change of shim {name.removeprefix('hole_')} [µm]", one["change_um"], one["change_um_sigma"])
         for name, one in data["shims"].items()
     ]
-    caption = "Plane: best focus minus CCD. Sigmas of plane and shims hold noise, CCDs off one plane and the vertices' common error."
+    caption = "Plane: best focus minus CCD. Sigmas hold noise, CCDs off one plane, and an error common to all vertices."
     return Table("alignment", "Result", caption, ("", "measured", "sigma"), rows, (None, 2, 2))
 
 
