@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -278,7 +279,7 @@ def _noise(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
     if gone:
         lines: list[tuple[Cell, ...]] = [
             (
-                one["file"],
+                Path(one["file"]).name,
                 one["line"],
                 one["reading_deg"],
                 f"{one['from_mean_um']:+.3f} µm" if "from_mean_um" in one else f"{one['from_mean_arcsec']:+.3f} arcsec",
@@ -295,4 +296,4 @@ def _noise(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
                 (None, None, 6),
             )
         )
-    return Section("Noise, and what was rejected", tuple(text), tuple(artefacts))
+    return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded=1 if gone else 0)

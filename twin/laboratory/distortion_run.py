@@ -399,7 +399,7 @@ def _check_region(files: DistortionFiles, found: SpotReadings, series: Calibrati
         shown = f"{np.degrees(found.reading[tuple(place)]):.9g} deg"
         line = int(found.lines[tuple(place)])
         raise InputError(
-            Issue("outside of the calibrated readings", found.file.file, line, ("reading",), shown, allowed)
+            Issue("outside of the calibrated readings", found.file.file, line, (found.head,), shown, allowed)
         )
 
 
@@ -411,7 +411,7 @@ def _check_angles(files: DistortionFiles, found: SpotReadings) -> None:
         shown = f"{np.degrees(found.reading[place]):.9g} deg, {np.degrees(off[place]):.4g} deg from the zero"
         allowed = f"within {np.degrees(WIDEST):.0f} deg of `zero`, the reading at which the line's middle is imaged"
         line = int(found.lines[place])
-        raise InputError(Issue("an angle beyond any field", found.file.file, line, ("reading",), shown, allowed))
+        raise InputError(Issue("an angle beyond any field", found.file.file, line, (found.head,), shown, allowed))
 
 
 def _locate(bench: DistortionBench, record: DistortionRecord) -> Spots:

@@ -1,7 +1,8 @@
 """``--export DIR``: what a simulated bench leaves, written as files of measurements, with a test's file that reads them
 back.
 
-The files are exactly those that a real bench would fill: nothing of the truth is in them.
+The files are exactly those that a real bench would fill: nothing of the truth is in them. Their numbers are in SI units
+with all digits, so that what is read back is the same to the bit.
 """
 
 from __future__ import annotations
@@ -12,8 +13,6 @@ from typing import Any
 import numpy as np
 
 from analysis.turntable.dividing_error import CalibrationSeries
-from analysis.units import ARCSEC
-from analysis.units import UM_PER_M as UM
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.measured_lab import (
     DistortionFiles,
@@ -54,16 +53,16 @@ def export_distortion(run: SimulatedDistortion, folder: RunFolder) -> None:
     """Spots with readings, the turntable's calibration, and ``distortion.yaml``."""
     setup = run.setup
     turntable = _turntable_files(folder, setup.turntable, run.calibration, run.table.held_out())
-    heads = ("point", "set", "reading [deg]", "along [mm]", "sigma [um]", "fixed sigma [um]")
-    reading, spots = np.degrees(run.reading), run.spots
+    heads = ("point", "set", "reading [rad]", "along [m]", "sigma [m]", "fixed sigma [m]")
+    reading, spots = run.reading, run.spots
     rows = (
         (
             i + 1,
             s + 1,
             float(reading[i, s]),
-            1e3 * float(spots.position[i, s]),
-            UM * float(spots.temporal[i, s]),
-            UM * float(spots.fixed[i, s]),
+            float(spots.position[i, s]),
+            float(spots.temporal[i, s]),
+            float(spots.fixed[i, s]),
         )
         for i, s in np.ndindex(*reading.shape)
     )
@@ -105,16 +104,16 @@ def _focus_tables(
     """Tables of images and of MTF values; writes the images."""
     bench = run.bench
     recorder = recorder_of(bench, state.standing, run.seed, number)
-    where = ("band", "x [mm]", "y [mm]", "edge", "shift [um]")
+    where = ("band", "x [m]", "y [m]", "edge", "shift [m]")
     images: list[Sequence[Any]] = [(*where, "file")]
     values: list[Sequence[Any]] = [(*where, "mtf", "sigma")]
     for i, (site, scan) in enumerate(zip(bench.sites, state.scans, strict=True)):
         field = bench.setup.test.fields.index(site.field) + 1
         facts = FrameFacts(f"{bench.setup.camera.name}, line CCD {site.band}", bench.ccds[site.band].band.pitch)
-        x, y = (1e3 * float(v) for v in site.place)
+        x, y = (float(v) for v in site.place)
         for edge, shift in scan.shift.items():
             for k, at in enumerate(scan.target):
-                place = (site.band, x, y, edge, UM * float(shift[k]))
+                place = (site.band, x, y, edge, float(shift[k]))
                 file = f"{stem}/{site.band}_field{field}_{edge}_{k + 1:02d}.tiff"
                 folder.write_bytes(file, tiff(recorder.frames(i, edge, float(at), scan.take + k), facts))
                 images.append((*place, file))
@@ -167,8 +166,8 @@ def _turntable_files(
 
 
 def _comparisons(series: CalibrationSeries) -> Iterator[Sequence[Any]]:
-    yield "reading [deg]", "repeat", "difference [arcsec]"
-    for angle, row in zip(np.degrees(series.angle), series.comparisons / ARCSEC, strict=True):
+    yield "reading [rad]", "repeat", "difference [rad]"
+    for angle, row in zip(series.angle, series.comparisons, strict=True):
         yield from ((float(angle), k + 1, float(value)) for k, value in enumerate(row))
 
 

@@ -5,6 +5,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -201,7 +202,7 @@ def _curves(run: MeasuredAlignment, data: Mapping[str, Any]) -> Section:
         ),
     ]
     if data["images_without_edge"]:
-        gone = [(one["file"], one["line"], one["reason"]) for one in data["images_without_edge"]]
+        gone = [(Path(one["file"]).name, one["line"], one["reason"]) for one in data["images_without_edge"]]
         heads_ = ("file", "line", "reason")
         note = "They have no weight."
         artefacts.insert(1, Table("no-edge", "Images without a measurable edge", note, heads_, gone))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.focal_plane.plane_fit import LineLevel, ObservabilityError
-from analysis.focal_plane.through_focus import FocusError, focus_vertex
+from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex
 from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.mtf.edge_location import EdgeError
 from analysis.spots.noise import NoiseModel
@@ -239,7 +239,12 @@ def _scan(
     """The place's curves and their vertices."""
     vertex = {}
     for edge, rows in site.rows.items():
+        good = int(np.sum(np.isfinite(sigma[rows])))
         try:
+            if good < LEAST_POINTS:
+                raise FocusError(
+                    f"{good} positions with an edge of {len(rows)}, at least {LEAST_POINTS} are needed", {}
+                )
             vertex[edge] = focus_vertex(shift[rows], mtf[rows], sigma[rows])
         except FocusError as error:
             text = f"no best focus of {site}, edge {edge}: {error}; positions are moves of the image, metres"

@@ -77,11 +77,13 @@ class Comparisons:
         series: for the analysis.
         lines: of each comparison in the file, (N, repeats); 0 where none was made.
         file: they stand in.
+        head: of its readings.
     """
 
     series: CalibrationSeries
     lines: Places
     file: DataFile
+    head: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +97,7 @@ class SpotReadings:
         across: of the spots across the line, (N, S), metres; None if the table has no such column.
         lines: in the file, (N, S); 0 where nothing was measured.
         file: they stand in.
+        head: of its readings.
     """
 
     reading: Array
@@ -103,6 +106,7 @@ class SpotReadings:
     across: Array | None
     lines: Places
     file: DataFile
+    head: str
 
 
 def read_turntable(files: TurntableFiles) -> tuple[Comparisons, Comparisons | None]:
@@ -123,7 +127,7 @@ def read_turntable(files: TurntableFiles) -> tuple[Comparisons, Comparisons | No
         allowed = f"{np.degrees(first):.9g} to {np.degrees(last):.9g} deg, as {files.comparisons} has it"
         line = int(held_out.lines[k].max())
         issue = Issue(
-            "a held-out reading beyond the calibrated ones", held_out.file.file, line, ("reading",), found, allowed
+            "a held-out reading beyond the calibrated ones", held_out.file.file, line, (held_out.head,), found, allowed
         )
         raise InputError(issue)
     return series, held_out
@@ -181,7 +185,7 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4) -> Comp
         remedy = "less than 1 deg: reading minus reference, both counted in the same sense and in the unit of the head"
         raise table.error(int(cells.first[worst]), name, text, allowed=remedy)
     series = CalibrationSeries(angle, matrix, reference_sigma, present=None if np.all(present) else present)
-    return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table))
+    return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table), table.heads[READING.name])
 
 
 def read_spots(files: DistortionFiles) -> SpotReadings:
@@ -232,7 +236,9 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     across = cells.matrix(table["across"], None)[rank] if "across" in table else None
     lines = cells.matrix(table.lines, 0)[rank]
     whole = None if np.all(present) else present[rank]
-    return SpotReadings(filled["reading"][rank], spots, whole, across, lines, DataFile.of(table))
+    return SpotReadings(
+        filled["reading"][rank], spots, whole, across, lines, DataFile.of(table), table.heads[READING.name]
+    )
 
 
 def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
@@ -349,12 +355,26 @@ def _check_angles(cells: _Cells, angle: Array, path: str, fewest: int) -> None:
     if count < fewest:
         remedy = f"{fewest} or more; where the table does not come back to the same reading, a column 'position'"
         raise InputError(
-            Issue("too few different readings", path, int(cells.table.lines[0]), ("reading",), str(count), remedy)
+            Issue(
+                "too few different readings",
+                path,
+                int(cells.table.lines[0]),
+                (cells.table.heads[READING.name],),
+                str(count),
+                remedy,
+            )
         )
     if count > MOST_ANGLES:
         remedy = f"at most {MOST_ANGLES}; a column 'position' numbers the stops of the table"
         raise InputError(
-            Issue("too many different readings", path, int(cells.table.lines[0]), ("reading",), str(count), remedy)
+            Issue(
+                "too many different readings",
+                path,
+                int(cells.table.lines[0]),
+                (cells.table.heads[READING.name],),
+                str(count),
+                remedy,
+            )
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ def _measured_fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         artefacts.insert(1, SvgFigure("turntable-residuals", "What the fits miss", note, figure_svg("residuals", run)))
     gone = result["rejected_readings"]
     if gone:
-        lines = [(one["file"], one["line"], one["reading_deg"], one["from_mean_arcsec"]) for one in gone]
+        lines = [(Path(one["file"]).name, one["line"], one["reading_deg"], one["from_mean_arcsec"]) for one in gone]
         artefacts.append(
             Table(
                 "turntable-rejected",
@@ -123,7 +124,7 @@ def _measured_fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
                 (None, None, 6, 3),
             )
         )
-    return Section("Fits of the dividing error", tuple(text), tuple(artefacts))
+    return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if gone else 0)
 
 
 def measured_turntable_report(run: MeasuredTurntable) -> Report:
