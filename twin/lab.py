@@ -12,7 +12,7 @@ if __name__ == "__main__":
 import typer
 
 from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
-from twin.laboratory.laboratory_tests import LABORATORY_EXPORTS, LABORATORY_TESTS
+from twin.laboratory.laboratory_tests import LABORATORY_TESTS, export_distortion, export_focus, export_turntable
 from twin.run.command import add_test
 
 PROGRAM = "twin.lab"
@@ -54,7 +54,7 @@ add_test(
 
     Example: `python -m twin.lab focus scenes/lab/focus.yaml`
     """,
-    LABORATORY_EXPORTS["focus"],
+    export_focus,
 )
 
 add_test(
@@ -72,7 +72,7 @@ add_test(
 
     Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
     """,
-    LABORATORY_EXPORTS["distortion"],
+    export_distortion,
 )
 
 add_test(
@@ -85,7 +85,7 @@ add_test(
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
     """,
-    LABORATORY_EXPORTS["turntable"],
+    export_turntable,
 )
 
 

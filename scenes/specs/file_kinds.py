@@ -7,19 +7,18 @@ from typing import Any, TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
-from scenes.specs.measured_lab import MeasuredDistortionSpec, MeasuredFocusSpec, MeasuredTurntableSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.study import StudySpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import read_yaml

@@ -6,7 +6,7 @@ from typing import Any, TypeVar, cast
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.load import (
     find_camera,
@@ -16,14 +16,8 @@ from scenes.specs.load import (
     load_lab_test,
     load_turntable_test,
 )
-from scenes.specs.measured_lab import (
-    MeasuredDistortionSpec,
-    MeasuredFocusSpec,
-    MeasuredTurntableSpec,
-    TurntableFiles,
-)
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.yaml_file import is_file, read_yaml

@@ -23,6 +23,7 @@ from twin.lab import app
 from twin.laboratory.distortion_run import measure_files
 from twin.laboratory.measured_focus import align_measured
 from twin.laboratory.measured_readings import read_comparisons
+from twin.run.procedure import BenchError
 
 EXAMPLES = SCENES / "lab" / "measured"
 TABLE = {"turntable": "comparisons.csv", "distortion": "spots.csv", "focus": "mtf.csv"}
@@ -122,6 +123,7 @@ TABLES = [
     ),
     ("distortion", scaled("along [mm]", -1.0), "angles and spot positions count in opposite senses"),
     ("distortion", only(30), "too few points; found 3, allowed: 5 or more, over the whole field"),
+    ("distortion", cell(4, "point", "77"), ":4: point: one spot only of this point in a test of several sets"),
     ("distortion", cell(3, "point", "x"), ":3: point: not a number"),
     ("distortion", only(2), "2 rows below the heads"),
     ("focus", head("shift [um]", "shift [arcsec]"), ":1: shift [arcsec]: "),
@@ -342,8 +344,8 @@ def survives(folder: Path, command: str, count: int, seed: int) -> int:
                 measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
             else:
                 align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
-        except InputError as error:
-            refused += error.file.endswith((".csv", ".yaml"))
+        except (InputError, BenchError) as error:  # a command tells the second at its key
+            refused += isinstance(error, BenchError) or error.file.endswith((".csv", ".yaml"))
     return refused
 
 

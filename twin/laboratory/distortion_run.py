@@ -32,8 +32,8 @@ from analysis.spots.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
+from scenes.specs.camera_tests import DistortionFiles, MeasuredDistortionSpec
 from scenes.specs.lab_setup import DistortionSetup, MeasuredDistortionSetup
-from scenes.specs.measured_lab import DistortionFiles, MeasuredDistortionSpec
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth

@@ -7,52 +7,53 @@ with all digits, so that what is read back is the same to the bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.measured_lab import (
+from scenes.specs.camera_tests import (
     DistortionFiles,
     FocusFiles,
     LevelSpec,
     MeasuredDistortionSpec,
     MeasuredFocusSpec,
-    MeasuredTurntableSpec,
     NoiseSpec,
-    TurntableFiles,
 )
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml
 from twin.laboratory.distortion_run import SimulatedDistortion
 from twin.laboratory.focus_alignment import Alignment, State, recorder_of
 from twin.laboratory.turntable_run import SimulatedTurntable
 from twin.run.data_files import FrameFacts, csv_table, tiff
-from twin.run.run_folder import RunFolder
 
 __all__ = ["export_distortion", "export_focus", "export_turntable"]
 
+Files: TypeAlias = Mapping[str, str | bytes]
+"""Path in the folder -> contents."""
 COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
 """Names of tables."""
 
 
-def export_turntable(run: SimulatedTurntable, folder: RunFolder) -> None:
+def export_turntable(run: SimulatedTurntable) -> Files:
     """Comparisons, held-out comparisons and ``turntable.yaml``."""
     spec = run.spec
-    files = _turntable_files(folder, spec, run.series, run.held_out)
+    out: dict[str, str | bytes] = {}
+    files = _turntable_files(out, spec, run.series, run.held_out)
     test = MeasuredTurntableSpec.model_construct(
         name="turntable", description=spec.description, measured=files, seed=run.model.seed
     )
-    _write_test(folder, "turntable.yaml", test)
+    return {**out, "turntable.yaml": _text(test)}
 
 
-def export_distortion(run: SimulatedDistortion, folder: RunFolder) -> None:
+def export_distortion(run: SimulatedDistortion) -> Files:
     """Spots with readings, the turntable's calibration, and ``distortion.yaml``."""
     setup = run.setup
-    turntable = _turntable_files(folder, setup.turntable, run.calibration, run.table.held_out())
+    out: dict[str, str | bytes] = {}
+    turntable = _turntable_files(out, setup.turntable, run.calibration, run.table.held_out())
     heads = ("point", "set", "reading [rad]", "along [m]", "sigma [m]", "fixed sigma [m]")
     reading, spots = run.reading, run.spots
     rows = (
@@ -66,7 +67,7 @@ def export_distortion(run: SimulatedDistortion, folder: RunFolder) -> None:
         )
         for i, s in np.ndindex(*reading.shape)
     )
-    folder.write_bytes(SPOTS, csv_table([heads, *rows]))
+    out[SPOTS] = csv_table([heads, *rows])
     files = DistortionFiles.model_construct(
         spots=SPOTS, zero=setup.turntable.camera_angle, turntable=turntable, line=None, angle_sigma=None, reversed=False
     )
@@ -77,31 +78,33 @@ def export_distortion(run: SimulatedDistortion, folder: RunFolder) -> None:
         measured=files,
         seed=run.seed,
     )
-    _write_test(folder, "distortion.yaml", test)
+    return {**out, "distortion.yaml": _text(test)}
 
 
-def export_focus(run: Alignment, folder: RunFolder) -> None:
+def export_focus(run: Alignment) -> Files:
     """Every standing of the assembly, before and after each round: frames of all edges, a table of them and of their
     MTF, and a test's file for each table.
     """
     mount = run.bench.setup.test.mount
+    out: dict[str, str | bytes] = {}
     shims = tuple(mount.thickness for _ in mount.holes)
     for number, state in enumerate(run.states):
         stem = "before" if number == 0 else f"round_{number}"
-        for name, rows in zip(("images", "mtf"), _focus_tables(run, state, number, stem, folder), strict=True):
+        for name, rows in zip(("images", "mtf"), _focus_tables(run, state, number, stem, out), strict=True):
             table = f"{stem}_{name}.csv"
-            folder.write_bytes(table, csv_table(rows))
-            _write_test(folder, f"focus_{stem}_{name}.yaml", _focus_test(run, state, {name: table}, shims))
+            out[table] = csv_table(rows)
+            out[f"focus_{stem}_{name}.yaml"] = _text(_focus_test(run, state, {name: table}, shims))
         if number < len(run.shimmings):
             thickness = run.shimmings[number].plan.thickness
             assert thickness is not None
             shims = tuple(float(one) for one in thickness)
+    return out
 
 
 def _focus_tables(
-    run: Alignment, state: State, number: int, stem: str, folder: RunFolder
+    run: Alignment, state: State, number: int, stem: str, out: dict[str, str | bytes]
 ) -> tuple[list[Sequence[Any]], list[Sequence[Any]]]:
-    """Tables of images and of MTF values; writes the images."""
+    """Tables of images and of MTF values; the images are put into ``out``."""
     bench = run.bench
     recorder = recorder_of(bench, state.standing, run.seed, number)
     where = ("band", "x [m]", "y [m]", "edge", "shift [m]")
@@ -115,7 +118,7 @@ def _focus_tables(
             for k, at in enumerate(scan.target):
                 place = (site.band, x, y, edge, float(shift[k]))
                 file = f"{stem}/{site.band}_field{field}_{edge}_{k + 1:02d}.tiff"
-                folder.write_bytes(file, tiff(recorder.frames(i, edge, float(at), scan.take + k), facts))
+                out[file] = tiff(recorder.frames(i, edge, float(at), scan.take + k), facts)
                 images.append((*place, file))
                 # where no edge was measured there is no value
                 if np.isfinite(scan.sigma[edge][k]):
@@ -152,11 +155,11 @@ def _focus_test(run: Alignment, state: State, table: dict[str, str], shims: tupl
 
 
 def _turntable_files(
-    folder: RunFolder, spec: TurntableTestSpec, series: CalibrationSeries, held_out: CalibrationSeries
+    out: dict[str, str | bytes], spec: TurntableTestSpec, series: CalibrationSeries, held_out: CalibrationSeries
 ) -> TurntableFiles:
-    """Write both tables."""
+    """Both tables are put into ``out``."""
     for name, one in ((COMPARISONS, series), (HELD_OUT, held_out)):
-        folder.write_bytes(name, csv_table(_comparisons(one)))
+        out[name] = csv_table(_comparisons(one))
     return TurntableFiles.model_construct(
         comparisons=COMPARISONS,
         held_out=HELD_OUT,
@@ -171,5 +174,5 @@ def _comparisons(series: CalibrationSeries) -> Iterator[Sequence[Any]]:
         yield from ((float(angle), k + 1, float(value)) for k, value in enumerate(row))
 
 
-def _write_test(folder: RunFolder, name: str, test: Spec) -> None:
-    folder.write_text(name, dump_yaml(test.plain()))
+def _text(test: Spec) -> str:
+    return dump_yaml(test.plain())

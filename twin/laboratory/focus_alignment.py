@@ -37,9 +37,8 @@ from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.specs.camera_tests import FocusTestSpec
+    from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
     from scenes.specs.lab_setup import FocusSetup
-    from scenes.specs.measured_lab import MeasuredFocusSpec
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
 

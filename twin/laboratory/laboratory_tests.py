@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from twin.run.command import Export, Test
+from twin.run.command import Test
 
 
 def _focus() -> Test[Any]:
@@ -49,27 +49,22 @@ LABORATORY_TESTS: dict[str, Callable[[], Test[Any]]] = {
 """Subcommand -> imports what runs the test and what shows it; only the test that is asked for is imported."""
 
 
-def _export_focus() -> Export[Any]:
-    from twin.laboratory.export import export_focus
+def export_focus(run: Any) -> Mapping[str, str | bytes]:
+    """Files with what the simulated bench of an alignment measured."""
+    from twin.laboratory import export
 
-    return export_focus
-
-
-def _export_distortion() -> Export[Any]:
-    from twin.laboratory.export import export_distortion
-
-    return export_distortion
+    return export.export_focus(run)
 
 
-def _export_turntable() -> Export[Any]:
-    from twin.laboratory.export import export_turntable
+def export_distortion(run: Any) -> Mapping[str, str | bytes]:
+    """Files with what the simulated bench of a distortion test measured."""
+    from twin.laboratory import export
 
-    return export_turntable
+    return export.export_distortion(run)
 
 
-LABORATORY_EXPORTS: dict[str, Callable[[], Export[Any]]] = {
-    "focus": _export_focus,
-    "distortion": _export_distortion,
-    "turntable": _export_turntable,
-}
-"""Subcommand -> imports what writes its simulated measurements as files."""
+def export_turntable(run: Any) -> Mapping[str, str | bytes]:
+    """Files with what the simulated bench of a turntable test measured."""
+    from twin.laboratory import export
+
+    return export.export_turntable(run)

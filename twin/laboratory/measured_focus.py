@@ -24,8 +24,8 @@ from analysis.spots.noise import NoiseModel
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
+from scenes.specs.camera_tests import FocusFiles, MeasuredFocusSpec, NoiseSpec
 from scenes.specs.lab_setup import FocusSetup, MeasuredFocusSetup
-from scenes.specs.measured_lab import FocusFiles, MeasuredFocusSpec, NoiseSpec
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from analysis.orientation.measurement import CALIBRATED, Spots
 from analysis.turntable.dividing_error import CalibrationSeries
-from scenes.specs.measured_lab import DistortionFiles, TurntableFiles
+from scenes.specs.camera_tests import DistortionFiles
+from scenes.specs.turntable_test import TurntableFiles
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, LENGTH
@@ -221,6 +222,11 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     cells = cells.at(slot)
     _few_points(table, cells, sets if "set" in table else None)
     present = cells.present
+    alone = cells.count < 2
+    if present.shape[1] > 1 and np.any(alone):
+        row = int(cells.first[int(np.argmax(alone))])
+        text = "one spot only of this point in a test of several sets"
+        raise table.error(row, "point", text, allowed="2 or more of each, 5 for Chauvenet's criterion to reject any")
     # what was not measured gets a value of its own point, which no mean takes
     filled = {name: cells.matrix(value, None) for name, value in (("reading", reading), ("where", where))}
     spots = Spots(filled["where"], cells.matrix(sigma), cells.matrix(fixed), np.zeros(present.shape))
