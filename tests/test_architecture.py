@@ -128,7 +128,7 @@ def computing() -> list[str]:
         and (
             module in RUNS
             or any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
-            or re.search(r"^[A-Z]+ = Procedure\(", (ROOT / path).read_text("utf-8"), re.M)
+            or re.search(r"^[A-Z]+ = Procedure(\[.*\])?\(", (ROOT / path).read_text("utf-8"), re.M)
         )
     ]
 

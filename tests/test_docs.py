@@ -32,9 +32,12 @@ from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
 from scenes.specs.resolved import resolve
+from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
+from twin.laboratory.measured_focus import IMAGE_COLUMNS, MTF_COLUMNS
+from twin.laboratory.measured_readings import COMPARISON_COLUMNS, SPOT_COLUMNS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -125,8 +128,12 @@ def test_every_block_is_of_a_sort_that_is_tested() -> None:
 
 
 def tables() -> list[Piece]:
-    """Contents of CSV files: of a course's table."""
+    """Contents of CSV files."""
     return blocks("csv")
+
+
+MEASURED = "docs/measured_laboratory.md"
+"""Page whose tables are measurements and not courses."""
 
 
 def models_of(text: str) -> list[type[Any]]:
@@ -154,7 +161,19 @@ def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument, backend) -> N
         build_instrument(spec, {site.camera: load_camera(site.camera) for site in spec.cameras.values()}, backend)
 
 
-@pytest.mark.parametrize("block", tables(), ids=str)
+@pytest.mark.parametrize("block", [block for block in tables() if block.page == MEASURED], ids=str)
+def test_a_table_of_measurements_can_be_read(block: Piece, tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text(block.text, "utf-8")
+    kinds = (COMPARISON_COLUMNS, SPOT_COLUMNS, MTF_COLUMNS, IMAGE_COLUMNS)
+    read = []
+    for columns in kinds:
+        with contextlib.suppress(InputError):
+            read.append(read_table(tmp_path / "table.csv", columns))
+    assert len(read) == 1
+    assert len(block.text.splitlines()) == 10
+
+
+@pytest.mark.parametrize("block", [block for block in tables() if block.page != MEASURED], ids=str)
 def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(block.text, "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ncourse: {table: table.csv}\n", "utf-8")

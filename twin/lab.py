@@ -1,4 +1,6 @@
-"""``python -m twin.lab``: laboratory tests of a camera, rendered and measured (paper 004)."""
+"""``python -m twin.lab``: laboratory tests of a camera, rendered or from files of measurements, and measured (paper
+004).
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,8 @@ if __name__ == "__main__":
 
 import typer
 
-from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
-from twin.laboratory.laboratory_tests import LABORATORY_TESTS
+from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from twin.laboratory.laboratory_tests import LABORATORY_TESTS, export_distortion, export_focus, export_turntable
 from twin.run.command import add_test
 
 PROGRAM = "twin.lab"
@@ -25,8 +27,12 @@ def main() -> None:
     """Test a camera in the laboratory as paper 004 does: every image is rendered through the traced camera, noise
     included, and only images and readings reach the analysis.
 
-    Examples of all three files are in scenes/lab. The run folder gets config.yaml, the numbers as JSON, a
-    self-contained report.html, figures and tables in artefacts/ and recorded frames in images/.
+    With `measured:` in the test's file, tables and images of a real bench go through the same analysis
+    (docs/measured_laboratory.md); `--export DIR` writes a simulated bench's as such files.
+
+    Examples of all three files are in scenes/lab, and of measurements in scenes/lab/measured. The run folder gets
+    config.yaml, the numbers as JSON, a self-contained report.html, figures and tables in artefacts/ and recorded
+    frames in images/.
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml`
 
@@ -38,7 +44,7 @@ add_test(
     app,
     PROGRAM,
     "focus",
-    resolve_focus,
+    resolve_focus_test,
     LABORATORY_TESTS["focus"],
     """Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
     shims, and the same again.
@@ -48,13 +54,14 @@ add_test(
 
     Example: `python -m twin.lab focus scenes/lab/focus.yaml`
     """,
+    export_focus,
 )
 
 add_test(
     app,
     PROGRAM,
     "distortion",
-    resolve_distortion,
+    resolve_distortion_test,
     LABORATORY_TESTS["distortion"],
     """Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
     turns the camera, with raw and with compensated angles.
@@ -65,18 +72,20 @@ add_test(
 
     Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
     """,
+    export_distortion,
 )
 
 add_test(
     app,
     PROGRAM,
     "turntable",
-    resolve_turntable,
+    resolve_turntable_test,
     LABORATORY_TESTS["turntable"],
     """Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
     """,
+    export_turntable,
 )
 
 

@@ -109,7 +109,9 @@ class PointMeans:
         return np.asarray(np.mean(values, axis=1, where=self.keep))
 
 
-def reduce_sets(angle: Array, spots: Spots, focal_length: float, single: float) -> PointMeans:
+def reduce_sets(
+    angle: Array, spots: Spots, focal_length: float, single: float, present: NDArray[np.bool_] | None = None
+) -> PointMeans:
     """Find gross errors among the sets and the noise of the means.
 
     In each set, L - f tan W of a point differs from its mean over the sets by the repeatability of the table and by
@@ -120,16 +122,18 @@ def reduce_sets(angle: Array, spots: Spots, focal_length: float, single: float) 
         spots: as located.
         focal_length: about, metres.
         single: sigma of one exposure, metres, for a test of one set.
+        present: which exposures there are, (N, S), where sets lack points; the others hold any finite numbers. None
+            for all.
     """
     rest = spots.position - focal_length * np.tan(angle)
     # what does not average out while the spot stays on its pixels
-    fixed = np.sqrt(np.mean(spots.fixed**2, axis=1))
+    fixed = np.sqrt(np.mean(spots.fixed**2, axis=1, where=True if present is None else present))
     count, sets = rest.shape
     if sets < 2:
         own = np.hypot(single, spots.temporal[:, 0])
         return PointMeans(np.ones(rest.shape, bool), float(np.sqrt(np.mean(own**2))), np.hypot(own, fixed))
     # the comparison of the table with the camera is a calibration series, if one forgets its units
-    series = CalibrationSeries(np.arange(count, dtype=float), rest)
+    series = CalibrationSeries(np.arange(count, dtype=float), rest, present=present)
     return PointMeans(series.keep, series.repeatability, np.hypot(series.noise_sigma, fixed))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, norm
 
-__all__ = ["FEWEST", "chauvenet", "limit", "normal_reduction", "rejection_rate"]
+__all__ = ["FEWEST", "chauvenet", "expected_rejections", "limit", "normal_reduction", "rejection_rate"]
 
 Array = NDArray[np.float64]
 FEWEST = 3
@@ -30,12 +30,16 @@ def limit(n: ArrayLike) -> Array:
     return np.asarray(norm.isf(0.25 / np.asarray(n, np.float64)))
 
 
-def chauvenet(readings: ArrayLike, repeated: bool = False) -> NDArray[np.bool_]:
+def chauvenet(
+    readings: ArrayLike, repeated: bool = False, present: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """Which readings to keep, (..., n) bool.
 
     Args:
         readings: (..., n); the last axis holds the repeats of one quantity, in any unit.
         repeated: apply the rule again to what is left, until nothing more goes.
+        present: (..., n), which of them were taken, where quantities have different numbers of repeats; the others
+            hold any finite number and are not kept. None for all.
 
     Raises:
         ValueError: not finite.
@@ -43,7 +47,8 @@ def chauvenet(readings: ArrayLike, repeated: bool = False) -> NDArray[np.bool_]:
     x = np.asarray(readings, np.float64)
     if not np.all(np.isfinite(x)):
         raise ValueError("Chauvenet's criterion: readings must be finite; leave failed readings out")
-    keep = np.ones(x.shape, bool)
+    keep = np.ones(x.shape, bool) if present is None else np.array(present, bool)
+    x = np.where(keep, x, 0.0)
     for _ in range(x.shape[-1] if repeated else 1):
         count = keep.sum(-1, keepdims=True)
         deviation = np.abs(x - np.mean(x, -1, keepdims=True, where=keep))
@@ -66,17 +71,35 @@ def rejection_rate(n: int) -> float:
     return float(beta.sf(_scaled(n), 0.5, 0.5 * (n - 2))) if n >= FEWEST else 0.0
 
 
-def normal_reduction(n: int) -> float:
+def expected_rejections(counts: NDArray[np.int64]) -> float:
+    """How many of series of so many normal readings, (N,), the single pass rejects on average."""
+    sizes, times = np.unique(counts, return_counts=True)
+    return float(sum(rejection_rate(int(n)) * (int(n) * int(many)) for n, many in zip(sizes, times, strict=True)))
+
+
+def normal_reduction(n: int | NDArray[np.int64]) -> float:
     """E[sum of squares left] / E[degrees of freedom left] / sigma^2 for n normal readings after the single pass.
 
     The pooled variance of cleaned series is divided by it. x - mean over s is independent of s (Basu), so a reading
     outside the limit takes n/(n - 1) (x - mean)^2 out of the sum, on average sigma^2 times the tail of the beta
     distribution (3/2, (n - 2)/2). That two readings of one series go at once is left out: rare for n below some 20.
+
+    n: of every series, or (N,) of each of them.
     """
+    sizes, times = np.unique(n, return_counts=True)
+    parts = [_left(int(size)) for size in sizes]
+    if len(parts) == 1:
+        return parts[0][0] / parts[0][1]
+    square, freedom = (float(times @ np.array(part)) for part in zip(*parts, strict=True))
+    return square / freedom
+
+
+def _left(n: int) -> tuple[float, float]:
+    """Expected sum of squares in sigma^2, and degrees of freedom, that the pass leaves of n normal readings."""
     if n < FEWEST:
-        return 1.0
+        return float(max(n - 1, 1)), float(max(n - 1, 1))
     square = float(beta.sf(_scaled(n), 1.5, 0.5 * (n - 2)))
-    return (n - 1 - n * square) / (n - 1 - n * rejection_rate(n))
+    return n - 1 - n * square, n - 1 - n * rejection_rate(n)
 
 
 def _scaled(n: int) -> float:

@@ -55,12 +55,15 @@ class CalibrationSeries:
         reference_sigma: standard deviation of the reference's own error at one position, as its certificate states,
             radians. It is the same in all repeats.
         repeated: apply Chauvenet's criterion until nothing more goes; the textbook applies it once.
+        present: which comparisons were made, (N, repeats), where angles have different numbers of them; the others
+            count for nothing. None for all.
     """
 
     angle: Array
     comparisons: Array
     reference_sigma: float = 0.0
     repeated: bool = False
+    present: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for shapes and numbers that are no series."""
@@ -75,23 +78,35 @@ class CalibrationSeries:
             raise ValueError("calibration: one repeat only; its noise cannot be told. Take 2 or more, 5 to reject any")
         if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and self.reference_sigma >= 0.0):
             raise ValueError("calibration: angles and comparisons must be finite and reference_sigma not negative")
+        if self.present is not None and (self.present.shape != y.shape or np.min(self.present.sum(axis=1)) < 2):
+            raise ValueError("calibration: every angle needs two comparisons or more, and `present` (N, repeats)")
         object.__setattr__(self, "angle", x)
         object.__setattr__(self, "comparisons", y)
 
     @cached_property
     def keep(self) -> NDArray[np.bool_]:
         """Comparisons that Chauvenet's criterion keeps, (N, repeats)."""
-        return chauvenet(self.comparisons, self.repeated)
+        return chauvenet(self.comparisons, self.repeated, self.present)
+
+    @property
+    def taken(self) -> NDArray[np.bool_]:
+        """Comparisons that were made, (N, repeats)."""
+        return np.ones(self.comparisons.shape, bool) if self.present is None else self.present
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """How often each angle was compared, (N,)."""
+        return np.asarray(self.taken.sum(axis=1))
 
     @property
     def repeats(self) -> int:
-        """How often each angle was compared."""
+        """How often the angles were compared, at most."""
         return self.comparisons.shape[1]
 
     @property
     def rejected(self) -> int:
         """How many comparisons went."""
-        return int(np.sum(~self.keep))
+        return int(np.sum(self.taken & ~self.keep))
 
     @cached_property
     def mean(self) -> Array:
@@ -101,7 +116,9 @@ class CalibrationSeries:
     @cached_property
     def rms_before(self) -> Array:
         """RMS of all repeats about their mean, divisor n - 1, (N,), radians."""
-        return np.asarray(np.std(self.comparisons, axis=1, ddof=1))
+        return np.asarray(
+            np.std(self.comparisons, axis=1, ddof=1, where=True if self.present is None else self.present)
+        )
 
     @cached_property
     def rms_after(self) -> Array:
@@ -110,7 +127,9 @@ class CalibrationSeries:
 
     @property
     def averaging_alone(self) -> float:
-        """Largest RMS of a mean if nothing were rejected: max(rms_before) / sqrt(repeats), radians."""
+        """Largest RMS of a mean if nothing were rejected: max(rms_before / sqrt(n)), radians."""
+        if self.present is not None:
+            return float(np.max(self.rms_before / np.sqrt(self.counts)))
         return float(np.max(self.rms_before) / np.sqrt(self.repeats))
 
     @property
@@ -139,7 +158,7 @@ class CalibrationSeries:
         """Standard deviation of one good comparison, radians: of all angles together that are not suspect, for one
         alone has few degrees of freedom, and corrected for what the criterion's single pass takes from normal noise.
         """
-        return float(np.sqrt(self._pooled(~self.suspect) / normal_reduction(self.repeats)))
+        return float(np.sqrt(self._pooled(~self.suspect) / normal_reduction(self.counts)))
 
     def _pooled(self, angles: NDArray[np.bool_]) -> float:
         """Pooled variance of the kept repeats at these angles (N,), rad^2."""

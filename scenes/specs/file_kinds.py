@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
@@ -19,7 +19,7 @@ from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.study import StudySpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import read_yaml
@@ -82,6 +82,9 @@ FILE_KINDS = (
     FileKind("focus_test", FocusTestSpec, "a focus test", "twin.lab focus"),
     FileKind("distortion_test", DistortionTestSpec, "a distortion test", "twin.lab distortion"),
     FileKind("turntable_test", TurntableTestSpec, "a turntable test", "twin.lab turntable"),
+    FileKind("measured_focus", MeasuredFocusSpec, "a focus test on measurements", "twin.lab focus"),
+    FileKind("measured_distortion", MeasuredDistortionSpec, "a distortion test on measurements", "twin.lab distortion"),
+    FileKind("measured_turntable", MeasuredTurntableSpec, "a turntable test on measurements", "twin.lab turntable"),
     FileKind("orbit_angle", OrbitAngleSpec, "a test of intersection angles", "twin.orbit angle"),
     FileKind("orbit_calibration", OrbitCalibrationSpec, "an in-orbit calibration", "twin.orbit calibrate"),
     FileKind("orbit_simulate", OrbitSimulateSpec, "a simulation of images of the ground", "twin.orbit simulate"),

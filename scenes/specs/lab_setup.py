@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, TypeVar, cast
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.load import (
     find_camera,
@@ -16,9 +17,16 @@ from scenes.specs.load import (
     load_turntable_test,
 )
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.spec import Paths, Spec
+from scenes.yaml.yaml_file import is_file, read_yaml
+
+MEASURED = "measured"
+"""Key of a test whose data come from files and not from a simulated bench."""
+DATA_FILES = ("comparisons", "held_out", "spots", "mtf", "images")
+"""Keys of `measured` that name files."""
+MeasuredSetup = TypeVar("MeasuredSetup", bound="ExperimentSetup[Any]")
 
 
 class FocusSetup(ExperimentSetup[FocusTestSpec]):
@@ -49,6 +57,18 @@ class DistortionSetup(ExperimentSetup[DistortionTestSpec]):
 
 class TurntableSetup(ExperimentSetup[TurntableTestSpec]):
     """A turntable test, which refers to nothing else."""
+
+
+class MeasuredFocusSetup(ExperimentSetup[MeasuredFocusSpec]):
+    """A focal-plane alignment on measurements."""
+
+
+class MeasuredDistortionSetup(ExperimentSetup[MeasuredDistortionSpec]):
+    """A distortion test on measurements."""
+
+
+class MeasuredTurntableSetup(ExperimentSetup[MeasuredTurntableSpec]):
+    """A turntable test on measurements."""
 
 
 def resolve_focus(path: str | Path) -> FocusSetup:
@@ -95,6 +115,74 @@ def resolve_turntable(path: str | Path) -> TurntableSetup:
     if (again := read_setup(TurntableSetup, path)) is not None:
         return again
     return TurntableSetup.model_construct(test=load_turntable_test(path))
+
+
+def resolve_focus_test(path: str | Path) -> FocusSetup | MeasuredFocusSetup:
+    """As `resolve_focus`, for a simulated bench or, with `measured:` in the file, for measurements."""
+    if is_measured(path):
+        return _measured(MeasuredFocusSetup, MeasuredFocusSpec, path)
+    return resolve_focus(path)
+
+
+def resolve_distortion_test(path: str | Path) -> DistortionSetup | MeasuredDistortionSetup:
+    """As `resolve_distortion`, for a simulated bench or, with `measured:` in the file, for measurements."""
+    if is_measured(path):
+        return _measured(MeasuredDistortionSetup, MeasuredDistortionSpec, path)
+    return resolve_distortion(path)
+
+
+def resolve_turntable_test(path: str | Path) -> TurntableSetup | MeasuredTurntableSetup:
+    """As `resolve_turntable`, for a simulated bench or, with `measured:` in the file, for measurements."""
+    if is_measured(path):
+        return _measured(MeasuredTurntableSetup, MeasuredTurntableSpec, path)
+    return resolve_turntable(path)
+
+
+def is_measured(path: str | Path) -> bool:
+    """Whether a test's file, or a run's config.yaml, takes its data from measurements.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
+        return False
+    data = read_yaml(path).data
+    inner = data.get("test", data) if isinstance(data, dict) else None
+    return isinstance(inner, dict) and MEASURED in inner
+
+
+def _measured(setup: type[MeasuredSetup], model: type[Spec], path: str | Path) -> MeasuredSetup:
+    """The test with the paths of its data made absolute, so that a run's config.yaml finds them from anywhere."""
+    again = read_setup(setup, path)
+    test: Spec = load_lab_test(model, path) if again is None else again.test
+    folder = Path(test.source.file).parent.absolute()
+    measured = getattr(test, MEASURED)
+    changed = {MEASURED: _absolute(measured, folder)}
+    return cast(MeasuredSetup, setup.model_construct(test=test.model_copy(update=changed)))
+
+
+def _absolute(files: Spec, folder: Path) -> Spec:
+    """The same section with every path absolute."""
+    changed: dict[str, Any] = {}
+    for name in type(files).model_fields:
+        value = getattr(files, name)
+        if isinstance(value, TurntableFiles):
+            changed[name] = _absolute(value, folder)
+        elif name in DATA_FILES and value is not None:
+            changed[name] = str(_found(files, name, folder / value))
+    return files.model_copy(update=changed)
+
+
+def _found(files: Spec, name: str, path: Path) -> Path:
+    """The path, if there is such a file."""
+    if is_file(path):
+        return path
+    try:
+        beside = [str(other.relative_to(path.parent)) for other in path.parent.iterdir() if other.suffix == path.suffix]
+    except OSError:
+        beside = []
+    meant = nearest(path.name, beside)
+    raise files.error(f"no such file: {path}", (name,), allowed="a CSV file, relative to this file", suggestion=meant)
 
 
 def _require_plane(test: Spec, camera: CameraSpec) -> None:

@@ -1,7 +1,7 @@
 """The turntable test of paper 004 (section 3.3): a table with a dividing error that nobody knows, and its regional
 comparison with a polygon and an autocollimator, as a file in scenes/lab gives it.
 
-Dividing error = reading - true angle.
+Dividing error = reading - true angle. With `measured:` the comparisons are those of a real bench, from files.
 """
 
 import math
@@ -18,6 +18,8 @@ ErrorSize = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg
 TableAngle = Annotated[float, Quantity(ANGLE, largest="360 deg")]
 Step = Annotated[float, Quantity(ANGLE, above_zero=True, largest="30 deg")]
 MOST_LINES = 10_000_000
+DataFile = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
+"""Path of a file of measurements, relative to the file that names it."""
 
 
 class GraduationSpec(Spec):
@@ -200,3 +202,37 @@ class TurntableTestSpec(Spec):
                 within=("camera_angle",),
             )
         return self
+
+
+class TurntableFiles(Spec):
+    """Readings of a turntable that were compared with a reference.
+
+    Attributes:
+        comparisons: table of the calibrated readings, a CSV file.
+        held_out: table of readings between them, measured in a series of their own, by which the fits are judged;
+            without it cross-validation judges them, and an error of a period below the step stays unseen.
+        reference: standard deviation of what the reference's certificate leaves unknown at each position, the same in
+            all repeats, radians.
+        folds: of the cross-validation.
+    """
+
+    comparisons: DataFile
+    held_out: DataFile | None = None
+    reference: ErrorSize
+    folds: Annotated[Whole, Field(ge=2, le=1000)] = 10
+
+
+class MeasuredTurntableSpec(Spec):
+    """The turntable test on measured readings.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        measured: the readings.
+        seed: of the network's starts.
+    """
+
+    name: Name
+    description: Text = ""
+    measured: TurntableFiles
+    seed: Seed = 1

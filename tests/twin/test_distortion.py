@@ -19,7 +19,7 @@ from scenes.specs.lab_setup import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_report import distortion_report
-from twin.laboratory.distortion_run import DistortionRun, measure
+from twin.laboratory.distortion_run import SimulatedDistortion, measure
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import BenchError
 from twin.validation.checks.printed import load_printed
@@ -47,7 +47,7 @@ def bench():
 
 
 @cache
-def run() -> DistortionRun:
+def run() -> SimulatedDistortion:
     return measure(bench(), 1)
 
 

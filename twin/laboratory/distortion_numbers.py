@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.turntable.chauvenet import rejection_rate
+from analysis.turntable.chauvenet import expected_rejections
 from analysis.units import ARCSEC
-from scenes.specs.lab_setup import DistortionSetup, resolve_distortion
-from twin.laboratory.distortion_run import DistortionRun, Estimate, rms, run_distortion
+from scenes.specs.lab_setup import DistortionSetup, resolve_distortion_test
+from scenes.specs.resolved import ExperimentSetup
+from twin.laboratory.distortion_run import (
+    DistortionRun,
+    FoundEstimate,
+    MeasuredDistortion,
+    SimulatedDistortion,
+    rms,
+    run_distortion,
+)
+from twin.laboratory.turntable_numbers import FileNumbers, RejectedNumbers
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 
@@ -42,7 +51,7 @@ class PointNumbers:
         """Of all points."""
         raw, own = run.raw, run.compensated
         kept = run.means.keep.sum(axis=1)
-        reading, field = np.degrees(run.means.mean(run.record.reading)), np.degrees(own.fit.angle)
+        reading, field = np.degrees(run.means.mean(run.reading)), np.degrees(own.fit.angle)
         return tuple(
             cls(
                 point=i + 1,
@@ -82,7 +91,7 @@ class EstimateNumbers:
     distortion_rms_um: float
 
     @classmethod
-    def of(cls, e: Estimate) -> EstimateNumbers:
+    def of(cls, e: FoundEstimate) -> EstimateNumbers:
         """Of one estimate."""
         return cls(
             principal_distance_mm=1e3 * e.f,
@@ -146,7 +155,7 @@ class TruthNumbers:
     centroid_minus_chief_ray_left_um: Array
 
     @classmethod
-    def of(cls, run: DistortionRun) -> TruthNumbers:
+    def of(cls, run: SimulatedDistortion) -> TruthNumbers:
         """Of a run."""
         exact, fit = run.true_fit(), run.compensated.fit
         raw, compensated = (rms(run.error(measured)) for measured in (run.raw, run.compensated))
@@ -174,7 +183,7 @@ class TruthNumbers:
 
 @dataclass(frozen=True)
 class DistortionNumbers:
-    """distortion.json."""
+    """distortion.json. Without a calibration of the turntable raw and compensated are the same."""
 
     name: str
     seed: int
@@ -194,55 +203,138 @@ class DistortionNumbers:
     correlations: CorrelationNumbers
     estimates: Mapping[str, EstimateNumbers]
     noise: NoiseNumbers
-    compensation: CompensationNumbers
+    compensation: CompensationNumbers | None
+
+
+@dataclass(frozen=True)
+class SimulatedDistortionNumbers(DistortionNumbers):
+    """distortion.json of a simulated bench."""
+
     truth: TruthNumbers
 
+
+@dataclass(frozen=True)
+class RejectedSpotNumbers:
+    """An exposure that Chauvenet's criterion takes out, and where it stands."""
+
+    file: str
+    line: int
+    point: int
+    reading_deg: float
+    from_mean_um: float
+
     @classmethod
-    def of(cls, run: DistortionRun) -> DistortionNumbers:
-        """Of a run."""
-        fit, smooth, table = run.compensated.fit, run.compensated.smooth, run.compensation
-        f, p = (fit.terms.index(name) for name in ("principal_distance", "principal_point"))
-        return cls(
-            name=run.setup.test.name,
-            seed=run.seed,
-            principal_distance_mm=1e3 * fit.value("principal_distance"),
-            principal_distance_mm_sigma=1e3 * fit.sigma("principal_distance"),
-            principal_point_mm=1e3 * fit.value("principal_point"),
-            principal_point_mm_sigma=1e3 * fit.sigma("principal_point"),
-            correlation=float(fit.correlation[f, p]),
-            principal_point_observable=bool(fit.point.observable),
-            principal_point_statement=fit.point.statement,
-            rms_raw_um=1e6 * rms(run.raw.smooth.residual),
-            rms_compensated_um=1e6 * rms(smooth.residual),
-            zero_arcsec=run.compensated.zero / ARCSEC,
-            points=PointNumbers.of(run),
-            radial3_mm=1e3 * smooth.value("radial3"),
-            radial3_mm_sigma=1e3 * smooth.sigma("radial3"),
-            correlations=CorrelationNumbers(smooth.terms, smooth.correlation),
-            estimates={name: EstimateNumbers.of(e) for name, e in run.estimates.items()},
-            noise=NoiseNumbers(
-                centroid_um=1e6 * rms(run.spots.temporal),
-                centroid_columns_um=1e6 * rms(run.spots.fixed),
-                exposure_um=1e6 * run.means.scatter,
-                white_raw_um=1e6 * run.raw.white,
-                white_compensated_um=1e6 * run.compensated.white,
-                rejected=int(np.sum(~run.means.keep)),
-                rejected_expected_of_good=rejection_rate(run.means.keep.shape[1]) * run.means.keep.size,
-            ),
-            compensation=CompensationNumbers(
-                fit=table.fit.name,
-                repeatability_arcsec=table.repeatability / ARCSEC,
-                common_arcsec=table.common / ARCSEC,
-                smooth_arcsec=table.smooth / ARCSEC,
-                white_arcsec=table.white / ARCSEC,
-            ),
-            truth=TruthNumbers.of(run),
+    def of(cls, run: MeasuredDistortion) -> tuple[RejectedSpotNumbers, ...]:
+        """All of them."""
+        own = run.compensated
+        # what the sets are compared by
+        rest = own.position - run.spec.focal_length * np.tan(own.angle)
+        mean = run.means.mean(rest)
+        return tuple(
+            cls(
+                run.readings.file.file,
+                int(run.readings.lines[i, s]),
+                int(i) + 1,
+                float(np.degrees(run.reading[i, s])),
+                1e6 * float(rest[i, s] - mean[i]),
+            )
+            for i, s in np.argwhere(run.rejected)
         )
+
+
+@dataclass(frozen=True)
+class MeasuredDistortionNumbers(DistortionNumbers):
+    """distortion.json of measurements. Chi-square: of the smooth model against the stated noise alone. Covariance: of
+    constant, principal distance and principal point, square millimetres.
+    """
+
+    chi_square: float
+    degrees_of_freedom: int
+    probability: float
+    covariance_terms: Sequence[str]
+    covariance_mm2: Array
+    stated_exposure_um: float
+    across_range_um: float | None
+    rejected_readings: tuple[RejectedSpotNumbers, ...]
+    rejected_comparisons: tuple[RejectedNumbers, ...]
+    files: tuple[FileNumbers, ...]
+
+    @classmethod
+    def of(cls, run: MeasuredDistortion) -> MeasuredDistortionNumbers:
+        """Of a run."""
+        across = run.readings.across
+        files = [run.readings.file, *(table.file for table in run.tables)]
+        return cls(
+            **_found(run, run.spec.name),
+            chi_square=run.stated.chi_square,
+            degrees_of_freedom=run.stated.degrees_of_freedom,
+            probability=run.stated.probability,
+            covariance_terms=run.compensated.fit.terms,
+            covariance_mm2=1e6 * run.compensated.fit.covariance,
+            stated_exposure_um=1e6 * float(np.sqrt(np.mean(run.spots.temporal**2, where=run.present))),
+            across_range_um=None if across is None else 1e6 * float(np.ptp(across)),
+            rejected_readings=RejectedSpotNumbers.of(run),
+            rejected_comparisons=tuple(one for table in run.tables for one in RejectedNumbers.of(table)),
+            files=tuple(FileNumbers(**asdict(file)) for file in files),
+        )
+
+
+def _found(run: DistortionRun, name: str) -> dict[str, Any]:
+    """Fields of `DistortionNumbers`."""
+    fit, smooth, table = run.compensated.fit, run.compensated.smooth, run.compensation
+    f, p = (fit.terms.index(term) for term in ("principal_distance", "principal_point"))
+    counts = run.means.keep.shape[1] * np.ones(len(run.reading), np.int64)
+    taken = run.means.keep.size
+    if isinstance(run, MeasuredDistortion):
+        counts, taken = run.present.sum(axis=1), int(np.sum(run.present))
+    return {
+        "name": name,
+        "seed": run.seed,
+        "principal_distance_mm": 1e3 * fit.value("principal_distance"),
+        "principal_distance_mm_sigma": 1e3 * fit.sigma("principal_distance"),
+        "principal_point_mm": 1e3 * fit.value("principal_point"),
+        "principal_point_mm_sigma": 1e3 * fit.sigma("principal_point"),
+        "correlation": float(fit.correlation[f, p]),
+        "principal_point_observable": bool(fit.point.observable),
+        "principal_point_statement": fit.point.statement,
+        "rms_raw_um": 1e6 * rms(run.raw.smooth.residual),
+        "rms_compensated_um": 1e6 * rms(smooth.residual),
+        "zero_arcsec": run.compensated.zero / ARCSEC,
+        "points": PointNumbers.of(run),
+        "radial3_mm": 1e3 * smooth.value("radial3"),
+        "radial3_mm_sigma": 1e3 * smooth.sigma("radial3"),
+        "correlations": CorrelationNumbers(smooth.terms, smooth.correlation),
+        "estimates": {key: EstimateNumbers.of(e) for key, e in run.found_estimates.items()},
+        "noise": NoiseNumbers(
+            centroid_um=1e6 * rms(run.spots.temporal),
+            centroid_columns_um=1e6 * rms(run.spots.fixed),
+            exposure_um=1e6 * run.means.scatter,
+            white_raw_um=1e6 * run.raw.white,
+            white_compensated_um=1e6 * run.compensated.white,
+            rejected=taken - int(np.sum(run.means.keep)),
+            rejected_expected_of_good=expected_rejections(counts),
+        ),
+        "compensation": None
+        if table is None
+        else CompensationNumbers(
+            fit=table.fit.name,
+            repeatability_arcsec=table.repeatability / ARCSEC,
+            common_arcsec=table.common / ARCSEC,
+            smooth_arcsec=table.smooth / ARCSEC,
+            white_arcsec=table.white / ARCSEC,
+        ),
+    }
 
 
 def distortion_numbers(run: DistortionRun) -> dict[str, Any]:
     """Contents of distortion.json without its frames."""
-    return dict(plain_data(DistortionNumbers.of(run)))
+    if isinstance(run, MeasuredDistortion):
+        return dict(plain_data(MeasuredDistortionNumbers.of(run)))
+    assert isinstance(run, SimulatedDistortion)
+    found = _found(run, run.setup.test.name)
+    return dict(plain_data(SimulatedDistortionNumbers(**found, truth=TruthNumbers.of(run))))
 
 
-DISTORTION = Procedure("distortion", DistortionSetup, resolve_distortion, run_distortion, distortion_numbers)
+DISTORTION = Procedure[ExperimentSetup[Any], DistortionRun](
+    "distortion", DistortionSetup, resolve_distortion_test, run_distortion, distortion_numbers
+)

@@ -13,7 +13,7 @@ from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
-from twin.laboratory.distortion_run import DistortionRun, rms
+from twin.laboratory.distortion_run import SimulatedDistortion, rms
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.run.artefact import FAR, Cell, SvgFigure, Table
 from twin.run.data_files import FrameFacts
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 RAW, COMPENSATED = "angles as read", "compensated angles"
 
 
-def curve_svg(run: DistortionRun) -> str:
+def curve_svg(run: SimulatedDistortion) -> str:
     """Distortion over the field, and its error against the truth."""
     with look("distortion-curve"):
         figure = new_figure(6.4)
@@ -46,11 +46,11 @@ def curve_svg(run: DistortionRun) -> str:
         below.set_xlabel("field angle W [deg]")
         for axes in (above, below):
             axes.set_ylabel("µm")
-            _dress(axes)
+            dress(axes)
         return to_svg(figure)
 
 
-def points_svg(run: DistortionRun) -> str:
+def points_svg(run: SimulatedDistortion) -> str:
     """Each point's error and its departure from a smooth curve, raw and compensated."""
     with look("distortion-points"):
         figure = new_figure(4.6)
@@ -67,12 +67,12 @@ def points_svg(run: DistortionRun) -> str:
             axes.set_title(title, loc="left")
             axes.set_ylabel("µm")
             axes.set_xlim(0.0, len(raw) + 1.0)
-            _dress(axes)
+            dress(axes)
         every[-1].set_xlabel("point")
         return to_svg(figure)
 
 
-def spot_svg(run: DistortionRun) -> str:
+def spot_svg(run: SimulatedDistortion) -> str:
     """The spot in the middle of the field, and the row through its centre."""
     with look("distortion-spot"):
         figure = new_figure(3.6)
@@ -94,7 +94,7 @@ def spot_svg(run: DistortionRun) -> str:
         profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
         profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
         profile.set(xlabel="column", ylabel="DN")
-        _dress(profile, columns=1)
+        dress(profile, columns=1)
         return to_svg(figure)
 
 
@@ -102,7 +102,8 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _dress(axes: Axes, columns: int = 3) -> None:
+def dress(axes: Axes, columns: int = 3) -> None:
+    """A light grid, a legend and room for it; columns: of the legend."""
     low, high = axes.get_ylim()
     # room for the legend above the data
     axes.set_ylim(low, high + 0.18 * (high - low))
@@ -117,7 +118,7 @@ SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
 
 
-def distortion_report(run: DistortionRun) -> Report:
+def distortion_report(run: SimulatedDistortion) -> Report:
     """Report of a distortion test."""
     data = distortion_numbers(run)
     truth, test = data["truth"], run.setup.test
@@ -176,7 +177,7 @@ def typeset(text: str) -> str:
     return text
 
 
-def _warnings(run: DistortionRun) -> tuple[str, ...]:
+def _warnings(run: SimulatedDistortion) -> tuple[str, ...]:
     out = []
     kept = int(np.sum(run.truth.gross & run.means.keep))
     if kept:
@@ -221,7 +222,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
     return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows, (None, 3, 3, 3))
 
 
-def _curve(run: DistortionRun) -> Section:
+def _curve(run: SimulatedDistortion) -> Section:
     own = run.compensated
     ratio = rms(run.error(own) / own.sigma)
     text = (
@@ -241,7 +242,7 @@ def _curve(run: DistortionRun) -> Section:
     return Section("Distortion", text, (figure,))
 
 
-def _compensation(run: DistortionRun) -> Section:
+def _compensation(run: SimulatedDistortion) -> Section:
     raw, own = run.raw, run.compensated
     pairs: tuple[tuple[str, Array, Array], ...] = (
         ("error of the distortion (needs the truth)", 1e6 * run.error(raw), 1e6 * run.error(own)),
@@ -277,7 +278,7 @@ def _compensation(run: DistortionRun) -> Section:
     return Section("Raw and compensated angles", text, (figure, table))
 
 
-_ESTIMATES = {
+ESTIMATES = {
     "eq2": "(2): f and p",
     "eq3": "(3): f, p = 0",
     "eq4": "(4): p, with f of (3)",
@@ -285,13 +286,14 @@ _ESTIMATES = {
     "constant": "constant, f, p (taken)",
     "constant_radial3": "constant, f, p, radial",
 }
+"""Estimate -> what it is, for readers."""
 
 
-def _estimates(run: DistortionRun) -> Section:
+def _estimates(run: SimulatedDistortion) -> Section:
     mm = 1e3
     rows: list[tuple[Cell, ...]] = [
         (
-            _ESTIMATES[name],
+            ESTIMATES[name],
             f"{mm * e.f:.4f}",
             None if e.f_sigma is None else mm * e.f_sigma,
             mm * (e.f - e.f_true),
@@ -341,7 +343,7 @@ def _estimates(run: DistortionRun) -> Section:
     return Section("Estimators and what can be observed", text, (estimates, correlation))
 
 
-def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+def _noise(run: SimulatedDistortion, data: Mapping[str, Any]) -> Section:
     noise, truth = data["noise"], data["truth"]
     plan = run.setup.turntable.dividing_error
     about = run.compensated.fit.value("principal_distance")

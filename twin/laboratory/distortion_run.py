@@ -1,8 +1,9 @@
 """Interior orientation and distortion by paper 004 (section 3), from the turntable's calibration to distortion.json.
 
 The analysis gets frames, readings, the calibration of the table and what a laboratory knows beforehand: the pixels,
-their noise, and by how much the energy centroid of a spot departs from its chief ray by the camera's design. The truth
-comes from exact chief rays of the as-built camera at the true angles, and is put through the same definitions.
+their noise, and by how much the energy centroid of a spot departs from its chief ray by the camera's design; or spots
+and readings from files of measurements. The truth of a simulated bench comes from exact chief rays of the as-built
+camera at the true angles, and is put through the same definitions.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +32,14 @@ from analysis.spots.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
-from scenes.specs.lab_setup import DistortionSetup
+from scenes.specs.camera_tests import DistortionFiles, MeasuredDistortionSpec
+from scenes.specs.lab_setup import DistortionSetup, MeasuredDistortionSetup
+from scenes.specs.resolved import ExperimentSetup
+from scenes.yaml.errors import InputError, Issue
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
+from twin.laboratory.measured_readings import Comparisons, SpotReadings, read_spots, read_turntable
 from twin.laboratory.turntable_bench import TurntableModel
+from twin.laboratory.turntable_run import usable_fits
 from twin.run.procedure import Advance, BenchError, silent
 
 Array = NDArray[np.float64]
@@ -40,60 +47,127 @@ CLOSED_FORMS = tuple(name for name in FITS if name != "network")
 """Fits of the dividing error that compete for the compensation. The network takes minutes to train; the turntable test
 ranks it.
 """
+WIDEST = np.radians(40.0)
+"""Angle from the middle of the line beyond which a reading is a mistake; the model's tangents end at 45 deg."""
 _EXACT = 1e-9
 """Metres: stands for the noise of the truth, whose estimates do not depend on it."""
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FoundEstimate:
     """One way to f, p and distortion.
 
     Attributes:
         f, p: as measured, metres; p is zero where it is not fitted.
-        f_true, p_true: the same from the exact chief rays.
         f_sigma, p_sigma: metres, None where the equation gives none.
         rms: of the distortion, metres.
-        error: RMS of measured minus true distortion by this estimate, metres.
     """
 
     f: float
     p: float
-    f_true: float
-    p_true: float
     f_sigma: float | None
     p_sigma: float | None
     rms: float
+
+
+@dataclass(frozen=True)
+class Estimate(FoundEstimate):
+    """The same beside its truth.
+
+    Attributes:
+        f_true, p_true: from the exact chief rays, metres.
+        error: RMS of measured minus true distortion by this estimate, metres.
+    """
+
+    f_true: float
+    p_true: float
     error: float
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionRun:
-    """One test, measured.
+    """One test, measured, whichever bench it comes from.
+
+    Attributes:
+        seed: of what was drawn.
+        reading: of the turntable, (N, S), radians.
+        calibration: of the turntable; None if angles count as read.
+        compensation: of its dividing error; None likewise.
+        spots: as located.
+        means: how sets are reduced.
+        common: covariance of the mean angles, the same in all sets, (N, N), rad^2.
+        raw, compensated: with angles as read, and freed from the dividing error; without a calibration the same.
+    """
+
+    seed: int
+    reading: Array
+    calibration: CalibrationSeries | None
+    compensation: DividingCompensation | None
+    spots: Spots
+    means: PointMeans
+    common: Array
+    raw: Distortion
+    compensated: Distortion
+
+    @cached_property
+    def found_estimates(self) -> Mapping[str, FoundEstimate]:
+        """The printed equations and the fits with a constant, all with compensated angles."""
+        fit = self.compensated.fit
+        where, turned = fit.position, fit.angle
+        out = {name: _printed_found(n, where, turned) for name, n in (("eq2", 2), ("eq3", 3), ("eq4", 4))}
+        out["eq2_zero_from_constant"] = _printed_found(2, where, turned - self.compensated.zero)
+        for name, own in (("constant", fit), ("constant_radial3", self.compensated.smooth)):
+            f, p = "principal_distance", "principal_point"
+            left = rms(own.position - fit_part(own))
+            out[name] = FoundEstimate(own.value(f), own.value(p), own.sigma(f), own.sigma(p), left)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredDistortion(DistortionRun):
+    """A test on measured angles and spots.
+
+    Attributes:
+        spec: of the test.
+        readings: the table of spots as read.
+        tables: of the turntable's calibration, as read.
+        stated: the smooth model's fit with nothing but the stated noise, for its chi-square.
+    """
+
+    spec: MeasuredDistortionSpec
+    readings: SpotReadings
+    tables: tuple[Comparisons, ...]
+    stated: InteriorOrientation
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Which exposures there are, (N, S)."""
+        return np.ones(self.reading.shape, bool) if self.readings.present is None else self.readings.present
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """Those that Chauvenet's criterion takes out, (N, S)."""
+        return self.present & ~self.means.keep
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedDistortion(DistortionRun):
+    """A test on the simulated bench.
 
     Attributes:
         bench: with all that was set up.
-        seed: of what was drawn.
         record: what the analysis got.
         truth: what it did not get.
         table: the turntable; holds the truth of its dividing error.
-        calibration: of the turntable.
-        compensation: of its dividing error.
-        spots: as located.
-        means: how sets are reduced.
-        raw, compensated: with angles as read, and freed from the dividing error.
+        calibration, compensation: there are always.
     """
 
+    calibration: CalibrationSeries
+    compensation: DividingCompensation
     bench: DistortionBench
-    seed: int
     record: DistortionRecord
     truth: DistortionTruth
     table: TurntableModel
-    calibration: CalibrationSeries
-    compensation: DividingCompensation
-    spots: Spots
-    means: PointMeans
-    raw: Distortion
-    compensated: Distortion
 
     @property
     def setup(self) -> DistortionSetup:
@@ -133,14 +207,14 @@ class DistortionRun:
             parts = [fit.position - fit_part(one) for one in (own, true)]
             parts[1] = true.position - fit_part(true)
             out[name] = Estimate(
-                own.value("principal_distance"),
-                own.value("principal_point"),
-                true.value("principal_distance"),
-                true.value("principal_point"),
-                own.sigma("principal_distance"),
-                own.sigma("principal_point"),
-                rms(parts[0]),
-                rms(parts[0] - parts[1]),
+                f=own.value("principal_distance"),
+                p=own.value("principal_point"),
+                f_true=true.value("principal_distance"),
+                p_true=true.value("principal_point"),
+                f_sigma=own.sigma("principal_distance"),
+                p_sigma=own.sigma("principal_point"),
+                rms=rms(parts[0]),
+                error=rms(parts[0] - parts[1]),
             )
         return out
 
@@ -163,7 +237,13 @@ def _printed(number: int, measured: tuple[Array, Array], true: tuple[Array, Arra
             p = float(principal_point(where, turned, f)) if number == 4 else 0.0
         found.append((f, p, distortion(where, turned, f, p)))
     (f, p, own), (f_true, p_true, exact) = found
-    return Estimate(f, p, f_true, p_true, None, None, rms(own), rms(own - exact))
+    return Estimate(f, p, None, None, rms(own), f_true, p_true, rms(own - exact))
+
+
+def _printed_found(number: int, where: Array, turned: Array) -> FoundEstimate:
+    """Equation (2), (3), or (4) with f of (3), on measured (L, W)."""
+    one = _printed(number, (where, turned), (where, turned))
+    return FoundEstimate(one.f, one.p, None, None, one.rms)
 
 
 def rms(values: Array) -> float:
@@ -171,7 +251,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> DistortionRun:
+def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> SimulatedDistortion:
     """Calibrate the table, carry out the test and measure it.
 
     Raises:
@@ -187,20 +267,151 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Dis
         raise BenchError(str(error), ("turntable",), "a turntable file with a finer or longer calibration") from error
     record, truth = bench.record(table, seed, advance)
     spots = _locate(bench, record)
-    angle = setup.turntable.camera_angle
-    raw = record.reading - angle
-    # the line's middle was put on the pinhole at this reading
-    corrected = compensation.correct(record.reading) - float(compensation.correct(angle))
-    # the prescription's focal length serves to see scatter only
-    about = bench.path.model.line_focal_length
-    means = reduce_sets(corrected, spots, about, about * compensation.repeatability)
-    # the white part is left to the test's own residuals, which see it at more angles than the calibration's did
-    common = replace(compensation, white=0.0).covariance(means.mean(record.reading))
+    # the line's middle was put on the pinhole at the camera's angle; the prescription's focal length serves to see
+    # scatter only
+    args = record.reading, spots, setup.turntable.camera_angle, bench.path.model.line_focal_length
     try:
-        measured = Distortion.measure(raw, spots, means), Distortion.measure(corrected, spots, means, common)
+        means, common, raw, compensated = reduce(*args, compensation)
     except OrientationError as error:
         raise BenchError(str(error), ("points",), f"{len(SMOOTH) + 1} or more, over the whole field") from error
-    return DistortionRun(bench, seed, record, truth, table, series, compensation, spots, means, *measured)
+    return SimulatedDistortion(
+        seed=seed,
+        reading=record.reading,
+        calibration=series,
+        compensation=compensation,
+        spots=spots,
+        means=means,
+        common=common,
+        raw=raw,
+        compensated=compensated,
+        bench=bench,
+        record=record,
+        truth=truth,
+        table=table,
+    )
+
+
+def reduce(
+    reading: Array,
+    spots: Spots,
+    zero: float,
+    about: float,
+    compensation: DividingCompensation | None,
+    angle_sigma: float = 0.0,
+    reverse: bool = False,
+    present: NDArray[np.bool_] | None = None,
+) -> tuple[PointMeans, Array, Distortion, Distortion]:
+    """Readings and spots to interior orientation and distortion, whichever bench they come from.
+
+    Args:
+        reading: of the turntable, (N, S), radians.
+        spots: on the line.
+        zero: reading at which the middle of the line is imaged, radians.
+        about: principal distance, about, metres; it serves to see scatter only.
+        compensation: of the turntable; None for angles as read.
+        angle_sigma: of the angles as read without a compensation, radians.
+        reverse: readings rise where places on the line fall.
+        present: which exposures there are, (N, S); None for all.
+
+    Returns:
+        How sets are reduced; covariance of the mean angles, (N, N), rad^2; raw and compensated.
+
+    Raises:
+        OrientationError: fewer points than unknowns, or angles that do not determine them.
+    """
+    sense = -1.0 if reverse else 1.0
+    raw = sense * (reading - zero)
+    if compensation is None:
+        means = reduce_sets(raw, spots, about, 0.0, present)
+        common = angle_sigma**2 * np.eye(len(reading))
+        found = Distortion.measure(raw, spots, means, common)
+        return means, common, found, found
+    corrected = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
+    means = reduce_sets(corrected, spots, about, about * compensation.repeatability, present)
+    # the white part is left to the test's own residuals, which see it at more angles than the calibration's did
+    common = replace(compensation, white=0.0).covariance(means.mean(reading))
+    measured = Distortion.measure(raw, spots, means), Distortion.measure(corrected, spots, means, common)
+    return means, common, *measured
+
+
+def measure_files(spec: MeasuredDistortionSpec, seed: int) -> MeasuredDistortion:
+    """Read the angles and spots, and do the same with them.
+
+    Raises:
+        InputError: a table cannot be used, or does not determine what is asked for.
+    """
+    files = spec.measured
+    found = read_spots(files)
+    compensation, series = None, None
+    tables: tuple[Comparisons, ...] = ()
+    if files.turntable is not None:
+        cal, held = read_turntable(files.turntable)
+        series, tables = cal.series, (cal,) if held is None else (cal, held)
+        _check_region(files, found, series)
+        names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
+        choice = choose(series, seed, names, files.turntable.folds)
+        compensation = compensate(series, choice, None if held is None else held.series)
+    _check_angles(files, found)
+    try:
+        means, common, raw, compensated = reduce(
+            found.reading,
+            found.spots,
+            files.zero,
+            spec.focal_length,
+            compensation,
+            files.angle_sigma or 0.0,
+            files.reversed,
+            found.present,
+        )
+        fit = compensated.fit
+        stated = fit_interior_orientation(fit.position, fit.angle, means.sigma, SMOOTH, angle_covariance=common)
+    except OrientationError as error:
+        text = str(error).removeprefix("interior orientation: ")
+        allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None
+        raise files.error(text, ("spots",), allowed=allowed) from error
+    return MeasuredDistortion(
+        seed=seed,
+        reading=found.reading,
+        calibration=series,
+        compensation=compensation,
+        spots=found.spots,
+        means=means,
+        common=common,
+        raw=raw,
+        compensated=compensated,
+        spec=spec,
+        readings=found,
+        tables=tables,
+        stated=stated,
+    )
+
+
+def _check_region(files: DistortionFiles, found: SpotReadings, series: CalibrationSeries) -> None:
+    """InputError unless the turntable is calibrated wherever it was read."""
+    first, last = series.angle[[0, -1]]
+    allowed = f"{np.degrees(first):.9g} to {np.degrees(last):.9g} deg, where the turntable is calibrated"
+    if not first <= files.zero <= last:
+        shown = f"{np.degrees(files.zero):.9g} deg"
+        raise files.error("outside of the calibrated readings", ("zero",), found=shown, allowed=allowed)
+    beyond = ((found.reading < first) | (found.reading > last)) & (found.lines > 0)
+    if np.any(beyond):
+        place = np.argwhere(beyond)[0]
+        shown = f"{np.degrees(found.reading[tuple(place)]):.9g} deg"
+        line = int(found.lines[tuple(place)])
+        raise InputError(
+            Issue("outside of the calibrated readings", found.file.file, line, (found.head,), shown, allowed)
+        )
+
+
+def _check_angles(files: DistortionFiles, found: SpotReadings) -> None:
+    """InputError for readings that are far from the zero, which is a mistaken zero or unit."""
+    off = np.abs(found.reading - files.zero) * (found.lines > 0)
+    if np.max(off) > WIDEST:
+        place = np.unravel_index(int(np.argmax(off)), off.shape)
+        shown = f"{np.degrees(found.reading[place]):.9g} deg, {np.degrees(off[place]):.4g} deg from the zero"
+        allowed = f"within {np.degrees(WIDEST):.0f} deg of `zero`, the reading at which the line's middle is imaged"
+        line = int(found.lines[place])
+        raise InputError(Issue("an angle beyond any field", found.file.file, line, (found.head,), shown, allowed))
 
 
 def _locate(bench: DistortionBench, record: DistortionRecord) -> Spots:
@@ -223,11 +434,17 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> Spots:
         raise BenchError(problem, ("light",), remedy) from error
 
 
-def run_distortion(setup: DistortionSetup, backend: Backend, seed: int, advance: Advance = silent) -> DistortionRun:
+def run_distortion(
+    setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
+) -> DistortionRun:
     """``python -m twin.lab distortion``.
 
     Raises:
-        InputError: ``as_built`` names what the camera does not have.
+        InputError: ``as_built`` names what the camera does not have; a table of measurements cannot be used.
         BenchError: the test cannot be carried out or measured as its file says.
     """
+    if isinstance(setup, MeasuredDistortionSetup):
+        advance("read and fit", 0, 1)
+        return measure_files(setup.test, seed)
+    assert isinstance(setup, DistortionSetup)
     return measure(DistortionBench.build(setup, backend, advance), seed, advance)

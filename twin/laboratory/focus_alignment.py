@@ -37,7 +37,7 @@ from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.specs.camera_tests import FocusTestSpec
+    from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
     from scenes.specs.lab_setup import FocusSetup
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
@@ -76,10 +76,18 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Shimming:
-    """One round's decision: the fitted plane and the shims."""
+    """One round's decision: the fitted plane and the shims.
+
+    Attributes:
+        plane, plan: as fitted and as decided.
+        vertex_error: that all vertices share, one sigma, metres.
+        vertex_trend: by how much it changes from the middle to the ends of the places, one sigma, metres.
+    """
 
     plane: FocalPlaneFit
     plan: ShimPlan
+    vertex_error: float = VERTEX_ERROR
+    vertex_trend: float = VERTEX_TREND
 
     @property
     def covariance(self) -> np.ndarray:
@@ -89,7 +97,17 @@ class Shimming:
     @property
     def systematic(self) -> np.ndarray:
         """(3,) part of the sigmas that is the same in every alignment of a camera: the vertices' own error."""
-        return np.array([VERTEX_ERROR, *(VERTEX_TREND / np.max(np.abs(self.plane.place), axis=0))])
+        reach = np.max(np.abs(self.plane.place), axis=0)
+        return np.array([self.vertex_error, *(self.vertex_trend / reach)])
+
+    @property
+    def systematic_changes(self) -> np.ndarray:
+        """(H, H) covariance of the shims' changes by the vertices' own error, square metres."""
+        holes, up = self.plan.mount.holes, self.plan.mount.normal
+        lever = np.cross(holes, up)
+        # a piston moves along Z', a slope along X' turns about -Y' and one along Y' about X'
+        gain = np.column_stack([np.full(len(holes), up[2]), -lever[:, 1], lever[:, 0]])
+        return np.asarray((gain * self.systematic**2) @ gain.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +174,7 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
     """
     test = bench.setup.test
     standing = misset(bench, seed)
-    patterns = {name: ccd.pattern(stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
+    patterns = _patterns(bench, seed)
     mount = mount_of(test)
     present = np.full(len(test.mount.holes), test.mount.thickness)
     states: list[State] = [_look(bench, standing, patterns, seed, 0, advance)]
@@ -164,16 +182,44 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> Alignment:
     places = np.array([site.place for site in bench.sites])
     for number in range(test.rounds):
         state = states[-1]
-        # the plane wants how far best focus lies downstream of the CCD
-        plane = fit_focal_plane(places, -state.defocus, state.defocus_sigma, estimate_extra=True)
-        plan = plan_shims(plane.correction(state.level), mount, present)
+        shimming = decide(places, state.defocus, state.defocus_sigma, state.level, mount, present)
+        plan = shimming.plan
         assert plan.thickness is not None
         present = plan.thickness
-        shimmings.append(Shimming(plane, plan))
+        shimmings.append(shimming)
         setting = np.random.default_rng(stream(seed, _SETTING, number)).normal(0.0, test.level)
         standing = Standing(_moved(standing.pose, plan, mount, float(setting)), standing.heights)
         states.append(_look(bench, standing, patterns, seed, number + 1, advance))
     return Alignment(bench, seed, tuple(states), tuple(shimmings))
+
+
+def decide(
+    places: np.ndarray,
+    defocus: np.ndarray,
+    sigma: np.ndarray,
+    level: LineLevel | None,
+    mount: Mount,
+    present: np.ndarray,
+    vertex: tuple[float, float] = (VERTEX_ERROR, VERTEX_TREND),
+) -> Shimming:
+    """The plane through best focus and the shims that bring the assembly there, whichever bench it stands on.
+
+    Args:
+        places: (N, 2) X', Y' of the sites, metres.
+        defocus: (N,) how far each CCD stands downstream of best focus, metres.
+        sigma: (N,) of it by noise, metres.
+        level: of the line; None to leave its turn as it is.
+        mount: where the shims are.
+        present: (H,) their thickness, metres.
+        vertex: error that all vertices share and its trend, metres.
+
+    Raises:
+        ObservabilityError: the places do not tell a slope.
+        BenchError: the mount does not allow the motion.
+    """
+    # the plane wants how far best focus lies downstream of the CCD
+    plane = fit_focal_plane(places, -defocus, sigma, estimate_extra=True)
+    return Shimming(plane, plan_shims(plane.correction(level), mount, present), *vertex)
 
 
 def misset(bench: FocusBench, seed: int) -> Standing:
@@ -186,7 +232,7 @@ def misset(bench: FocusBench, seed: int) -> Standing:
     return Standing(Pose(rotation, shift), heights)
 
 
-def mount_of(test: FocusTestSpec) -> Mount:
+def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
     """The mounting surface as its drawing has it, in the assembly's frame.
 
     Raises:
@@ -225,6 +271,31 @@ def line_turn(pose: Pose) -> float:
     return float(np.arctan2(-x, y))
 
 
+def recorder_of(
+    bench: FocusBench,
+    standing: Standing,
+    seed: int,
+    number: int,
+    patterns: Mapping[str, FixedPattern] | None = None,
+) -> Recorder:
+    """What records the edges of a standing: the same frames whenever it is asked for the same ones.
+
+    Args:
+        bench: the bench.
+        standing: of the assembly.
+        seed: of the alignment.
+        number: of the round before it, 0 for none.
+        patterns: of the columns; None to draw them, always the same.
+    """
+    drawn = _patterns(bench, seed) if patterns is None else patterns
+    return Recorder(bench, standing, stream(seed, _SCAN, number), drawn)
+
+
+def _patterns(bench: FocusBench, seed: int) -> dict[str, FixedPattern]:
+    """Of each band's columns."""
+    return {name: ccd.pattern(stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
+
+
 def _look(
     bench: FocusBench,
     standing: Standing,
@@ -234,7 +305,7 @@ def _look(
     advance: Advance,
 ) -> State:
     """Measure one standing of the assembly. Only the first one needs to be searched for focus."""
-    recorder = Recorder(bench, standing, stream(seed, _SCAN, number), patterns)
+    recorder = recorder_of(bench, standing, seed, number, patterns)
     name = "through focus, before" if number == 0 else f"through focus, round {number}"
     scans = scan(recorder, lambda _, done, total: advance(name, done, total), search=number == 0)
     sigma = bench.setup.test.level

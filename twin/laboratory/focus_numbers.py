@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from analysis.focal_plane.through_focus import FocusVertex
 from analysis.units import ARCMIN, ARCSEC
 from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_vector
-from scenes.specs.lab_setup import FocusSetup, resolve_focus
-from twin.laboratory.focus_alignment import Alignment, Shimming, State, run_focus
+from scenes.specs.lab_setup import FocusSetup, resolve_focus_test
+from scenes.specs.resolved import ExperimentSetup
+from twin.laboratory.focus_alignment import Alignment, Shimming, State
 from twin.laboratory.focus_scan import VERTEX_ERROR
+from twin.laboratory.measured_focus import MeasuredAlignment, run_focus_test
+from twin.laboratory.turntable_numbers import FileNumbers
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 from twin.targets.edge_images import ALONG, TRACK
@@ -86,7 +90,6 @@ class RoundNumbers(StateNumbers):
         plan = done.plan
         assert plan.thickness is not None
         names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
-        piston, slope_x, slope_y = np.sqrt(np.diag(done.covariance))
         across, along = (_by_band(alignment, state, edge) for edge in (TRACK, ALONG))
         return cls(
             **_measured(alignment, state),
@@ -100,15 +103,21 @@ class RoundNumbers(StateNumbers):
             slides_mm={n: [1e3 * float(x) for x in s] for n, s in zip(names, plan.slide, strict=True)},
             turn_by_hand_arcmin=plan.turn / ARCMIN,
             line_level_without_turn_arcmin=plan.level_coupling / ARCMIN,
-            correction=CorrectionNumbers(
-                rotation_arcmin=[float(v) / ARCMIN for v in plan.wanted.rotation],
-                shift_um=[UM * float(v) for v in plan.wanted.shift],
-                piston_um_sigma=UM * float(piston),
-                slope_x_arcsec_sigma=float(slope_x) / ARCSEC,
-                slope_y_arcsec_sigma=float(slope_y) / ARCSEC,
-            ),
+            correction=_correction(done),
             chips_um_rms=UM * done.plane.extra_sigma,
         )
+
+
+def _correction(done: Shimming) -> CorrectionNumbers:
+    wanted = done.plan.wanted
+    piston, slope_x, slope_y = np.sqrt(np.diag(done.covariance))
+    return CorrectionNumbers(
+        rotation_arcmin=[float(v) / ARCMIN for v in wanted.rotation],
+        shift_um=[UM * float(v) for v in wanted.shift],
+        piston_um_sigma=UM * float(piston),
+        slope_x_arcsec_sigma=float(slope_x) / ARCSEC,
+        slope_y_arcsec_sigma=float(slope_y) / ARCSEC,
+    )
 
 
 def _measured(alignment: Alignment, state: State) -> dict[str, Any]:
@@ -218,9 +227,185 @@ class FocusNumbers:
         )
 
 
-def focus_numbers(alignment: Alignment) -> dict[str, Any]:
+@dataclass(frozen=True)
+class CurveNumbers:
+    """A curve through focus: its vertex as a move of the image, peak, and the fit."""
+
+    vertex_um: float
+    vertex_um_sigma: float
+    peak_mtf: float
+    peak_mtf_sigma: float
+    chi_square: float
+    degrees_of_freedom: int
+    positions: int
+    positions_used: int
+
+    @classmethod
+    def of(cls, vertex: FocusVertex) -> CurveNumbers:
+        """Of a vertex."""
+        return cls(
+            vertex_um=UM * vertex.position,
+            vertex_um_sigma=UM * vertex.sigma,
+            peak_mtf=vertex.peak,
+            peak_mtf_sigma=vertex.peak_sigma,
+            chi_square=vertex.chi_square,
+            degrees_of_freedom=vertex.degrees_of_freedom,
+            positions=len(vertex.used),
+            positions_used=int(np.sum(vertex.used)),
+        )
+
+
+@dataclass(frozen=True)
+class MeasuredSiteNumbers:
+    """One place; defocus is positive where the CCD stands downstream of best focus; residual: from the plane."""
+
+    band: str
+    x_mm: float
+    y_mm: float
+    defocus_um: float
+    defocus_um_sigma: float
+    residual_um: float
+    curves: Mapping[str, CurveNumbers]
+
+
+@dataclass(frozen=True)
+class PlaneNumbers:
+    """The weighted plane of best focus minus CCD. Covariance of piston and slopes: metres and radians. Its sigmas hold
+    the error that all vertices share; chi-square is that of the places about the plane with their own sigmas.
+    """
+
+    piston_um: float
+    piston_um_sigma: float
+    slope_x_arcsec: float
+    slope_x_arcsec_sigma: float
+    slope_y_arcsec: float
+    slope_y_arcsec_sigma: float
+    covariance: np.ndarray
+    chi_square: float
+    degrees_of_freedom: int
+    probability: float
+    chips_um_rms: float
+
+
+@dataclass(frozen=True)
+class ShimNumbers:
+    """The shim of one hole: exact change of thickness, what is ground, the new shim, and the slide by hand."""
+
+    change_um: float
+    change_um_sigma: float
+    ground_um: float
+    shim_um: float
+    slide_mm: Sequence[float]
+
+
+@dataclass(frozen=True)
+class NoEdgeNumbers:
+    """An image without a measurable edge."""
+
+    file: str
+    line: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class MeasuredFocusNumbers:
+    """focus.json of measurements. Expected: largest distance from best focus on the new shims, after rounding, where
+    the places are best predicted.
+    """
+
+    name: str
+    seed: int
+    confocal_um_max: float
+    confocal_um_sigma: float
+    line_level_arcmin: float | None
+    line_level_arcmin_sigma: float | None
+    plane: PlaneNumbers
+    correction: CorrectionNumbers
+    shims: Mapping[str, ShimNumbers]
+    turn_by_hand_arcmin: float
+    line_level_without_turn_arcmin: float
+    expected_confocal_um_max: float
+    expected_confocal_um_sigma: float
+    curves_chi_square: float
+    curves_degrees_of_freedom: int
+    sites: tuple[MeasuredSiteNumbers, ...]
+    images_without_edge: tuple[NoEdgeNumbers, ...]
+    files: tuple[FileNumbers, ...]
+
+    @classmethod
+    def of(cls, run: MeasuredAlignment) -> MeasuredFocusNumbers:
+        """Of an alignment."""
+        plane, plan, level = run.shimming.plane, run.shimming.plan, run.level
+        assert plan.thickness is not None
+        covariance = plane.covariance + np.diag(run.shimming.systematic**2)
+        piston, slope_x, slope_y = (float(v) for v in np.sqrt(np.diag(covariance)))
+        left, spread = plane.predicted_defocus()
+        expected = left + plan.focus_error(plane.place)
+        worst = int(np.argmax(np.abs(expected)))
+        names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
+        square, freedom = run.chi_square
+        changes = np.sqrt(np.diag(plan.change_covariance + run.shimming.systematic_changes))
+        return cls(
+            name=run.spec.name,
+            seed=run.seed,
+            confocal_um_max=UM * float(np.max(np.abs(run.defocus))),
+            confocal_um_sigma=UM * float(np.hypot(np.max(run.defocus_sigma), run.spec.vertex_error)),
+            line_level_arcmin=None if level is None else level.angle / ARCMIN,
+            line_level_arcmin_sigma=None if level is None else level.sigma / ARCMIN,
+            plane=PlaneNumbers(
+                piston_um=UM * plane.piston,
+                piston_um_sigma=UM * piston,
+                slope_x_arcsec=plane.slope_x / ARCSEC,
+                slope_x_arcsec_sigma=slope_x / ARCSEC,
+                slope_y_arcsec=plane.slope_y / ARCSEC,
+                slope_y_arcsec_sigma=slope_y / ARCSEC,
+                covariance=covariance,
+                chi_square=plane.chi_square,
+                degrees_of_freedom=plane.degrees_of_freedom,
+                probability=plane.p_value,
+                chips_um_rms=UM * plane.extra_sigma,
+            ),
+            correction=_correction(run.shimming),
+            shims={
+                name: ShimNumbers(
+                    change_um=UM * float(plan.change[k]),
+                    change_um_sigma=UM * float(changes[k]),
+                    ground_um=round(UM * float(plan.rounded_change[k]), 6),
+                    shim_um=round(UM * float(plan.thickness[k]), 6),
+                    slide_mm=[1e3 * float(v) for v in plan.slide[k]],
+                )
+                for k, name in enumerate(names)
+            },
+            turn_by_hand_arcmin=plan.turn / ARCMIN,
+            line_level_without_turn_arcmin=plan.level_coupling / ARCMIN,
+            expected_confocal_um_max=UM * float(np.abs(expected[worst])),
+            expected_confocal_um_sigma=UM * float(np.hypot(np.sqrt(spread[worst, worst]), run.spec.vertex_error)),
+            curves_chi_square=square,
+            curves_degrees_of_freedom=freedom,
+            sites=tuple(
+                MeasuredSiteNumbers(
+                    band=site.band,
+                    x_mm=1e3 * float(site.place[0]),
+                    y_mm=1e3 * float(site.place[1]),
+                    defocus_um=UM * float(run.defocus[k]),
+                    defocus_um_sigma=UM * float(run.defocus_sigma[k]),
+                    residual_um=UM * float(plane.residual[k]),
+                    curves={edge: CurveNumbers.of(vertex) for edge, vertex in run.scans[k].vertex.items()},
+                )
+                for k, site in enumerate(run.sites)
+            ),
+            images_without_edge=tuple(NoEdgeNumbers(one.file, one.line, one.reason) for one in run.no_edge),
+            files=(FileNumbers(**asdict(run.file)),),
+        )
+
+
+def focus_numbers(alignment: Alignment | MeasuredAlignment) -> dict[str, Any]:
     """Contents of focus.json without its frames."""
+    if isinstance(alignment, MeasuredAlignment):
+        return dict(plain_data(MeasuredFocusNumbers.of(alignment)))
     return dict(plain_data(FocusNumbers.of(alignment)))
 
 
-FOCUS = Procedure("focus", FocusSetup, resolve_focus, run_focus, focus_numbers)
+FOCUS = Procedure[ExperimentSetup[Any], Alignment | MeasuredAlignment](
+    "focus", FocusSetup, resolve_focus_test, run_focus_test, focus_numbers
+)

@@ -11,6 +11,7 @@ import numpy as np
 from analysis.focal_plane.through_focus import FocusError, FocusVertex, focus_vertex
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.slanted_edge import measure_edge
+from analysis.spots.noise import NoiseModel
 from optics.geometry.pose import Pose
 from optics.numerics.threads import cores, one_blas_thread
 from twin.laboratory.focus_bench import FocusBench, Site
@@ -57,7 +58,9 @@ class SiteScan:
         shift: edge -> moves of the target, as moves of the image in the edge's direction, metres, (Z,).
         mtf, sigma: edge -> MTF at the Nyquist frequency, (Z,); an infinite sigma where no edge could be measured.
         vertex: edge -> its peak.
-        frames: edge -> one recorded frame near the peak.
+        frames: edge -> one recorded frame near the peak; empty of a table of MTF values.
+        target: moves of the target itself, metres, (Z,); empty of measurements.
+        take: number of the exposure at its first position.
     """
 
     shift: Mapping[str, np.ndarray]
@@ -65,6 +68,8 @@ class SiteScan:
     sigma: Mapping[str, np.ndarray]
     vertex: Mapping[str, FocusVertex]
     frames: Mapping[str, np.ndarray]
+    target: np.ndarray
+    take: int = 0
 
     @property
     def defocus(self) -> float:
@@ -135,9 +140,7 @@ class Recorder:
         """
         frames = self.frames(number, edge, shift, take)
         ccd = self.bench.ccds[self.bench.sites[number].band]
-        result = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames))
-        value, sigma = result.at(NYQUIST)
-        return value, sigma, frames
+        return *edge_mtf(frames, ccd.noise), frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
         """As ``measure``; where the image is too blurred, or otherwise not good for it, MTF 0 with an infinite sigma,
@@ -147,6 +150,20 @@ class Recorder:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
             return 0.0, np.inf, np.zeros((1, 1, 1), np.uint16), str(error)
+
+
+def edge_mtf(frames: np.ndarray, noise: NoiseModel | None, frequency: float = NYQUIST) -> tuple[float, float]:
+    """MTF of the knife edge in the mean of frames (frames, H, W) and its sigma, whichever bench they come from.
+
+    Args:
+        frames: as recorded.
+        noise: of the detector; None to estimate it from the image.
+        frequency: cycles per pixel.
+
+    Raises:
+        EdgeError: no edge can be measured in them.
+    """
+    return measure_edge(frames.mean(axis=0), noise=noise, frames=len(frames)).at(frequency)
 
 
 def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> tuple[SiteScan, ...]:
@@ -219,7 +236,7 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
             centre = _search(recorder, number, zero) if attempt == 1 or not search else float(target[best])
             continue
         frames = {edge: taken[edge][int(np.argmax(mtf[edge]))][2][0] for edge in DIRECTIONS}
-        return SiteScan(shift, mtf, sigma, vertex, frames)
+        return SiteScan(shift, mtf, sigma, vertex, frames, target, 1000 * (attempt + 1))
     raise AssertionError("unreachable")
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.turntable.angle_fits import AngleFit
-from analysis.turntable.chauvenet import rejection_rate
+from analysis.turntable.chauvenet import expected_rejections
 from analysis.turntable.dividing_error import CalibrationSeries
 from analysis.units import ARCSEC
-from scenes.specs.lab_setup import TurntableSetup, resolve_turntable
-from twin.laboratory.turntable_run import TurntableRun, rms, run_turntable_test
+from scenes.specs.lab_setup import TurntableSetup, resolve_turntable_test
+from scenes.specs.resolved import ExperimentSetup
+from twin.laboratory.measured_readings import Comparisons
+from twin.laboratory.turntable_run import MeasuredTurntable, SimulatedTurntable, TurntableRun, rms, run_turntable_test
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 
@@ -25,7 +27,7 @@ Array = NDArray[np.float64]
 class FitNumbers:
     """One fit: RMS at the held-out readings, at the calibrated ones, and by cross-validation."""
 
-    heldout_rms_arcsec: float
+    heldout_rms_arcsec: float | None
     train_rms_arcsec: float
     cross_validation_rms_arcsec: float
     effective_parameters: float
@@ -37,7 +39,7 @@ class FitNumbers:
         series, fit, validation = run.series, run.fits[name], run.choice[name].validation
         assert validation is not None
         return cls(
-            heldout_rms_arcsec=rms(run.held_out_residual(name)) / ARCSEC,
+            heldout_rms_arcsec=None if run.held_out is None else rms(run.held_out_residual(name)) / ARCSEC,
             train_rms_arcsec=rms(series.mean - fit(series.angle)) / ARCSEC,
             cross_validation_rms_arcsec=validation.rms / ARCSEC,
             effective_parameters=fit.effective_parameters,
@@ -78,8 +80,8 @@ class PointNumbers:
                 sigma_arcsec=float(series.sigma[i]) / ARCSEC,
                 rms_before_arcsec=float(series.rms_before[i]) / ARCSEC,
                 rms_after_arcsec=float(series.rms_after[i]) / ARCSEC,
-                comparisons_arcsec=series.comparisons[i] / ARCSEC,
-                kept=series.keep[i],
+                comparisons_arcsec=series.comparisons[i][series.taken[i]] / ARCSEC,
+                kept=series.keep[i][series.taken[i]],
                 fitted_arcsec={name: float(values[i]) for name, values in fitted.items()},
             )
             for i in range(len(series.angle))
@@ -103,7 +105,7 @@ class TurntableTruth:
     part_rms_full_circle_arcsec: Mapping[str, float]
 
     @classmethod
-    def of(cls, run: TurntableRun) -> TurntableTruth:
+    def of(cls, run: SimulatedTurntable) -> TurntableTruth:
         """Of a run."""
         fits = {}
         for name, fit in run.fits.items():
@@ -130,7 +132,7 @@ class TurntableNumbers:
     rejected: int
     rejected_expected_of_good: float
     suspect_angles: int
-    heldout_sigma_arcsec: float
+    heldout_sigma_arcsec: float | None
     fits: Mapping[str, FitNumbers]
     failed: Mapping[str, str | None]
     chosen: str
@@ -138,40 +140,116 @@ class TurntableNumbers:
     compensation: CompensationNumbers
     points: tuple[PointNumbers, ...]
     heldout_points: tuple[PointNumbers, ...]
+
+
+@dataclass(frozen=True)
+class SimulatedTurntableNumbers(TurntableNumbers):
+    """turntable.json of a simulated bench."""
+
     truth: TurntableTruth
 
+
+@dataclass(frozen=True)
+class FileNumbers:
+    """A file of measurements: rows below its heads, SHA-256 of its contents."""
+
+    file: str
+    rows: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class RejectedNumbers:
+    """A comparison that Chauvenet's criterion takes out, and where it stands."""
+
+    file: str
+    line: int
+    reading_deg: float
+    from_mean_arcsec: float
+
     @classmethod
-    def of(cls, run: TurntableRun) -> TurntableNumbers:
-        """Of a run."""
-        series, compensation = run.series, run.compensation
-        return cls(
-            name=run.spec.name,
-            seed=run.model.seed,
-            repeat_rms_arcsec=float(np.max(series.rms_before)) / ARCSEC,
-            chauvenet_rms_arcsec=float(np.max(series.rms_after)) / ARCSEC,
-            averaging_alone_rms_arcsec=series.averaging_alone / ARCSEC,
-            mean_rms_arcsec=series.mean_rms / ARCSEC,
-            repeatability_arcsec=series.repeatability / ARCSEC,
-            rejected=series.rejected,
-            rejected_expected_of_good=rejection_rate(series.repeats) * series.comparisons.size,
-            suspect_angles=int(np.sum(series.suspect)),
-            heldout_sigma_arcsec=rms(run.held_out.sigma) / ARCSEC,
-            fits={name: FitNumbers.of(run, name) for name in run.fits},
-            failed={trial.name: trial.failure for trial in run.choice.trials if trial.fit is None},
-            chosen=run.choice.chosen,
-            ranking=run.ranking,
-            compensation=CompensationNumbers(
-                compensation.common / ARCSEC, compensation.smooth / ARCSEC, compensation.white / ARCSEC
-            ),
-            points=PointNumbers.of(series, run.fits),
-            heldout_points=PointNumbers.of(run.held_out, run.fits),
-            truth=TurntableTruth.of(run),
+    def of(cls, comparisons: Comparisons) -> tuple[RejectedNumbers, ...]:
+        """All of a series."""
+        series = comparisons.series
+        return tuple(
+            cls(
+                comparisons.file.file,
+                int(comparisons.lines[i, k]),
+                float(np.degrees(series.angle[i])),
+                float(series.comparisons[i, k] - series.mean[i]) / ARCSEC,
+            )
+            for i, k in np.argwhere(series.taken & ~series.keep)
         )
+
+
+@dataclass(frozen=True)
+class MeasuredTurntableNumbers(TurntableNumbers):
+    """turntable.json of measurements. Chi-square of the chosen fit: against the sigmas of the calibrated means; at the
+    held-out readings against all that the compensation states.
+    """
+
+    fit_chi_square: float
+    fit_degrees_of_freedom: float
+    heldout_chi_square: float | None
+    heldout_degrees_of_freedom: int | None
+    rejected_readings: tuple[RejectedNumbers, ...]
+    too_few_angles_for: Sequence[str]
+    files: tuple[FileNumbers, ...]
+
+    @classmethod
+    def of(cls, run: MeasuredTurntable) -> MeasuredTurntableNumbers:
+        """Of a run."""
+        square, freedom = run.chi_square
+        held, held_freedom = run.held_out_chi_square or (None, None)
+        tables = [table for table in (run.comparisons, run.held_out_comparisons) if table is not None]
+        return cls(
+            **_found(run, run.spec.name, run.seed),
+            fit_chi_square=square,
+            fit_degrees_of_freedom=freedom,
+            heldout_chi_square=held,
+            heldout_degrees_of_freedom=held_freedom,
+            rejected_readings=tuple(one for table in tables for one in RejectedNumbers.of(table)),
+            too_few_angles_for=run.too_few,
+            files=tuple(FileNumbers(**asdict(table.file)) for table in tables),
+        )
+
+
+def _found(run: TurntableRun, name: str, seed: int) -> dict[str, Any]:
+    """Fields of `TurntableNumbers`."""
+    series, compensation = run.series, run.compensation
+    return {
+        "name": name,
+        "seed": seed,
+        "repeat_rms_arcsec": float(np.max(series.rms_before)) / ARCSEC,
+        "chauvenet_rms_arcsec": float(np.max(series.rms_after)) / ARCSEC,
+        "averaging_alone_rms_arcsec": series.averaging_alone / ARCSEC,
+        "mean_rms_arcsec": series.mean_rms / ARCSEC,
+        "repeatability_arcsec": series.repeatability / ARCSEC,
+        "rejected": series.rejected,
+        "rejected_expected_of_good": expected_rejections(series.counts),
+        "suspect_angles": int(np.sum(series.suspect)),
+        "heldout_sigma_arcsec": None if run.held_out is None else rms(run.held_out.sigma) / ARCSEC,
+        "fits": {name: FitNumbers.of(run, name) for name in run.fits},
+        "failed": {trial.name: trial.failure for trial in run.choice.trials if trial.fit is None},
+        "chosen": run.choice.chosen,
+        "ranking": run.ranking,
+        "compensation": CompensationNumbers(
+            compensation.common / ARCSEC, compensation.smooth / ARCSEC, compensation.white / ARCSEC
+        ),
+        "points": PointNumbers.of(series, run.fits),
+        "heldout_points": () if run.held_out is None else PointNumbers.of(run.held_out, run.fits),
+    }
 
 
 def turntable_numbers(run: TurntableRun) -> dict[str, Any]:
     """Contents of turntable.json without its frames."""
-    return dict(plain_data(TurntableNumbers.of(run)))
+    if isinstance(run, MeasuredTurntable):
+        return dict(plain_data(MeasuredTurntableNumbers.of(run)))
+    assert isinstance(run, SimulatedTurntable)
+    found = _found(run, run.spec.name, run.model.seed)
+    return dict(plain_data(SimulatedTurntableNumbers(**found, truth=TurntableTruth.of(run))))
 
 
-TURNTABLE = Procedure("turntable", TurntableSetup, resolve_turntable, run_turntable_test, turntable_numbers)
+TURNTABLE = Procedure[ExperimentSetup[Any], TurntableRun](
+    "turntable", TurntableSetup, resolve_turntable_test, run_turntable_test, turntable_numbers
+)

@@ -10,7 +10,7 @@ import numpy as np
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.turntable_numbers import turntable_numbers
-from twin.laboratory.turntable_run import TurntableRun
+from twin.laboratory.turntable_run import SimulatedTurntable, TurntableRun
 from twin.run.artefact import SvgFigure, Table
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
@@ -48,7 +48,8 @@ def comparison_figure(run: TurntableRun) -> Figure:
     figure = new_figure(5.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     top.plot(places[keep], off[keep], ".", color=BLUE, ms=3.5, label=f"kept, {np.sum(keep)}")
-    top.plot(places[~keep], off[~keep], "x", color=VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
+    gone = series.taken & ~keep
+    top.plot(places[gone], off[gone], "x", color=VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
     top.set(title="Comparisons, minus the mean of those kept at their angle", ylabel="arcsec")
     top.margins(y=0.18)
     top.legend(loc="upper right", ncols=2)
@@ -63,16 +64,19 @@ def comparison_figure(run: TurntableRun) -> Figure:
 
 
 def curve_figure(run: TurntableRun) -> Figure:
-    """The measured dividing error with the chosen fit and the true curve."""
+    """The measured dividing error with the chosen fit and, of a simulated table, the true curve."""
     series, held = run.series, run.held_out
     chosen = run.choice.chosen
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
     figure = new_figure(3.6)
     axes = figure.subplots()
-    axes.plot(np.degrees(at), _slow_truth(run, at) / ARCSEC, color=INK, lw=2.4, alpha=0.35, label="truth")
+    if isinstance(run, SimulatedTurntable):
+        axes.plot(np.degrees(at), _slow_truth(run, at) / ARCSEC, color=INK, lw=2.4, alpha=0.35, label="truth")
     fitted = run.fits[chosen](at) / ARCSEC
     axes.plot(np.degrees(at), fitted, color=COLOURS[chosen], lw=1.1, label=f"chosen fit: {FIT_NAMES[chosen]}")
     for points, mark, colour, label in ((series, "o", INK, "calibrated"), (held, "s", VERMILION, "held out")):
+        if points is None:
+            continue
         axes.errorbar(
             np.degrees(points.angle),
             points.mean / ARCSEC,
@@ -93,10 +97,11 @@ def curve_figure(run: TurntableRun) -> Figure:
 
 
 def residual_figure(run: TurntableRun) -> Figure:
-    """For each fit, ranked: the held-out points and the true curve, both minus the fit."""
+    """For each fit, ranked: the held-out points and, of a simulated table, the true curve, both minus the fit."""
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
     held = run.held_out
-    truth = _slow_truth(run, at)
+    assert held is not None
+    truth = _slow_truth(run, at) if isinstance(run, SimulatedTurntable) else None
     most = 1.15 * max(float(np.max(np.abs(run.held_out_residual(name)))) for name in run.ranking) / ARCSEC
     figure = new_figure(1.35 * len(run.ranking) + 0.5)
     panels = np.atleast_1d(figure.subplots(len(run.ranking), 1, sharex=True, sharey=True))
@@ -104,7 +109,8 @@ def residual_figure(run: TurntableRun) -> Figure:
         fit = run.fits[name]
         residual = run.held_out_residual(name)
         axes.axhline(0.0, color=GREY, lw=0.7)
-        axes.plot(np.degrees(at), (truth - fit(at)) / ARCSEC, color=COLOURS[name], lw=1.3)
+        if truth is not None:
+            axes.plot(np.degrees(at), (truth - fit(at)) / ARCSEC, color=COLOURS[name], lw=1.3)
         axes.errorbar(
             np.degrees(held.angle),
             residual / ARCSEC,
@@ -132,7 +138,7 @@ def figure_svg(name: str, run: TurntableRun) -> str:
         return to_svg(draw(run))
 
 
-def _slow_truth(run: TurntableRun, at: np.ndarray) -> np.ndarray:
+def _slow_truth(run: SimulatedTurntable, at: np.ndarray) -> np.ndarray:
     """True dividing error without the subdivision error, whose period is far below what a figure can show."""
     error = run.model.error
     return error(at) - error.parts["subdivision"](at)
@@ -144,19 +150,25 @@ def _finish(*panels: Axes) -> None:
         plain_axes(axes)
 
 
-def sections(run: TurntableRun, result: Mapping[str, Any]) -> tuple[Section, ...]:
+def sections(run: SimulatedTurntable, result: Mapping[str, Any]) -> tuple[Section, ...]:
     """Comparison, and fits; result: the run's numbers."""
-    return _comparison(run, result), _fits(run, result)
+    return comparison_section(run, result, _steps(run)), _fits(run, result)
 
 
-def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
-    series, plan = run.series, run.spec.calibration
+def _steps(run: SimulatedTurntable) -> str:
+    """Which readings were compared."""
+    plan = run.spec.calibration
     region = f"{format_quantity(plan.first, ANGLE)} to {format_quantity(plan.last, ANGLE)}"
+    return f"{region} in steps of {format_quantity(plan.step, ANGLE)}: {plan.count} readings, {plan.repeats} repeats"
+
+
+def comparison_section(run: TurntableRun, result: Mapping[str, Any], readings: str) -> Section:
+    """The comparisons; readings: which were compared, in words."""
+    series = run.series
     text = [
         f"The dividing error is the table's reading minus its true angle. It is compared with a polygon and an "
-        f"autocollimator from {region} in steps of {format_quantity(plan.step, ANGLE)}: {plan.count} readings, "
-        f"{plan.repeats} repeats.",
-        f"Chauvenet's criterion rejects {series.rejected} of {series.comparisons.size} comparisons. It would reject "
+        f"autocollimator from {readings}.",
+        f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. It would reject "
         f"{result['rejected_expected_of_good']:.0f} on average if all were good: it trims normal noise, and the RMS "
         f"that remains is that of trimmed readings. All angles together, corrected for this, one comparison has "
         f"σ = {result['repeatability_arcsec']:.4f} arcsec.",
@@ -191,7 +203,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     return Section("Regional comparison of the turntable", tuple(text), (figure, table))
 
 
-def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
+def _fits(run: SimulatedTurntable, result: Mapping[str, Any]) -> Section:
     fits, truth = result["fits"], result["truth"]["fits"]
     chosen, best = result["chosen"], result["ranking"][0]
     held = fits[chosen]["heldout_rms_arcsec"]
@@ -252,8 +264,8 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     return Section("Fits of the dividing error", tuple(text), (curve, residuals, table))
 
 
-def turntable_report(run: TurntableRun) -> Report:
-    """Report of a turntable test."""
+def turntable_report(run: SimulatedTurntable) -> Report:
+    """Report of a simulated turntable test."""
     data = turntable_numbers(run)
     plan = run.spec.calibration
     chosen = data["chosen"]

@@ -1,7 +1,8 @@
 """The turntable test of paper 004 (section 3.3): a table whose dividing error nobody knows is compared with a
 reference, five fits are made of the comparisons and judged on angles that no fit has seen.
 
-The analysis gets the comparisons and the certificate of the reference. The true dividing error is only compared with.
+The analysis gets the comparisons and the certificate of the reference, of a simulated bench or from files of
+measurements. The true dividing error of a simulated table is only compared with.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,10 @@ from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
 from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.lab_setup import TurntableSetup
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.lab_setup import MeasuredTurntableSetup
+from scenes.specs.resolved import ExperimentSetup
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from twin.laboratory.measured_readings import Comparisons, read_turntable
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import Advance, silent
 
@@ -30,19 +34,17 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, eq=False)
 class TurntableRun:
-    """One turntable test.
+    """One turntable test, whichever bench it comes from.
 
     Attributes:
-        model: the table and the reference; holds the truth.
         series: comparisons at the calibrated readings.
-        held_out: comparisons at readings that no fit has seen.
+        held_out: comparisons at readings that no fit has seen; None if there are none.
         choice: fits and their cross-validation.
         compensation: of the chosen fit.
     """
 
-    model: TurntableModel
     series: CalibrationSeries
-    held_out: CalibrationSeries
+    held_out: CalibrationSeries | None
     choice: Choice
     compensation: DividingCompensation
 
@@ -51,19 +53,43 @@ class TurntableRun:
         """The fits that succeeded, in the order in which they were made."""
         return {trial.name: trial.fit for trial in self.choice.trials if trial.fit is not None}
 
-    @property
-    def spec(self) -> TurntableTestSpec:
-        """Of the test."""
-        return self.model.spec
-
     def held_out_residual(self, name: str) -> Array:
         """Measured - fitted dividing error at the held-out readings, radians."""
+        assert self.held_out is not None
         return self.held_out.mean - self.fits[name](self.held_out.angle)
 
     @cached_property
     def ranking(self) -> tuple[str, ...]:
-        """Names of the fits by their RMS at the held-out readings, the best first."""
-        return tuple(sorted(self.fits, key=lambda name: rms(self.held_out_residual(name))))
+        """Names of the fits by their RMS at the held-out readings, the best first; without such readings by
+        cross-validation.
+        """
+
+        def judged(name: str) -> float:
+            if self.held_out is not None:
+                return rms(self.held_out_residual(name))
+            validation = self.choice[name].validation
+            assert validation is not None
+            return validation.rms
+
+        return tuple(sorted(self.fits, key=judged))
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTurntable(TurntableRun):
+    """A test on the simulated bench.
+
+    Attributes:
+        model: the table and the reference; holds the truth.
+        held_out: comparisons at readings that no fit has seen.
+    """
+
+    held_out: CalibrationSeries
+    model: TurntableModel
+
+    @property
+    def spec(self) -> TurntableTestSpec:
+        """Of the test."""
+        return self.model.spec
 
     @cached_property
     def truth_readings(self) -> Array:
@@ -78,12 +104,71 @@ class TurntableRun:
         return self.model.error(self.truth_readings)
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredTurntable(TurntableRun):
+    """A test on measured readings.
+
+    Attributes:
+        spec: of the test.
+        seed: of the network's starts.
+        comparisons, held_out_comparisons: the tables as read.
+        too_few: fits that need more angles than there are.
+    """
+
+    spec: MeasuredTurntableSpec
+    seed: int
+    comparisons: Comparisons
+    held_out_comparisons: Comparisons | None
+    too_few: tuple[str, ...]
+
+    @cached_property
+    def chi_square(self) -> tuple[float, float]:
+        """Of the chosen fit at the calibrated readings, against their sigmas, and its degrees of freedom."""
+        fit, series = self.compensation.fit, self.series
+        square = float(np.sum(((series.mean - fit(series.angle)) / series.sigma) ** 2))
+        return square, len(series.angle) - fit.effective_parameters
+
+    @cached_property
+    def held_out_chi_square(self) -> tuple[float, int] | None:
+        """The same at the held-out readings, against all that the compensation states of them."""
+        if self.held_out is None:
+            return None
+        held, fit = self.held_out, self.compensation
+        rest = held.mean - fit.error(held.angle)
+        spread = np.diag(held.sigma**2) + fit.covariance(held.angle)
+        return float(rest @ np.linalg.solve(spread, rest)), len(rest)
+
+
+def analyse(
+    series: CalibrationSeries,
+    held_out: CalibrationSeries | None,
+    seed: int,
+    names: Sequence[str],
+    folds: int,
+    say: Callable[[str], None] = lambda text: None,
+) -> tuple[Choice, DividingCompensation]:
+    """Fit the comparisons, choose a fit, and make the compensation of it.
+
+    Args:
+        series: the calibration.
+        held_out: the series at other readings, if there is one.
+        seed: of the network's starts.
+        names: of the fits.
+        folds: of the cross-validation.
+        say: told what is being done.
+    """
+    # the network's matrices are small
+    with one_blas_thread():
+        choice = choose(series, seed, names, folds, say)
+        return choice, compensate(series, choice, held_out)
+
+
 def run_turntable(
     spec: TurntableTestSpec,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
     names: Sequence[str] = tuple(FITS),
-) -> TurntableRun:
+) -> SimulatedTurntable:
     """Simulate the comparison, clean it, fit it, choose.
 
     Args:
@@ -109,10 +194,57 @@ def run_turntable(
     say("compare the table with the reference")
     model = TurntableModel(spec, seed)
     series, held_out = model.calibrate(), model.held_out()
-    # the network's matrices are small
-    with one_blas_thread():
-        choice = choose(series, seed, names, plan.folds, say)
-        return TurntableRun(model, series, held_out, choice, compensate(series, choice, held_out))
+    choice, compensation = analyse(series, held_out, seed, names, plan.folds, say)
+    return SimulatedTurntable(series=series, held_out=held_out, choice=choice, compensation=compensation, model=model)
+
+
+def run_measured(
+    spec: MeasuredTurntableSpec, seed: int, say: Callable[[str], None] = lambda text: None
+) -> MeasuredTurntable:
+    """Read the comparisons and do the same with them.
+
+    Args:
+        spec: of the test.
+        seed: of the network's starts.
+        say: told what is being done.
+
+    Raises:
+        InputError: a table cannot be used.
+    """
+    say("read the comparisons")
+    found, held = read_turntable(spec.measured)
+    names, too_few = usable_fits(spec.measured, found, tuple(FITS))
+    held_out = None if held is None else held.series
+    choice, compensation = analyse(found.series, held_out, seed, names, spec.measured.folds, say)
+    return MeasuredTurntable(
+        series=found.series,
+        held_out=held_out,
+        choice=choice,
+        compensation=compensation,
+        spec=spec,
+        seed=seed,
+        comparisons=found,
+        held_out_comparisons=held,
+        too_few=too_few,
+    )
+
+
+def usable_fits(
+    files: TurntableFiles, found: Comparisons, names: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The fits of which there are angles enough, and the others.
+
+    Raises:
+        InputError: there are enough for none.
+    """
+    count = len(found.series.angle)
+    left = angles_left(count, files.folds)
+    enough = tuple(name for name in names if left >= fewest(name))
+    if not enough:
+        text = f"{count} angles, {left} of them without a fold of the cross-validation"
+        issue = files.error("too few angles for any fit", ("comparisons",), found=text, allowed="more angles or folds")
+        raise issue
+    return enough, tuple(name for name in names if name not in enough)
 
 
 def rms(value: Array) -> float:
@@ -120,6 +252,14 @@ def rms(value: Array) -> float:
     return float(np.sqrt(np.mean(value**2)))
 
 
-def run_turntable_test(setup: TurntableSetup, backend: Backend, seed: int, advance: Advance = silent) -> TurntableRun:
+def run_turntable_test(
+    setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
+) -> TurntableRun:
     """``python -m twin.lab turntable``; nothing is traced, so that the backend is not used. Raises InputError."""
-    return run_turntable(setup.test, seed, lambda part: advance(part, 0, 1))
+
+    def say(part: str) -> None:
+        advance(part, 0, 1)
+
+    if isinstance(setup, MeasuredTurntableSetup):
+        return run_measured(setup.test, seed, say)
+    return run_turntable(setup.test, seed, say)

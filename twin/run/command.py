@@ -19,6 +19,7 @@ from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_js
 from twin.run.cli import (
     AsJson,
     BackendName,
+    Export,
     File,
     Force,
     Heartbeat,
@@ -38,7 +39,7 @@ from twin.run.cli import (
 )
 from twin.run.procedure import Advance, Procedure, Run
 from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, chosen
+from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
@@ -160,6 +161,7 @@ def add_test(
     resolve: Callable[[Path], Any],
     load: Callable[[], Test[Run]],
     about: str,
+    export: Callable[[Run], Mapping[str, str | bytes]] | None = None,
 ) -> None:
     """Add a test to a program as a subcommand with the options that all tests have.
 
@@ -170,7 +172,25 @@ def add_test(
         resolve: reads the test's file, as its procedure does.
         load: imports the test and its report.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+        export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
     """
+    if export is not None:
+
+        @app.command(command, help=about)
+        def exporting_test(
+            file: File,
+            out: Out = None,
+            seed: Seed = None,
+            export_to: Export = None,
+            backend: BackendName = "llvm",
+            force: Force = False,
+            as_json: AsJson = False,
+            quiet: Quiet = False,
+        ) -> None:
+            options = Options(out, seed, backend, force, as_json, quiet, export_to)
+            run_test(program, command, file, resolve, load, options, export)
+
+        return
 
     @app.command(command, help=about)
     def test(
@@ -192,6 +212,7 @@ def run_test(
     resolve: Callable[[Path], Any],
     load: Callable[[], Test[Run]],
     options: Options,
+    export: Callable[[Run], Mapping[str, str | bytes]] | None = None,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
@@ -202,6 +223,7 @@ def run_test(
         resolve: reads it, as the test's procedure does; ``test`` of the set-up has a ``seed``.
         load: imports the test and its report.
         options: what the user chose.
+        export: run -> path and contents of files with what was measured, where the test has any.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -212,17 +234,41 @@ def run_test(
         from twin.run.report import with_warnings
 
         procedure, report = load()
+        # a folder that cannot be made is told before the run
+        folder = None if options.export is None else _export_folder(setup, procedure, options.export, options.force)
         number = setup.test.seed if options.seed is None else options.seed
         run, given = procedure.performed(setup, session.backend, number, session.advance)
+        if folder is not None and export is not None:
+            with folder:
+                for name, content in export(run).items():
+                    folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
+                said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
+                write_manifest(folder, program, session.started, session.seconds, **said)
         shown = with_warnings(report(run), given)
         numbers = {**procedure.numbers(run), "verdict": shown.verdict}
         config, name = setup.with_seed(number).to_yaml(), session.backend.name
-        drawn = number if procedure.seeded else None
+        drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
         facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
         write_test(procedure.kind, numbers, shown, facts, session.folder)
         return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console))
 
     run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
+
+
+def _export_folder(setup: Any, procedure: Procedure[Any, Any], target: Path, force: bool) -> RunFolder:
+    """The folder of ``--export``, checked before anything is computed.
+
+    Raises:
+        InputError: the test is one of measurements, which are files already.
+        RunFolderError: the folder cannot be made.
+    """
+    if not isinstance(setup, procedure.setup):
+        text = "measurements are files already; --export writes those of a simulated bench"
+        raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
+    try:
+        return RunFolder(target, force)
+    except RunFolderError as error:
+        raise RunFolderError(str(error).replace("--out", "--export")) from None
 
 
 def print_report(report: Report, console: Console) -> None:

@@ -95,7 +95,10 @@ class ProcedureBase:
 
     def resolve(self, file: Path | str) -> Spec:
         """Read the test with all it refers to. Raises InputError."""
-        setup: Spec = self.procedure.resolve(file)
+        setup: Any = self.procedure.resolve(file)
+        if not isinstance(setup, self.model):
+            text = "measurements cannot be varied; a study needs a simulated bench"
+            raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
         return setup
 
     def check(self, tree: Tree, backend: Backend) -> None:

@@ -11,7 +11,7 @@ from analysis.units import UM_PER_M as UM
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.distortion_run import DistortionRun, measure, rms
+from twin.laboratory.distortion_run import SimulatedDistortion, measure, rms
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.validation.checks.check import REFUTED, UNDECIDED, Check, CheckResult, Explanation, mean_of, median_of
 from twin.validation.checks.group import CheckGroup, Context
@@ -82,7 +82,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     _show(context, runs)
 
 
-def measured_tests(context: Context) -> list[DistortionRun]:
+def measured_tests(context: Context) -> list[SimulatedDistortion]:
     """Tests from rendered spots, each with a turntable of its own."""
     with one_blas_thread():
         context.progress(0.0, "build the bench")
@@ -136,7 +136,7 @@ def _table2(context: Context) -> Iterator[CheckResult]:
     yield context.check("004.table2.bound").evaluate(float(np.max(own)), None, how)
 
 
-def _accuracy(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
+def _accuracy(check: Check, runs: Sequence[SimulatedDistortion]) -> CheckResult:
     raw, own = _errors(runs).T
     how = (
         f"{len(runs)} rendered tests, {POINTS} points and {SETS} sets each, against "
@@ -147,7 +147,7 @@ def _accuracy(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
     return check.evaluate(value, None, how, inputs=[dividing(value)])
 
 
-def _compensation(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
+def _compensation(check: Check, runs: Sequence[SimulatedDistortion]) -> CheckResult:
     raw, own = _errors(runs).T
     over_sets = [lower(rms(r.raw.rms_over_sets), rms(r.compensated.rms_over_sets)) for r in runs]
     less = 100.0 * (1.0 - own / raw)
@@ -164,7 +164,7 @@ def _compensation(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
     return check.evaluate(value, float(np.std(less, ddof=1)), how, inputs=[dividing(value, 0.0)])
 
 
-def _points(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
+def _points(check: Check, runs: Sequence[SimulatedDistortion]) -> CheckResult:
     columns = [np.round(UM * np.array([m.rms_over_sets for m in pair]), 1) for pair in
                ((r.raw, r.compensated) for r in runs)]  # fmt: skip
     share = np.array([100.0 * np.mean(raw != own) for raw, own in columns])
@@ -202,15 +202,15 @@ _EVALUATIONS = {
 }
 
 
-def _errors(runs: Sequence[DistortionRun]) -> Array:
+def _errors(runs: Sequence[SimulatedDistortion]) -> Array:
     """RMS error of the distortion with raw and with compensated angles, (T, 2), micrometres."""
     return np.array([[UM * rms(run.error(m)) for m in (run.raw, run.compensated)] for run in runs])
 
 
-def _show(context: Context, runs: Sequence[DistortionRun]) -> None:
+def _show(context: Context, runs: Sequence[SimulatedDistortion]) -> None:
     raw, own = RAW, COMPENSATED
     changes = {"paper 004, Table 2": (raw[None], own[None])}
-    kinds: dict[str, Callable[[DistortionRun], tuple[Array, Array]]] = {
+    kinds: dict[str, Callable[[SimulatedDistortion], tuple[Array, Array]]] = {
         "error of the distortion (needs the truth)": lambda r: (r.error(r.raw), r.error(r.compensated)),
         "distance from a smooth curve": lambda r: (r.raw.smooth.residual, r.compensated.smooth.residual),
         "RMS of distortion over the sets": lambda r: (r.raw.rms_over_sets, r.compensated.rms_over_sets),

@@ -23,7 +23,7 @@ from analysis.orientation.distortion_model import (
 from analysis.units import ARCSEC
 from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
-from twin.laboratory.distortion_run import DistortionRun, rms
+from twin.laboratory.distortion_run import SimulatedDistortion, rms
 from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import load_printed
@@ -124,7 +124,7 @@ class SpotTest:
         run: the test.
     """
 
-    run: DistortionRun
+    run: SimulatedDistortion
 
     @cached_property
     def place(self) -> Array:
@@ -189,7 +189,7 @@ def _fitted(where: Array, turn: Array) -> tuple[float, Array]:
     return float(found[1]), np.asarray(where - columns @ found)
 
 
-def evaluate_equations(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
+def evaluate_equations(context: Context, runs: Sequence[SimulatedDistortion]) -> Iterator[CheckResult]:
     """The rows of (1) to (4)."""
     tests = [SpotTest(run) for run in runs]
     for equation in (_eq1, _eq2, _eq4):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from analysis.units import ARCSEC
 from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
-from twin.laboratory.distortion_run import DistortionRun, rms
+from twin.laboratory.distortion_run import SimulatedDistortion, rms
 from twin.validation.checks.check import REFUTED, Check, CheckResult, Explanation
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import Context
@@ -45,7 +45,7 @@ CHECKS = (
 )  # fmt: skip
 
 
-def evaluate_sensitivity(context: Context, runs: Sequence[DistortionRun]) -> Iterator[CheckResult]:
+def evaluate_sensitivity(context: Context, runs: Sequence[SimulatedDistortion]) -> Iterator[CheckResult]:
     """The rows of the sources of error."""
     if not context.wants("004.sensitivity"):
         return
@@ -94,7 +94,7 @@ def _ratio(over: Array, under: Array, column: int) -> float:
     return float(np.sqrt((n - 1) * np.var(values)))
 
 
-def evaluate_angles(check: Check, runs: Sequence[DistortionRun]) -> CheckResult:
+def evaluate_angles(check: Check, runs: Sequence[SimulatedDistortion]) -> CheckResult:
     """What is left of the dividing error in the angles of the tests."""
     tests = [SpotTest(run) for run in runs]
     own, raw = (

@@ -1,0 +1,399 @@
+"""Laboratory tests on measurements: closed loops through files, independence of order, units and columns, other
+people's least squares on the same files, more data, and tables that cannot be used.
+"""
+
+import csv
+import json
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from typer.testing import CliRunner
+
+from analysis.focal_plane.through_focus import QUARTIC
+from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from scenes.specs.load import SCENES, load_turntable_test
+from scenes.yaml.errors import InputError
+from twin.lab import app
+from twin.laboratory.distortion_run import MeasuredDistortion, measure_files
+from twin.laboratory.export import export_turntable
+from twin.laboratory.measured_focus import MeasuredAlignment, align_measured
+from twin.laboratory.measured_readings import read_comparisons, read_turntable
+from twin.laboratory.turntable_run import MeasuredTurntable, analyse, run_turntable
+
+EXAMPLES = SCENES / "lab" / "measured"
+JOBS = Path(__file__).resolve().parent.parent / "golden" / "jobs"
+ARCSEC = math.pi / 648000
+ROUNDING = 1e-9
+"""Of a sigma: what text with all digits and a change of units may cost."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The shipped examples, to spoil."""
+    place = tmp_path / "measured"
+    shutil.copytree(EXAMPLES, place)
+    return place
+
+
+def rows_of(path: Path) -> list[list[str]]:
+    with path.open(newline="") as stream:
+        return list(csv.reader(stream))
+
+
+def write(path: Path, rows: Sequence[Sequence[object]]) -> None:
+    with path.open("w", newline="") as stream:
+        csv.writer(stream).writerows(rows)
+
+
+def distortion_of(folder: Path) -> MeasuredDistortion:
+    return measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
+
+
+def focus_of(folder: Path) -> MeasuredAlignment:
+    return align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
+
+
+def turntable_of(folder: Path, names: Sequence[str] = ("cubic_spline", "fourier")) -> MeasuredTurntable:
+    """Without the network, which takes nearly all of the time."""
+    spec = resolve_turntable_test(folder / "turntable.yaml").test
+    found = read_comparisons(spec.measured.comparisons, spec.measured.reference)  # type: ignore[union-attr]
+    choice, compensation = analyse(found.series, None, 1, names, 10)
+    return MeasuredTurntable(found.series, None, choice, compensation, spec, 1, found, None, ())  # type: ignore[arg-type]
+
+
+# --- closed loops ----------------------------------------------------------------------------------------
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    done = CliRunner().invoke(app, [str(one) for one in arguments])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, " ".join(done.output.split())
+
+
+def loop(command: str, place: Path, test: str) -> tuple[dict, dict]:
+    """Numbers of a simulated bench and of what it exported."""
+    code, told = run(
+        command, JOBS / f"{command}.yaml", "--out", place / "simulated", "--export", place / "files", "--quiet"
+    )
+    assert code == 0, told
+    code, told = run(command, place / "files" / test, "--out", place / "measured", "--quiet")
+    assert code == 0, told
+    return tuple(json.loads((place / name / f"{command}.json").read_text()) for name in ("simulated", "measured"))  # type: ignore[return-value]
+
+
+def same(simulated: dict, measured: dict) -> None:
+    """Every number that both have, to the bit: exported files have all digits."""
+    assert simulated["truth"]
+    assert "truth" not in measured
+    there, here = ({k: v for k, v in each.items() if k not in ("truth", "verdict")} for each in (simulated, measured))
+    assert there == {name: here[name] for name in there}
+
+
+@pytest.mark.slow
+def test_turntable_exported_and_read_back(tmp_path: Path) -> None:
+    simulated, measured = loop("turntable", tmp_path, "turntable.yaml")
+    assert "truth" not in (tmp_path / "measured" / "report.html").read_text()
+    same(simulated, measured)
+    # the run's own config gives the same from anywhere
+    code, told = run("turntable", tmp_path / "measured" / "config.yaml", "--out", tmp_path / "again", "--quiet")
+    assert code == 0, told
+    assert (tmp_path / "again" / "turntable.json").read_bytes() == (
+        tmp_path / "measured" / "turntable.json"
+    ).read_bytes()
+
+
+def test_distortion_exported_and_read_back(tmp_path: Path) -> None:
+    simulated, measured = loop("distortion", tmp_path, "distortion.yaml")
+    same(simulated, measured)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("table", ["images", "mtf"])
+def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
+    simulated, measured = loop("focus", tmp_path, f"focus_before_{table}.yaml")
+    own = {(one["band"], round(one["y_mm"])): one for one in measured["sites"]}
+    order = sorted(simulated["initial"]["sites"], key=lambda one: (one["band"], one["field"]))
+    for there, here in zip(order, sorted(own.values(), key=lambda one: (one["band"], one["y_mm"])), strict=True):
+        assert abs(here["defocus_um"] - there["defocus_um"]) < ROUNDING * there["defocus_um_sigma"]
+        assert here["defocus_um_sigma"] == pytest.approx(there["defocus_um_sigma"], rel=1e-9)
+    done = simulated["rounds"][0]
+    for hole, shim in done["shim_changes_um"].items():
+        assert measured["shims"][hole]["ground_um"] == shim
+        assert measured["shims"][hole]["shim_um"] == done["shims_um"][hole]
+    for name in ("rotation_arcmin", "shift_um"):
+        np.testing.assert_allclose(measured["correction"][name], done["correction"][name], rtol=1e-9, atol=1e-9)
+    assert measured["correction"]["piston_um_sigma"] == pytest.approx(done["correction"]["piston_um_sigma"], rel=1e-9)
+    # frames are those that the bench recorded, to the bit: their MTF is that of the simulation's own table
+    values = [float(row[-2]) for row in rows_of(tmp_path / "files" / "before_mtf.csv")[1:]]
+    if table == "images":
+        images = align_measured(resolve_focus_test(tmp_path / "files" / "focus_before_images.yaml").test)  # type: ignore[arg-type]
+        again = sorted(float(v) for scan in images.scans for edge in scan.mtf.values() for v in edge if v > 0.0)
+        assert again == sorted(values)
+    # after the round the assembly stands where the shims were to bring it
+    code, told = run(
+        "focus", tmp_path / "files" / f"focus_round_1_{table}.yaml", "--out", tmp_path / "after", "--quiet"
+    )
+    assert code == 0, told
+    after = json.loads((tmp_path / "after" / "focus.json").read_text())
+    assert after["confocal_um_max"] == pytest.approx(done["confocal_um_max"], rel=1e-9)
+
+
+def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
+    spec = load_turntable_test(JOBS / "turntable.yaml")
+    done = run_turntable(spec, 7, names=("cubic_spline",))
+    for name, content in export_turntable(done).items():
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    again = resolve_turntable_test(tmp_path / "turntable.yaml").test
+    series, held_out = read_turntable(again.measured)  # type: ignore[union-attr]
+    assert held_out is not None
+    for there, here in ((done.series, series.series), (done.held_out, held_out.series)):
+        np.testing.assert_array_equal(here.angle, there.angle)
+        np.testing.assert_array_equal(here.comparisons, there.comparisons)
+        np.testing.assert_array_equal(here.sigma, there.sigma)
+
+
+def test_export_is_for_simulated_benches(folder: Path, tmp_path: Path) -> None:
+    code, told = run("turntable", folder / "turntable.yaml", "--export", tmp_path / "files", "--out", tmp_path / "run")
+    assert code == 2
+    assert "turntable.yaml:6: measured: measurements are files already" in told
+    (tmp_path / "there").mkdir()
+    code, told = run("turntable", JOBS / "turntable.yaml", "--export", tmp_path / "there", "--out", tmp_path / "run")
+    assert code == 2
+    assert "choose another with --export" in told
+    assert not (tmp_path / "run").exists()
+
+
+# --- what must not change --------------------------------------------------------------------------------
+
+
+def shuffled(path: Path, seed: int) -> None:
+    head, *body = rows_of(path)
+    rng = np.random.default_rng(seed)
+    body = [body[k] for k in rng.permutation(len(body))]
+    columns = rng.permutation(len(head))
+    write(path, [[row[k] for k in columns] for row in (head, *body)])
+
+
+def in_unit(path: Path, old: str, new: str, factor: float) -> None:
+    head, *body = rows_of(path)
+    k = head.index(old)
+    for row in body:
+        row[k] = repr(float(row[k]) * factor)
+    head[k] = new
+    write(path, [head, *body])
+
+
+def test_order_of_rows_and_columns_changes_no_bit(folder: Path) -> None:
+    kinds: list[Callable[[], np.ndarray]] = [
+        lambda: turntable_of(folder).series.mean,
+        lambda: distortion_of(folder).compensated.fit.values,
+        lambda: np.concatenate([focus_of(folder).defocus, np.diag(focus_of(folder).shimming.plane.covariance)]),
+    ]
+    before = [kind() for kind in kinds]
+    for k, name in enumerate(("comparisons.csv", "held_out.csv", "spots.csv", "mtf.csv")):
+        shuffled(folder / name, k)
+    for there, kind in zip(before, kinds, strict=True):
+        np.testing.assert_array_equal(kind(), there)
+
+
+def test_units_change_nothing_but_rounding(folder: Path) -> None:
+    turntable, distortion, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
+    in_unit(folder / "comparisons.csv", "difference [arcsec]", "difference [urad]", ARCSEC * 1e6)
+    in_unit(folder / "comparisons.csv", "reading [deg]", "reading [arcmin]", 60.0)
+    in_unit(folder / "spots.csv", "along [mm]", "along [um]", 1e3)
+    in_unit(folder / "mtf.csv", "shift [um]", "shift [mm]", 1e-3)
+    in_unit(folder / "mtf.csv", "x [mm]", "x [m]", 1e-3)
+    np.testing.assert_allclose(turntable_of(folder).series.mean, turntable.series.mean, atol=ROUNDING * ARCSEC * 0.01)
+    fit, again = distortion.compensated.fit, distortion_of(folder).compensated.fit
+    assert np.all(np.abs(again.values - fit.values) < ROUNDING * np.sqrt(np.diag(fit.covariance)))
+    assert np.all(np.abs(focus_of(folder).defocus - focus.defocus) < ROUNDING * focus.defocus_sigma)
+
+
+def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
+    fit = distortion_of(folder).compensated.fit
+    in_unit(folder / "spots.csv", "along [mm]", "column", 1e3 / 7.0)
+    for name in ("sigma", "fixed sigma"):
+        in_unit(folder / "spots.csv", f"{name} [um]", f"column {name}", 1.0 / 7.0)
+    text = (folder / "distortion.yaml").read_text()
+    text = text.replace("  zero: 102 deg", "  line: {pitch: 7 um, middle: 0}\n  zero: 102 deg")
+    (folder / "distortion.yaml").write_text(text)
+    again = distortion_of(folder).compensated.fit
+    assert np.all(np.abs(again.values - fit.values) < ROUNDING * np.sqrt(np.diag(fit.covariance)))
+    # a line that counts the other way: only with `reversed`
+    in_unit(folder / "spots.csv", "column", "column", -1.0)
+    with pytest.raises(InputError, match="reversed: true"):
+        distortion_of(folder)
+    (folder / "distortion.yaml").write_text(text.replace("  zero:", "  reversed: true\n  zero:"))
+    mirrored = distortion_of(folder).compensated.fit
+    assert mirrored.value("principal_distance") == pytest.approx(fit.value("principal_distance"), abs=ROUNDING)
+    assert mirrored.value("principal_point") == pytest.approx(-fit.value("principal_point"), abs=1e-6)
+
+
+def test_a_moved_focal_plane_and_a_moved_target(folder: Path) -> None:
+    there = focus_of(folder).defocus
+    text = (folder / "focus.yaml").read_text()
+    in_unit(folder / "mtf.csv", "shift [um]", "shift [um]", -1.0)
+    (folder / "focus.yaml").write_text(text.replace("moved: image", "moved: focal_plane"))
+    np.testing.assert_array_equal(focus_of(folder).defocus, there)
+    in_unit(folder / "mtf.csv", "shift [um]", "shift [um]", -1.0 / 0.08)
+    (folder / "focus.yaml").write_text(text.replace("moved: image", "moved: target\n  per_shift: 0.08"))
+    np.testing.assert_allclose(focus_of(folder).defocus, there, rtol=1e-9)
+
+
+def test_reference_angles_and_positions_in_place_of_differences(folder: Path) -> None:
+    """The reference counts from another zero and over a full turn; the table never stops at the same reading twice."""
+    before = turntable_of(folder).series
+    _, *body = rows_of(folder / "comparisons.csv")
+    rng = np.random.default_rng(3)
+    rows: list[list[object]] = [["position", "repeat", "reading [deg]", "reference [deg]"]]
+    for reading, repeat, difference in body:
+        off = rng.uniform(-1.0, 1.0) / 3600.0
+        at = float(reading) + off
+        reference = at - float(difference) / 3600.0 + 264.0
+        rows.append([round(2.0 * float(reading)), repeat, f"{at:.12f}", f"{reference % 360.0:.12f}"])
+    write(folder / "comparisons.csv", rows)
+    after = turntable_of(folder).series
+    constant = after.mean - before.mean
+    # 1e-12 deg of rounding
+    np.testing.assert_allclose(constant, constant[0], atol=1e-9 * ARCSEC * 10.0)
+    np.testing.assert_allclose(after.angle, before.angle, atol=1.0 * ARCSEC)
+
+
+def test_missing_repeats_cost_only_their_own_angle(folder: Path) -> None:
+    whole = turntable_of(folder).series
+    head, *body = rows_of(folder / "comparisons.csv")
+    write(folder / "comparisons.csv", [head, *body[:7], *body[10:]])
+    less = turntable_of(folder).series
+    assert less.counts.tolist() == [7] + 40 * [10]
+    np.testing.assert_array_equal(less.mean[1:], whole.mean[1:])
+    assert less.noise_sigma[0] > whole.noise_sigma[0]
+    # the repeatability of all angles together hardly changes: three comparisons of 410
+    assert less.repeatability == pytest.approx(whole.repeatability, rel=0.01)
+
+
+def test_missing_spots_are_no_spots(folder: Path) -> None:
+    whole = distortion_of(folder)
+    head, *body = rows_of(folder / "spots.csv")
+    write(folder / "spots.csv", [head, *body[:13], *body[17:]])
+    less = distortion_of(folder)
+    assert int(np.sum(less.present)) == whole.reading.size - 4
+    assert not np.any(less.means.keep & ~less.present)
+    f = "principal_distance"
+    assert abs(less.compensated.fit.value(f) - whole.compensated.fit.value(f)) < whole.compensated.fit.sigma(f)
+
+
+# --- other people's least squares ------------------------------------------------------------------------
+
+
+def test_distortion_agrees_with_scipy(folder: Path) -> None:
+    text = (folder / "distortion.yaml").read_text()
+    (folder / "distortion.yaml").write_text(text[: text.index("  turntable:")] + "  angle_sigma: 0.05 arcsec\n")
+    run_ = distortion_of(folder)
+    fit = run_.compensated.fit
+    head, *body = rows_of(folder / "spots.csv")
+    table = np.array(body, float)
+    points, sets = int(table[:, 0].max()), int(table[:, 1].max())
+    keep = run_.means.keep
+    angle = np.radians(table[:, head.index("reading [deg]")] - 102.0).reshape(points, sets)
+    along = 1e-3 * table[:, head.index("along [mm]")].reshape(points, sets)
+    w, where = (np.array([one[k].mean() for one, k in zip(each, keep, strict=True)]) for each in (angle, along))
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return np.asarray(1e6 * (where - x[0] - x[1] * np.tan(w) + x[2] * np.tan(w) ** 2))
+
+    found = least_squares(residual, [0.0, 5.0, 0.0], x_scale=[1e-6, 1.0, 1e-3], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    sigma = np.sqrt(np.diag(fit.covariance))
+    # finite differences of least_squares: 1e-8 of the sigmas and less
+    assert np.all(np.abs(found.x - fit.values) < 1e-5 * sigma)
+    jacobian = np.column_stack([np.ones_like(w), np.tan(w), -(np.tan(w) ** 2)])
+    smooth = run_.compensated.smooth
+    t, (_, f, p, k3) = np.tan(w), smooth.values
+    for own, rate in (
+        (fit, (fit.values[1] - 2 * fit.values[2] * t) * (1 + t**2)),
+        (smooth, (f - 2 * p * t + 3 * k3 * t**2) * (1 + t**2)),
+    ):
+        design = jacobian if own is fit else np.column_stack([jacobian, t**3])
+        noise = run_.means.sigma**2 + run_.compensated.white**2 + (rate * 0.05 * ARCSEC) ** 2
+        inverse = np.linalg.inv(design.T @ design) @ design.T
+        np.testing.assert_allclose(
+            np.sqrt(np.diag((inverse * noise) @ inverse.T)), np.sqrt(np.diag(own.covariance)), rtol=1e-6
+        )
+
+
+def test_focus_agrees_with_scipy(folder: Path) -> None:
+    run_ = focus_of(folder)
+    scan = run_.scans[7]
+    for edge, vertex in scan.vertex.items():
+        z, v, s = (each[edge][vertex.used] for each in (scan.shift, scan.mtf, scan.sigma))
+
+        def residual(x: np.ndarray, z: np.ndarray = z, v: np.ndarray = v, s: np.ndarray = s) -> np.ndarray:
+            u = x[2] * (1e4 * (z - x[1])) ** 2
+            return np.asarray((v - x[0] * (1.0 - u + QUARTIC * u**2)) / s)
+
+        start = [v.max(), z[np.argmax(v)], 0.05]
+        found = least_squares(
+            residual, start, x_scale=[0.1, 1e-5, 0.01], jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
+        sigma = np.sqrt(np.linalg.inv(found.jac.T @ found.jac)[1, 1])
+        assert abs(found.x[1] - vertex.position) < 1e-4 * vertex.sigma
+        assert sigma == pytest.approx(vertex.sigma, rel=1e-4)
+        assert 2.0 * found.cost == pytest.approx(vertex.chi_square, rel=1e-6)
+    plane = run_.shimming.plane
+    spread = np.hypot(run_.defocus_sigma, plane.extra_sigma)
+    design = np.column_stack([np.ones(len(spread)), plane.place])
+    found = least_squares(lambda x: (-run_.defocus - design @ x) / spread, np.zeros(3), x_scale=[1e-5, 1e-4, 1e-4])
+    covariance = np.linalg.inv((design / spread[:, None]).T @ (design / spread[:, None]))
+    sigma = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(found.x - [plane.piston, plane.slope_x, plane.slope_y]) < 1e-5 * sigma)
+    np.testing.assert_allclose(covariance, plane.covariance, rtol=1e-9, atol=1e-12 * np.outer(sigma, sigma).max())
+
+
+def test_turntable_agrees_with_scipy(folder: Path) -> None:
+    run_ = turntable_of(folder, ("polynomial",))
+    fit, series = run_.compensation.fit, run_.series
+    _, *body = rows_of(folder / "comparisons.csv")
+    table = np.array(body, float).reshape(41, 10, 3)
+    mean = np.array([row[keep, 2].mean() for row, keep in zip(table, series.keep, strict=True)])
+    np.testing.assert_allclose(mean * ARCSEC, series.mean, atol=1e-9 * series.sigma.min())
+    order = int(fit.settings["order"])
+    x = (table[:, 0, 0] - 102.0) / 10.0
+    design = np.polynomial.chebyshev.chebvander(x, order) / (series.sigma / ARCSEC)[:, None]
+    found = least_squares(
+        lambda c: design @ c - mean / (series.sigma / ARCSEC), np.zeros(order + 1), xtol=1e-15, gtol=1e-15
+    )
+    at = np.polynomial.chebyshev.chebvander(x, order)
+    sigma = np.sqrt(np.diag(fit.covariance(series.angle))) / ARCSEC
+    assert np.all(np.abs(at @ found.x - fit(series.angle) / ARCSEC) < 1e-5 * sigma)
+    covariance = at @ np.linalg.inv(design.T @ design) @ at.T
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=1e-8)
+
+
+# --- more data -------------------------------------------------------------------------------------------
+
+
+def test_more_data_never_raise_a_sigma(folder: Path) -> None:
+    """Known noise: each place and each angle that is added lowers sigmas or leaves them."""
+    head, *body = rows_of(folder / "mtf.csv")
+    last = None
+    for step in (4, 2, 1):  # every fourth position on either side of focus is too few: whole scans are left out
+        places = sorted({(row[0], row[2]) for row in body})[::step]
+        write(folder / "mtf.csv", [head, *(row for row in body if (row[0], row[2]) in places)])
+        run_ = focus_of(folder)
+        design = np.column_stack([np.ones(len(run_.sites)), run_.shimming.plane.place]) / run_.defocus_sigma[:, None]
+        sigma = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+        if last is not None:
+            assert np.all(sigma < last)
+        last = sigma
+    # the same repeats once more: half of the variance, but for the limits that depend on their number
+    before = turntable_of(folder).series
+    head, *body = rows_of(folder / "comparisons.csv")
+    write(folder / "comparisons.csv", [head, *body, *([a, str(int(r) + 10), d] for a, r, d in body)])
+    after = turntable_of(folder).series
+    ratio = after.noise_sigma / before.noise_sigma
+    assert np.all(ratio < 0.85)
+    assert np.median(ratio) == pytest.approx(math.sqrt(0.5), rel=0.1)

@@ -1,0 +1,402 @@
+"""Measurements that cannot be used: each is told with file, line, column and remedy, exit code 2, and nothing is kept;
+tables that were spoilt at random; tables of a million rows.
+"""
+
+import csv
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from analysis.turntable.chauvenet import expected_rejections, normal_reduction, rejection_rate
+from analysis.turntable.dividing_error import CalibrationSeries
+from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test
+from scenes.specs.load import SCENES
+from scenes.yaml.errors import InputError
+from twin.lab import app
+from twin.laboratory.distortion_run import measure_files
+from twin.laboratory.measured_focus import align_measured
+from twin.laboratory.measured_readings import read_comparisons
+from twin.run.procedure import BenchError
+
+EXAMPLES = SCENES / "lab" / "measured"
+TABLE = {"turntable": "comparisons.csv", "distortion": "spots.csv", "focus": "mtf.csv"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    place = tmp_path / "measured"
+    shutil.copytree(EXAMPLES, place)
+    return place
+
+
+def edited(path: Path, change: Callable[[list[list[str]]], object]) -> None:
+    with path.open(newline="") as stream:
+        rows = list(csv.reader(stream))
+    change(rows)
+    with path.open("w", newline="") as stream:
+        csv.writer(stream).writerows(rows)
+
+
+def cell(line: int, head: str, value: str) -> Callable[[list[list[str]]], None]:
+    def change(rows: list[list[str]]) -> None:
+        rows[line - 1][rows[0].index(head)] = value
+
+    return change
+
+
+def head(old: str, new: str) -> Callable[[list[list[str]]], None]:
+    def change(rows: list[list[str]]) -> None:
+        rows[0][rows[0].index(old)] = new
+
+    return change
+
+
+def without(name: str) -> Callable[[list[list[str]]], None]:
+    def change(rows: list[list[str]]) -> None:
+        k = rows[0].index(name)
+        for row in rows:
+            del row[k]
+
+    return change
+
+
+def only(count: int) -> Callable[[list[list[str]]], None]:
+    return lambda rows: rows.__delitem__(slice(count + 1, None))
+
+
+def copied(line: int) -> Callable[[list[list[str]]], None]:
+    return lambda rows: rows.append(list(rows[line - 1]))
+
+
+def scaled(name: str, factor: float) -> Callable[[list[list[str]]], None]:
+    def change(rows: list[list[str]]) -> None:
+        k = rows[0].index(name)
+        for row in rows[1:]:
+            row[k] = repr(float(row[k]) * factor)
+
+    return change
+
+
+TABLES = [
+    ("turntable", head("reading [deg]", "reading"), ":1: reading: a head without a unit; allowed: 'reading [arcsec]'"),
+    ("turntable", head("reading [deg]", "reding [deg]"), "no such column; did you mean 'reading [arcsec]'?"),
+    ("turntable", head("reading [deg]", "reading [mm]"), ":1: reading [mm]: "),
+    ("turntable", without("difference [arcsec]"), "one column has to say what the reference read; found neither"),
+    ("turntable", cell(7, "difference [arcsec]", "0,3"), ":7: difference [arcsec]: not a number; found '0,3'"),
+    ("turntable", cell(9, "difference [arcsec]", ""), ":9: difference [arcsec]: not a number"),
+    ("turntable", cell(9, "difference [arcsec]", "nan"), ":9: difference [arcsec]: not a finite number"),
+    ("turntable", cell(5, "reading [deg]", "9200"), ":5: reading [deg]: out of range"),
+    ("turntable", cell(5, "reading [deg]", "92.25"), "one repeat only of this reading"),
+    ("turntable", cell(5, "repeat", "1.5"), ":5: repeat: not a whole number"),
+    ("turntable", copied(12), ":412: repeat: the same repeat twice, first in line 12"),
+    ("turntable", only(20), ":2: reading [deg]: too few different readings; found 2, allowed: 4 or more"),
+    ("turntable", only(0), "0 rows below the heads"),
+    ("turntable", scaled("difference [arcsec]", 3600.0), "the difference from the reference changes by"),
+    ("turntable", lambda rows: rows[5].append("1"), ":6: 4 cells under 3 heads"),
+    ("distortion", without("along [mm]"), "one column has to say where the spots are; found neither"),
+    (
+        "distortion",
+        lambda rows: [
+            head("along [mm]", "column")(rows),
+            head("sigma [um]", "column sigma")(rows),
+            head("fixed sigma [um]", "column fixed sigma")(rows),
+        ],
+        "allowed: line: {pitch: 7 um, middle: 6143.5}",
+    ),
+    ("distortion", head("sigma [um]", "column sigma"), "a sigma in pixels of places in lengths; allowed: 'sigma [um]'"),
+    ("distortion", without("point"), "sets of points that have no number; allowed: a column 'point' as well"),
+    ("distortion", cell(4, "sigma [um]", "-0.1"), ":4: sigma [um]: out of range; found '-0.1', allowed: at least 0"),
+    ("distortion", cell(4, "along [mm]", "inf"), ":4: along [mm]: not a finite number"),
+    ("distortion", cell(4, "set", "1"), ":4: set: the same set twice, first in line 2"),
+    ("distortion", cell(4, "set", "77"), ":4: set: a set of 1 points; allowed: 5 or more in every set"),
+    (
+        "distortion",
+        cell(4, "reading [deg]", "150"),
+        ":4: reading [deg]: outside of the calibrated readings; found 150 deg",
+    ),
+    ("distortion", scaled("along [mm]", -1.0), "angles and spot positions count in opposite senses"),
+    ("distortion", only(30), "too few points; found 3, allowed: 5 or more, over the whole field"),
+    ("distortion", cell(4, "point", "77"), ":4: point: one spot only of this point in a test of several sets"),
+    ("distortion", cell(3, "point", "x"), ":3: point: not a number"),
+    ("distortion", only(2), "2 rows below the heads"),
+    ("focus", head("shift [um]", "shift [arcsec]"), ":1: shift [arcsec]: "),
+    ("focus", without("sigma"), "no column 'sigma'"),
+    ("focus", cell(5, "sigma", "0"), ":5: sigma: out of range; found '0'"),
+    ("focus", cell(5, "mtf", "20"), ":5: mtf: out of range; found '20', allowed: -0.5 to 1.5"),
+    ("focus", cell(5, "edge", "allong"), ":5: edge: no such direction; did you mean 'along'?"),
+    ("focus", cell(5, "edge", "track"), None),
+    ("focus", cell(2, "x [mm]", "3"), "no row of the edge 'track', which other places have"),
+    ("focus", cell(5, "band", ""), ":5: band: an empty cell"),
+    ("focus", scaled("x [mm]", 0.0), "all places lie on X' = constant (the line CCD alone), so slope_x cannot be told"),
+    ("focus", only(9), "3 places cannot tell|1 places cannot tell"),
+    ("focus", scaled("shift [um]", 0.0), "no best focus of"),
+    ("focus", lambda rows: rows.__delitem__(slice(3, 9)), "no best focus of P"),
+    ("focus", only(4), "4 rows below the heads"),
+    ("focus", head("mtf", "MTF"), "no such column; did you mean 'mtf'?"),
+]
+
+
+@pytest.mark.parametrize(("command", "spoil", "told"), TABLES, ids=[f"{k}-{n}" for n, (k, _, _) in enumerate(TABLES)])
+def test_bad_tables(folder: Path, tmp_path: Path, command: str, spoil: Callable, told: str | None) -> None:
+    edited(folder / TABLE[command], spoil)
+    done = CliRunner().invoke(app, [command, str(folder / f"{command}.yaml"), "--out", str(tmp_path / "run")])
+    text = " ".join(done.output.split())
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    if told is None:  # odd, but nothing that a table could know
+        assert done.exit_code in (0, 2)
+        return
+    assert done.exit_code == 2, text
+    assert any(one in text for one in told.split("|")), text
+    assert TABLE[command] in text or f"{command}.yaml" in text
+    assert not (tmp_path / "run").exists()
+
+
+FILES = [
+    ("turntable", "comparisons: comparisons.csv", "comparisons: comparison.csv", "did you mean 'comparisons.csv'?"),
+    ("turntable", "reference: 0.015 arcsec", "reference: 0.015", "a number without a unit"),
+    ("turntable", "reference: 0.015 arcsec", "referenz: 0.015 arcsec", "did you mean 'reference'?"),
+    ("turntable", "held_out: held_out.csv", "held_out: spots.csv", "no such column"),
+    ("turntable", "folds: 10", "folds: 1", "folds"),
+    (
+        "distortion",
+        "zero: 102 deg",
+        "zero: 150 deg",
+        "measured.zero: outside of the calibrated readings; found '150 deg'",
+    ),
+    ("distortion", "  zero: 102 deg", "  angle_sigma: 1 arcsec\n  zero: 102 deg", "told in one way; found both"),
+    ("distortion", "focal_length: 5.51 m", "focal_length: 0 m", "focal_length"),
+    ("distortion", "held_out: held_out.csv", "held_out: measured", "no such file"),
+    ("focus", "moved: image", "moved: target", "how far the image moves with the target is not told; found 'target'"),
+    ("focus", "moved: image", "moved: images", "did you mean 'image'?"),
+    ("focus", "moved: image", "moved: image\n  per_shift: 0.08", "moved: target"),
+    ("focus", "  mtf: mtf.csv", "  mtf: mtf.csv\n  images: mtf.csv", "one table is needed; found both"),
+    ("focus", "  step: 5 um", "  step: 5 um\nshims: [5 mm, 5 mm]", "another number of shims than of holes; found 2"),
+    ("focus", "clearance: 1 mm", "clearance: 1 um", "would slide hole"),
+    ("focus", "thickness: 5 mm", "thickness: 10 um", "thicker shims|above|shims"),
+    ("focus", "    - [60 mm, -150 mm, -30 mm]\n    - [60 mm, 150 mm, -30 mm]\n", "", "holes"),
+]
+
+
+@pytest.mark.parametrize(("command", "old", "new", "told"), FILES, ids=[f"{f[0]}-{k}" for k, f in enumerate(FILES)])
+def test_bad_files(folder: Path, tmp_path: Path, command: str, old: str, new: str, told: str) -> None:
+    file = folder / f"{command}.yaml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    done = CliRunner().invoke(app, [command, str(file), "--out", str(tmp_path / "run")])
+    said = " ".join(done.output.split())
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    if command == "focus" and old.startswith("thickness"):
+        # these shims all become thicker: thin ones are no obstacle
+        assert done.exit_code in (0, 2)
+        return
+    assert done.exit_code == 2, said
+    assert any(one in said for one in told.split("|")), said
+    assert not (tmp_path / "run").exists()
+
+
+# --- images ----------------------------------------------------------------------------------------------
+
+
+def edge(defocus: float, direction: str, seed: int) -> np.ndarray:
+    """An edge blurred by a Gaussian that grows with defocus, made without the twin: 64 x 64, 12 bits, noise of 4 DN."""
+    v, u = np.mgrid[0:640, 0:640] / 10.0
+    across, along = (u, v) if direction == "along" else (v, u)
+    sharp = (across - 32.0 - np.tan(np.radians(5.0)) * (along - 32.0) > 0.0).astype(np.float32)
+    width = 10.0 * np.hypot(0.45, 0.004e6 * defocus)
+    wide = cv2.GaussianBlur(sharp, (0, 0), float(width), borderType=cv2.BORDER_REPLICATE)
+    image = 300.0 + 2500.0 * cv2.resize(wide, (64, 64), interpolation=cv2.INTER_AREA)
+    return np.uint16(image + np.random.default_rng(seed).normal(0.0, 4.0, (64, 64)))
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images through focus at four places, best focus 20 um upstream of the CCD at one end to 40 um at the other."""
+    folder = tmp_path_factory.mktemp("images")
+    rows = [["x [mm]", "y [mm]", "edge", "shift [um]", "file"]]
+    for n, (x, y) in enumerate(((0, -100), (0, 100), (20, -100), (20, 100))):
+        for way in ("along", "track"):
+            for k, shift in enumerate(np.linspace(-150.0, 90.0, 9)):
+                focus = -30.0e-6 - 1e-7 * y
+                name = f"{n}_{way}_{k}.tiff"
+                tifffile.imwrite(folder / name, edge(1e-6 * shift - focus, way, 100 * n + 10 * k + len(way)))
+                rows.append([str(x), str(y), way, f"{shift:.3f}", name])
+    with (folder / "images.csv").open("w", newline="") as stream:
+        csv.writer(stream).writerows(rows)
+    return folder
+
+
+@pytest.fixture
+def stack(folder: Path, images: Path) -> Path:
+    """The same beside a test's file, to spoil."""
+    shutil.copytree(images, folder, dirs_exist_ok=True)
+    text = (folder / "focus.yaml").read_text().replace("mtf: mtf.csv  ", "images: images.csv")
+    (folder / "focus.yaml").write_text(text)
+    return folder
+
+
+def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
+    run = align_measured(resolve_focus_test(stack / "focus.yaml").test)  # type: ignore[arg-type]
+    true = np.array([-20e-6, -40e-6, -20e-6, -40e-6])
+    by_place = {tuple(np.rint(1e3 * site.place)): k for k, site in enumerate(run.sites)}
+    order = [by_place[place] for place in ((0, -100), (0, 100), (20, -100), (20, 100))]
+    # a Gaussian's curve is even, its form another than a pupil's: half a micrometre is stated for that
+    sigma = np.hypot(run.defocus_sigma[order], run.spec.vertex_error)
+    assert np.all(np.abs(run.defocus[order] - true) < 4.0 * sigma)
+    sigma_y = float(np.sqrt(run.shimming.plane.covariance[2, 2])) + run.shimming.systematic[2]
+    assert abs(run.shimming.plane.slope_y - 1e-4) < 4.0 * sigma_y
+    assert sigma_y < 1e-5
+    assert not run.no_edge
+
+
+def more(*columns: tuple[str, str]) -> Callable[[Path], None]:
+    """Further columns of the table of images, every row with the same values."""
+
+    def change(rows: list[list[str]]) -> None:
+        for k, row in enumerate(rows):
+            row.extend(name if k == 0 else value for name, value in columns)
+
+    return lambda place: edited(place / "images.csv", change)
+
+
+REGION = ("row", "0"), ("column", "0"), ("height", "90"), ("width", "90")
+IMAGES = [
+    (lambda place: (place / "0_along_3.tiff").unlink(), "there is no image"),
+    (lambda place: (place / "0_along_3.tiff").write_bytes(b"II*\0" + bytes(20)), "has no pages"),
+    (lambda place: (place / "0_along_3.tiff").write_text("no image"), "cannot be read as an image"),
+    (lambda place: tifffile.imwrite(place / "0_along_3.tiff", np.zeros((64, 64, 3), np.uint8)), "3 colours"),
+    (more(("row", "0")), "part of a region only"),
+    (more(("page", "3")), "does not exist"),
+    (more(("page", "-1")), "page: out of range"),
+    (more(("per shift", "1")), "moved: target"),
+    (more(*REGION), "does not lie in the image"),
+    (lambda place: edited(place / "images.csv", without("file")), "no column 'file'"),
+    (lambda place: edited(place / "images.csv", cell(4, "file", "")), ":4: file: an empty cell"),
+    (lambda place: edited(place / "images.csv", cell(4, "file", "..")), "is a folder, not an image"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "told"), IMAGES, ids=[told.replace(" ", "-") for _, told in IMAGES])
+def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object], told: str) -> None:
+    spoil(stack)
+    done = CliRunner().invoke(app, ["focus", str(stack / "focus.yaml"), "--out", str(tmp_path / "run")])
+    text = " ".join(done.output.split())
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    assert done.exit_code == 2, text
+    assert told in text, text
+    assert "images.csv:" in text, text
+
+
+def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None:
+    test = resolve_focus_test(stack / "focus.yaml").test
+    before = align_measured(test)  # type: ignore[arg-type]
+    flat = np.random.default_rng(1).normal(1000.0, 4.0, (64, 64)).astype(np.uint16)
+    tifffile.imwrite(stack / "0_along_8.tiff", flat)
+    after = align_measured(test)  # type: ignore[arg-type]
+    (lost,) = after.no_edge
+    assert lost.line == 10
+    assert np.all(np.abs(after.defocus - before.defocus) < 3.0 * before.defocus_sigma)
+    for k in range(9):
+        tifffile.imwrite(stack / f"0_along_{k}.tiff", flat)
+    with pytest.raises(InputError, match="of its first image without an edge"):
+        align_measured(test)  # type: ignore[arg-type]
+
+
+# --- tables that were spoilt at random -------------------------------------------------------------------
+
+
+def spoilt(text: bytes, rng: np.random.Generator) -> bytes:
+    """A copy with a few bytes changed, cut out, doubled or cut off."""
+    data = bytearray(text)
+    for _ in range(int(rng.integers(1, 6))):
+        at = int(rng.integers(0, max(len(data), 1)))
+        match int(rng.integers(0, 5)):
+            case 0:
+                data[at : at + 1] = bytes([int(rng.integers(0, 256))])
+            case 1:
+                del data[at : at + int(rng.integers(1, 40))]
+            case 2:
+                data[at:at] = data[at : at + int(rng.integers(1, 200))]
+            case 3:
+                data[at:at] = [b",", b"\n", b'"', b"-", b"1e999", b"nan", b"\0", b"\xff", b";"][int(rng.integers(0, 9))]
+            case _:
+                del data[at:]
+    return bytes(data)
+
+
+def survives(folder: Path, command: str, count: int, seed: int) -> int:
+    """How many of so many spoilt tables are refused; others give results, nothing else happens."""
+    table = folder / TABLE[command]
+    good, rng, refused = table.read_bytes(), np.random.default_rng(seed), 0
+    for _ in range(count):
+        table.write_bytes(spoilt(good, rng))
+        try:
+            if command == "turntable":
+                read_comparisons(str(table), 1e-8)
+            elif command == "distortion":
+                measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
+            else:
+                align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
+        except (InputError, BenchError) as error:  # a command tells the second at its key
+            refused += isinstance(error, BenchError) or error.file.endswith((".csv", ".yaml"))
+    return refused
+
+
+@pytest.mark.parametrize("command", list(TABLE))
+def test_spoilt_tables(folder: Path, command: str) -> None:
+    assert survives(folder, command, 12, 1) > 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", list(TABLE))
+def test_many_spoilt_tables(folder: Path, command: str) -> None:
+    assert survives(folder, command, 1000, 2) > 200
+
+
+# --- size, and series of unequal length ------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_million_rows(folder: Path) -> None:
+    """The shipped tables, as often as makes a million rows; the limit is that of a slow machine."""
+    rng = np.random.default_rng(1)
+    angle = np.repeat(np.linspace(92.0, 112.0, 41), 24_400)
+    value = rng.normal(0.0, 0.02, angle.size)
+    with (folder / "comparisons.csv").open("w") as stream:
+        stream.write("reading [deg],difference [arcsec]\n")
+        stream.writelines(f"{a},{v}\n" for a, v in zip(angle.tolist(), value.tolist(), strict=True))
+    start = time.monotonic()
+    found = read_comparisons(str(folder / "comparisons.csv"), 1e-8)
+    assert time.monotonic() - start < 30.0
+    assert found.series.comparisons.shape == (41, 24_400)
+    assert found.series.repeatability == pytest.approx(0.02 * np.pi / 648000, rel=0.01)
+    head_, *body = (folder / "mtf.csv").read_text().splitlines()
+    (folder / "mtf.csv").write_text("\n".join([head_, *body * (1_000_000 // len(body) + 1)]) + "\n")
+    start = time.monotonic()
+    run = align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
+    assert time.monotonic() - start < 60.0
+    assert len(run.sites) == 25
+
+
+def test_series_of_unequal_length() -> None:
+    """The noise of all angles together is right whatever the numbers of repeats; 4000 of 3 to 12, 1% is 3 sigma."""
+    rng = np.random.default_rng(4)
+    counts = rng.integers(3, 13, 4000)
+    present = np.arange(12) < counts[:, None]
+    series = CalibrationSeries(
+        np.arange(4000.0), np.where(present, rng.normal(0.0, 2.0, present.shape), 7e3), present=present
+    )
+    assert series.repeatability == pytest.approx(2.0, rel=0.012)
+    assert not np.any(series.keep & ~present)
+    expected = expected_rejections(series.counts)
+    assert abs(series.rejected - expected) < 4.0 * np.sqrt(expected)
+    # of equal numbers it is what it was for one
+    assert normal_reduction(np.full(5, 10)) == normal_reduction(10)
+    assert expected_rejections(np.full(41, 10)) == rejection_rate(10) * 410

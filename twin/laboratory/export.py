@@ -1,0 +1,178 @@
+"""``--export DIR``: what a simulated bench leaves, written as files of measurements, with a test's file that reads them
+back.
+
+The files are exactly those that a real bench would fill: nothing of the truth is in them. Their numbers are in SI units
+with all digits, so that what is read back is the same to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from analysis.turntable.dividing_error import CalibrationSeries
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.camera_tests import (
+    DistortionFiles,
+    FocusFiles,
+    LevelSpec,
+    MeasuredDistortionSpec,
+    MeasuredFocusSpec,
+    NoiseSpec,
+)
+from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from scenes.yaml.spec import Spec
+from scenes.yaml.yaml_file import dump_yaml
+from twin.laboratory.distortion_run import SimulatedDistortion
+from twin.laboratory.focus_alignment import Alignment, State, recorder_of
+from twin.laboratory.turntable_run import SimulatedTurntable
+from twin.run.data_files import FrameFacts, csv_table, tiff
+
+__all__ = ["export_distortion", "export_focus", "export_turntable"]
+
+Files: TypeAlias = Mapping[str, str | bytes]
+"""Path in the folder -> contents."""
+COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
+"""Names of tables."""
+
+
+def export_turntable(run: SimulatedTurntable) -> Files:
+    """Comparisons, held-out comparisons and ``turntable.yaml``."""
+    spec = run.spec
+    out: dict[str, str | bytes] = {}
+    files = _turntable_files(out, spec, run.series, run.held_out)
+    test = MeasuredTurntableSpec.model_construct(
+        name="turntable", description=spec.description, measured=files, seed=run.model.seed
+    )
+    return {**out, "turntable.yaml": _text(test)}
+
+
+def export_distortion(run: SimulatedDistortion) -> Files:
+    """Spots with readings, the turntable's calibration, and ``distortion.yaml``."""
+    setup = run.setup
+    out: dict[str, str | bytes] = {}
+    turntable = _turntable_files(out, setup.turntable, run.calibration, run.table.held_out())
+    heads = ("point", "set", "reading [rad]", "along [m]", "sigma [m]", "fixed sigma [m]")
+    reading, spots = run.reading, run.spots
+    rows = (
+        (
+            i + 1,
+            s + 1,
+            float(reading[i, s]),
+            float(spots.position[i, s]),
+            float(spots.temporal[i, s]),
+            float(spots.fixed[i, s]),
+        )
+        for i, s in np.ndindex(*reading.shape)
+    )
+    out[SPOTS] = csv_table([heads, *rows])
+    files = DistortionFiles.model_construct(
+        spots=SPOTS, zero=setup.turntable.camera_angle, turntable=turntable, line=None, angle_sigma=None, reversed=False
+    )
+    test = MeasuredDistortionSpec.model_construct(
+        name="distortion",
+        description=setup.test.description,
+        focal_length=run.bench.path.model.line_focal_length,
+        measured=files,
+        seed=run.seed,
+    )
+    return {**out, "distortion.yaml": _text(test)}
+
+
+def export_focus(run: Alignment) -> Files:
+    """Every standing of the assembly, before and after each round: frames of all edges, a table of them and of their
+    MTF, and a test's file for each table.
+    """
+    mount = run.bench.setup.test.mount
+    out: dict[str, str | bytes] = {}
+    shims = tuple(mount.thickness for _ in mount.holes)
+    for number, state in enumerate(run.states):
+        stem = "before" if number == 0 else f"round_{number}"
+        for name, rows in zip(("images", "mtf"), _focus_tables(run, state, number, stem, out), strict=True):
+            table = f"{stem}_{name}.csv"
+            out[table] = csv_table(rows)
+            out[f"focus_{stem}_{name}.yaml"] = _text(_focus_test(run, state, {name: table}, shims))
+        if number < len(run.shimmings):
+            thickness = run.shimmings[number].plan.thickness
+            assert thickness is not None
+            shims = tuple(float(one) for one in thickness)
+    return out
+
+
+def _focus_tables(
+    run: Alignment, state: State, number: int, stem: str, out: dict[str, str | bytes]
+) -> tuple[list[Sequence[Any]], list[Sequence[Any]]]:
+    """Tables of images and of MTF values; the images are put into ``out``."""
+    bench = run.bench
+    recorder = recorder_of(bench, state.standing, run.seed, number)
+    where = ("band", "x [m]", "y [m]", "edge", "shift [m]")
+    images: list[Sequence[Any]] = [(*where, "file")]
+    values: list[Sequence[Any]] = [(*where, "mtf", "sigma")]
+    for i, (site, scan) in enumerate(zip(bench.sites, state.scans, strict=True)):
+        field = bench.setup.test.fields.index(site.field) + 1
+        facts = FrameFacts(f"{bench.setup.camera.name}, line CCD {site.band}", bench.ccds[site.band].band.pitch)
+        x, y = (float(v) for v in site.place)
+        for edge, shift in scan.shift.items():
+            for k, at in enumerate(scan.target):
+                place = (site.band, x, y, edge, float(shift[k]))
+                file = f"{stem}/{site.band}_field{field}_{edge}_{k + 1:02d}.tiff"
+                out[file] = tiff(recorder.frames(i, edge, float(at), scan.take + k), facts)
+                images.append((*place, file))
+                # where no edge was measured there is no value
+                if np.isfinite(scan.sigma[edge][k]):
+                    values.append((*place, float(scan.mtf[edge][k]), float(scan.sigma[edge][k])))
+    return images, values
+
+
+def _focus_test(run: Alignment, state: State, table: dict[str, str], shims: tuple[float, ...]) -> MeasuredFocusSpec:
+    noise = {}
+    for name, ccd in run.bench.ccds.items():
+        # noise beyond EMVA 1288's model has no place in the file: it is then estimated from the images
+        if not ccd.noise.further:
+            numbers: dict[str, Any] = {field: float(getattr(ccd.noise, field)) for field in NoiseSpec.model_fields}
+            noise[name] = NoiseSpec.model_construct(**numbers)
+    given: dict[str, Any] = {"mtf": None, "images": None, **table}
+    files = FocusFiles.model_construct(
+        **given,
+        moved="image",
+        per_shift=None,
+        frequency=0.5,
+        noise=FrozenMap(noise if "images" in table else {}),
+        level=LevelSpec.model_construct(angle=state.level.angle, sigma=state.level.sigma),
+    )
+    return MeasuredFocusSpec.model_construct(
+        name="focus",
+        description=run.bench.setup.test.description,
+        measured=files,
+        mount=run.bench.setup.test.mount,
+        shims=shims,
+        vertex_error=MeasuredFocusSpec.model_fields["vertex_error"].default,
+        vertex_trend=MeasuredFocusSpec.model_fields["vertex_trend"].default,
+        seed=run.seed,
+    )
+
+
+def _turntable_files(
+    out: dict[str, str | bytes], spec: TurntableTestSpec, series: CalibrationSeries, held_out: CalibrationSeries
+) -> TurntableFiles:
+    """Both tables are put into ``out``."""
+    for name, one in ((COMPARISONS, series), (HELD_OUT, held_out)):
+        out[name] = csv_table(_comparisons(one))
+    return TurntableFiles.model_construct(
+        comparisons=COMPARISONS,
+        held_out=HELD_OUT,
+        reference=spec.reference.calibration,
+        folds=spec.calibration.folds,
+    )
+
+
+def _comparisons(series: CalibrationSeries) -> Iterator[Sequence[Any]]:
+    yield "reading [rad]", "repeat", "difference [rad]"
+    for angle, row in zip(series.angle, series.comparisons, strict=True):
+        yield from ((float(angle), k + 1, float(value)) for k, value in enumerate(row))
+
+
+def _text(test: Spec) -> str:
+    return dump_yaml(test.plain())

@@ -1,0 +1,399 @@
+"""Measured readings of a turntable, and spots of a camera on it, from tables to what the analysis takes.
+
+Rows are sorted before anything is computed, so that their order in a file changes no bit of a result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.orientation.measurement import CALIBRATED, Spots
+from analysis.turntable.dividing_error import CalibrationSeries
+from scenes.specs.camera_tests import DistortionFiles
+from scenes.specs.turntable_test import TurntableFiles
+from scenes.yaml.csv_table import Column, Table, read_table
+from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.units import ANGLE, LENGTH
+
+__all__ = ["Comparisons", "DataFile", "SpotReadings", "read_comparisons", "read_spots", "read_turntable"]
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+MOST_ANGLES = 3000
+"""Different angles of a series: the fits have matrices of this many rows and columns."""
+MOST_CELLS = 30_000_000
+"""Angles times the largest number of repeats."""
+SAME_READING = 1e-9
+"""Radians, 0.0002 arcsec: readings nearer than this are repeats of one."""
+MOST_ERROR = np.radians(1.0)
+"""By how much the difference from the reference may change over the region: no dividing error is as large."""
+CIRCLE = 2.0 * np.pi
+READING = Column("reading", ANGLE, least=-2.0 * CIRCLE, most=2.0 * CIRCLE)
+COMPARISON_COLUMNS = (
+    READING,
+    Column("difference", ANGLE, needed=False),
+    Column("reference", ANGLE, needed=False),
+    Column("position", needed=False, whole=True, least=-1e9, most=1e9),
+    Column("repeat", needed=False, whole=True, least=-1e9, most=1e9),
+)
+SPOT_COLUMNS = (
+    READING,
+    Column("along", LENGTH, needed=False),
+    Column("column", needed=False),
+    Column("sigma", LENGTH, needed=False, least=0.0),
+    Column("fixed sigma", LENGTH, needed=False, least=0.0),
+    Column("column sigma", needed=False, least=0.0),
+    Column("column fixed sigma", needed=False, least=0.0),
+    Column("across", LENGTH, needed=False),
+    Column("point", needed=False, whole=True, least=-1e9, most=1e9),
+    Column("set", needed=False, whole=True, least=-1e9, most=1e9),
+)
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """A file that was read: its path, rows and SHA-256, so that a result can be held against its data."""
+
+    file: str
+    rows: int
+    sha256: str
+
+    @classmethod
+    def of(cls, table: Table) -> DataFile:
+        """Of a table."""
+        with Path(table.file).open("rb") as stream:
+            return cls(table.file, len(table), hashlib.file_digest(stream, "sha256").hexdigest())
+
+
+@dataclass(frozen=True, eq=False)
+class Comparisons:
+    """A measured series.
+
+    Attributes:
+        series: for the analysis.
+        lines: of each comparison in the file, (N, repeats); 0 where none was made.
+        file: they stand in.
+        head: of its readings.
+    """
+
+    series: CalibrationSeries
+    lines: Places
+    file: DataFile
+    head: str
+
+
+@dataclass(frozen=True, eq=False)
+class SpotReadings:
+    """Measured spots: N points, S sets.
+
+    Attributes:
+        reading: of the turntable, (N, S), radians.
+        spots: on the line.
+        present: which were measured, (N, S); None for all.
+        across: of the spots across the line, (N, S), metres; None if the table has no such column.
+        lines: in the file, (N, S); 0 where nothing was measured.
+        file: they stand in.
+        head: of its readings.
+    """
+
+    reading: Array
+    spots: Spots
+    present: NDArray[np.bool_] | None
+    across: Array | None
+    lines: Places
+    file: DataFile
+    head: str
+
+
+def read_turntable(files: TurntableFiles) -> tuple[Comparisons, Comparisons | None]:
+    """The calibration of a turntable, and the series at held-out readings if there is one.
+
+    Raises:
+        InputError: a table that cannot be used, with file, line and column.
+    """
+    series = read_comparisons(files.comparisons, files.reference)
+    if files.held_out is None:
+        return series, None
+    held_out = read_comparisons(files.held_out, files.reference, fewest=1)
+    first, last = series.series.angle[[0, -1]]
+    beyond = (held_out.series.angle < first) | (held_out.series.angle > last)
+    if np.any(beyond):
+        k = int(np.argmax(beyond))
+        found = f"{np.degrees(held_out.series.angle[k]):.9g} deg"
+        allowed = f"{np.degrees(first):.9g} to {np.degrees(last):.9g} deg, as {files.comparisons} has it"
+        line = int(held_out.lines[k].max())
+        issue = Issue(
+            "a held-out reading beyond the calibrated ones", held_out.file.file, line, (held_out.head,), found, allowed
+        )
+        raise InputError(issue)
+    return series, held_out
+
+
+def read_comparisons(path: str, reference_sigma: float, fewest: int = 4) -> Comparisons:
+    """A table of comparisons of a turntable with a reference.
+
+    Args:
+        path: of the CSV file.
+        reference_sigma: of the reference's certificate, radians.
+        fewest: different angles.
+
+    Raises:
+        InputError: with file, line and column.
+    """
+    table = read_table(path, COMPARISON_COLUMNS, 2)
+    if ("difference" in table) is ("reference" in table):
+        found = "neither" if "difference" not in table else "both"
+        allowed = "'difference [arcsec]', reading minus reference, or 'reference [deg]'"
+        raise InputError(Issue("one column has to say what the reference read", path, 1, (), found, allowed))
+    reading = table["reading"]
+    if "difference" in table:
+        value = table["difference"]
+    else:
+        value = reading - table["reference"]
+        # whole turns only, so that the order of rows changes no bit
+        value = value - CIRCLE * (np.rint((value - value[0]) / CIRCLE) + np.rint(value[0] / CIRCLE))
+    group = _groups(table)
+    # repeats by their number; else by their value, so that the order of rows does not matter
+    order = np.lexsort((value, table["repeat"] if "repeat" in table else value, group))
+    cells = _Cells(table, group[order], order)
+    if "repeat" in table:
+        cells.refuse_twice(table["repeat"], "repeat")
+    angle = cells.centre(reading)
+    _check_angles(cells, angle, path, fewest)
+    _check_positions(cells, reading, angle)
+    few = cells.count < 2
+    if np.any(few):
+        row = int(cells.first[int(np.argmax(few))])
+        text = "one repeat only of this reading, which does not tell its noise"
+        remedy = (
+            "2 or more of each, 5 for Chauvenet's criterion to reject any; where the table does not come back to the"
+        )
+        raise table.error(
+            row, "reading", text, allowed=f"{remedy} same reading, a column 'position' that numbers the stops"
+        )
+    matrix = cells.matrix(value)
+    present = cells.present
+    mean = np.sum(matrix, axis=1) / cells.count
+    if np.ptp(mean) > MOST_ERROR:
+        worst = int(np.argmax(np.abs(mean - np.median(mean))))
+        name = "difference" if "difference" in table else "reference"
+        text = f"the difference from the reference changes by {np.degrees(np.ptp(mean)):.3g} deg over the region"
+        remedy = "less than 1 deg: reading minus reference, both counted in the same sense and in the unit of the head"
+        raise table.error(int(cells.first[worst]), name, text, allowed=remedy)
+    series = CalibrationSeries(angle, matrix, reference_sigma, present=None if np.all(present) else present)
+    return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table), table.heads[READING.name])
+
+
+def read_spots(files: DistortionFiles) -> SpotReadings:
+    """A table of readings and spots.
+
+    Args:
+        files: the section of the test's file.
+
+    Raises:
+        InputError: with file, line and column.
+    """
+    table = read_table(files.spots, SPOT_COLUMNS, len(CALIBRATED))
+    where, sigma, fixed = _places(table, files)
+    numbered = "point" in table
+    if "set" in table and not numbered:
+        raise InputError(
+            Issue("sets of points that have no number", files.spots, 1, allowed="a column 'point' as well")
+        )
+    reading = table["reading"]
+    group = (
+        np.unique(table["point"], return_inverse=True)[1]
+        if numbered
+        else np.argsort(np.argsort(reading, kind="stable"))
+    )
+    sets = table["set"] if "set" in table else np.zeros(len(table))
+    order = np.lexsort((where, reading, sets, group))
+    cells = _Cells(table, group[order], order)
+    if "set" in table:
+        cells.refuse_twice(sets, "set")
+        slot = np.unique(sets[order], return_inverse=True)[1]
+    else:
+        slot = cells.slot
+    cells = cells.at(slot)
+    _few_points(table, cells, sets if "set" in table else None)
+    present = cells.present
+    alone = cells.count < 2
+    if present.shape[1] > 1 and np.any(alone):
+        row = int(cells.first[int(np.argmax(alone))])
+        text = "one spot only of this point in a test of several sets"
+        raise table.error(row, "point", text, allowed="2 or more of each, 5 for Chauvenet's criterion to reject any")
+    # what was not measured gets a value of its own point, which no mean takes
+    filled = {name: cells.matrix(value, None) for name, value in (("reading", reading), ("where", where))}
+    spots = Spots(filled["where"], cells.matrix(sigma), cells.matrix(fixed), np.zeros(present.shape))
+    if present.shape[1] == 1 and sigma is not None and not np.all(sigma > 0.0) and files.turntable is None:
+        row = int(np.argmin(sigma))
+        name = "sigma" if "along" in table else "column sigma"
+        text = "one set of points without sigmas, which does not tell their noise"
+        shown = name if name in table else ""
+        raise table.error(row, shown, text, allowed=f"a column '{name}' above zero, or two sets or more")
+    # points in the order of their readings
+    rank = np.argsort(np.mean(filled["reading"], axis=1), kind="stable")
+    spots = Spots(spots.position[rank], spots.temporal[rank], spots.fixed[rank], spots.row[rank])
+    across = cells.matrix(table["across"], None)[rank] if "across" in table else None
+    lines = cells.matrix(table.lines, 0)[rank]
+    whole = None if np.all(present) else present[rank]
+    return SpotReadings(
+        filled["reading"][rank], spots, whole, across, lines, DataFile.of(table), table.heads[READING.name]
+    )
+
+
+def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
+    """Places on the line and their sigmas, new in each exposure and fixed, (rows,), metres."""
+    if ("along" in table) is ("column" in table):
+        found = "neither" if "along" not in table else "both"
+        allowed = "'along [mm]' from the line's middle, or 'column' with `line:` in the test's file"
+        raise InputError(Issue("one column has to say where the spots are", files.spots, 1, (), found, allowed))
+    none = np.zeros(len(table))
+    if "along" in table:
+        odd = next((n for n in ("column sigma", "column fixed sigma") if n in table), None)
+        if odd is not None:
+            raise table.error(0, odd, "a sigma in pixels of places in lengths", allowed=f"'{odd[7:]} [um]'")
+        return table["along"], table.columns.get("sigma", none), table.columns.get("fixed sigma", none)
+    odd = next((n for n in ("sigma", "fixed sigma") if n in table), None)
+    if odd is not None:
+        raise table.error(0, odd, "a sigma in lengths of places in pixels", allowed=f"'column {odd}'")
+    if files.line is None:
+        allowed = "line: {pitch: 7 um, middle: 6143.5}"
+        raise files.error("places in pixels need the line's pixels", ("spots",), found="column", allowed=allowed)
+    pitch = files.line.pitch
+    own, fixed = (table.columns.get(n, none) for n in ("column sigma", "column fixed sigma"))
+    return (table["column"] - files.line.middle) * pitch, own * pitch, fixed * pitch
+
+
+def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
+    """InputError unless there are points enough, in all and in each set, and not more than fit into memory."""
+    count, need = len(cells.count), len(CALIBRATED) + 2
+    if count < need or count > MOST_ANGLES:
+        few = "too few points" if count < need else "too many points"
+        remedy = (
+            f"{need} or more, over the whole field" if count < need else f"at most {MOST_ANGLES}; 'point' numbers them"
+        )
+        raise InputError(Issue(few, table.file, int(table.lines[0]), (), str(count), remedy))
+    own = cells.present.sum(axis=0)
+    if np.min(own) < need:
+        k = int(np.argmin(own))
+        row = int(np.flatnonzero(cells.slot == k)[0])
+        row = int(cells.order[row])
+        name = "point" if sets is None else "set"
+        text = f"a set of {own[k]} points"
+        raise table.error(row, name if name in table else "", text, allowed=f"{need} or more in every set")
+
+
+def _groups(table: Table) -> Places:
+    """Number of the angle that each row belongs to, (rows,)."""
+    if "position" in table:
+        _, group = np.unique(table["position"], return_inverse=True)
+        return np.asarray(group, np.int64)
+    reading = table["reading"]
+    order = np.argsort(reading, kind="stable")
+    new = np.concatenate([[0], np.cumsum(np.diff(reading[order]) > SAME_READING)])
+    group = np.empty(len(reading), np.int64)
+    group[order] = new
+    return group
+
+
+class _Cells:
+    """Rows of a table, sorted, as a matrix of groups and their members.
+
+    Args:
+        table: with the rows.
+        group: of the sorted rows, (rows,), not falling.
+        order: row of the table of each sorted row, (rows,).
+        slot: place of each sorted row among the columns; by default members of a group one after the other.
+    """
+
+    def __init__(self, table: Table, group: Places, order: Places, slot: Places | None = None) -> None:
+        self.table, self.order = table, order
+        _, start, self.group, self.count = np.unique(group, return_index=True, return_inverse=True, return_counts=True)
+        self.first = order[start]
+        self.slot = np.arange(len(order)) - start[self.group] if slot is None else slot
+        width = int(self.slot.max()) + 1
+        if len(self.count) * width > MOST_CELLS:
+            text = f"{len(self.count)} angles with up to {width} repeats each"
+            raise InputError(Issue("too many to hold", table.file, int(table.lines[0]), (), text, "fewer repeats"))
+        self.present = np.zeros((len(self.count), width), bool)
+        self.present[self.group, self.slot] = True
+
+    def at(self, slot: Places) -> _Cells:
+        """The same with other places among the columns."""
+        return _Cells(self.table, self.group, self.order, slot)
+
+    def matrix(self, value: Array | Places, empty: float | None = 0.0) -> np.ndarray:
+        """Values of the table's rows as a matrix; what is empty gets that value, None for the first of its group."""
+        start = (
+            np.asarray(value)[self.first] if empty is None else np.full(len(self.count), empty, np.asarray(value).dtype)
+        )
+        out = np.repeat(start[:, None], self.present.shape[1], axis=1)
+        out[self.group, self.slot] = np.asarray(value)[self.order]
+        return out
+
+    def centre(self, value: Array) -> Array:
+        """Mean of every group, (N,); exactly the value where all are the same."""
+        least, most = (np.full(len(self.count), side) for side in (np.inf, -np.inf))
+        np.minimum.at(least, self.group, value[self.order])
+        np.maximum.at(most, self.group, value[self.order])
+        mean = np.bincount(self.group, value[self.order]) / self.count
+        return np.where(least == most, least, mean)
+
+    def refuse_twice(self, number: Array, name: str) -> None:
+        """InputError where two rows of a group have the same number."""
+        own = number[self.order]
+        same = (np.diff(self.group) == 0) & (np.diff(own) == 0)
+        if np.any(same):
+            k = int(np.argmax(same))
+            first, again = sorted((int(self.order[k]), int(self.order[k + 1])))
+            text = f"the same {name} twice, first in line {self.table.lines[first]}"
+            raise self.table.error(again, name, text, f"{own[k]:g}", "every number once for each angle")
+
+
+def _check_angles(cells: _Cells, angle: Array, path: str, fewest: int) -> None:
+    count = len(angle)
+    if count < fewest:
+        remedy = f"{fewest} or more; where the table does not come back to the same reading, a column 'position'"
+        raise InputError(
+            Issue(
+                "too few different readings",
+                path,
+                int(cells.table.lines[0]),
+                (cells.table.heads[READING.name],),
+                str(count),
+                remedy,
+            )
+        )
+    if count > MOST_ANGLES:
+        remedy = f"at most {MOST_ANGLES}; a column 'position' numbers the stops of the table"
+        raise InputError(
+            Issue(
+                "too many different readings",
+                path,
+                int(cells.table.lines[0]),
+                (cells.table.heads[READING.name],),
+                str(count),
+                remedy,
+            )
+        )
+
+
+def _check_positions(cells: _Cells, reading: Array, angle: Array) -> None:
+    """InputError unless readings of one position lie nearer to it than half way to the next."""
+    if "position" not in cells.table or len(angle) < 2:
+        return
+    rank = np.sort(angle)
+    at = np.searchsorted(rank, angle)
+    gap = np.diff(rank)
+    room = 0.5 * np.minimum(np.concatenate([[np.inf], gap])[at], np.concatenate([gap, [np.inf]])[at])
+    off = np.abs(reading[cells.order] - angle[cells.group]) > room[cells.group]
+    if np.any(off):
+        row = int(cells.order[int(np.argmax(off))])
+        text = "a reading that is nearer to those of another position"
+        raise cells.table.error(row, "reading", text, allowed="the position's own number in this row")
