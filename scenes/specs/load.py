@@ -15,9 +15,9 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measured.orbit_data import MeasuredTestSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_measured import MeasuredTestSpec
 from scenes.specs.orbit_scene import LineImageSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
