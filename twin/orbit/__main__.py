@@ -12,7 +12,8 @@ from typing import Any
 
 import typer
 
-from scenes.specs.orbit_setup import resolve_angle, resolve_any_calibration, resolve_monitor, resolve_simulate
+from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
+from scenes.specs.orbit_setup import resolve_angle, resolve_monitor, resolve_simulate
 from twin.orbit.orbit_tests import ORBIT_TESTS
 from twin.run.command import add_test
 

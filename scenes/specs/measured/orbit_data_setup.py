@@ -14,6 +14,7 @@ from scenes.specs.measured.orbit_data import (
     OrbitDataSpec,
     PassFilesSpec,
 )
+from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import Problem
@@ -89,6 +90,15 @@ def resolve_measured_calibration(path: str | Path) -> MeasuredCalibrationSetup:
             suggestion=problem.suggestion,
         ) from None
     return setup
+
+
+AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
+"""On a simulation, or on measurements."""
+
+
+def resolve_any_calibration(path: str | Path) -> AnyCalibration:
+    """As `resolve_calibration`, or `resolve_measured_calibration` for a file that names measurements."""
+    return resolve_measured_calibration(path) if is_measured(path) else resolve_calibration(path)
 
 
 def resolve_measured_angle(path: str | Path) -> MeasuredAngleSetup:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
+from scenes.specs.measured.orbit_data_setup import AnyCalibration, MeasuredCalibrationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.calibration.calibration_run import CalibrationRun
+from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.measured.measurement_files import CAMERA_FILE, campaign_files
 
 TEST_FILE = "calibrate.yaml"
@@ -15,14 +16,18 @@ TEST_FILE = "calibrate.yaml"
 
 def exported(run: CalibrationRun) -> dict[str, str]:
     """Path -> text of the files. Points that screening left out are in them, as they were measured."""
-    passes = [one.measurements for one in run.campaign.passes]
-    files = campaign_files(passes, run.setup.camera.plain())
-    return files | {TEST_FILE: dump_yaml(_test(run))}
+    return files_of(run.setup, run.campaign)
 
 
-def _test(run: CalibrationRun) -> dict[str, Any]:
+def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
+    """As `exported`, of a campaign that is not calibrated yet."""
+    files = campaign_files([one.measurements for one in campaign.passes], setup.camera.plain())
+    return files | {TEST_FILE: dump_yaml(_test(setup))}
+
+
+def _test(setup: AnyCalibration) -> dict[str, Any]:
     """The test file: the same schemes, sigmas of readings, effects and limits."""
-    setup, spec = run.setup, run.setup.test
+    spec = setup.test
     plain: Mapping[str, Any] = spec.plain()
     given = plain["errors"]
     common = {

@@ -34,7 +34,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import AnyCalibration
+    from scenes.specs.measured.orbit_data_setup import AnyCalibration
 
 _EVEN = 1e-3
 """Of their interval, by which times of readings may be uneven."""
