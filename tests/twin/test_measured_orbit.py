@@ -16,14 +16,17 @@ import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import body_axes_matrix
+from scenes.specs.measured.orbit_data_setup import resolve_measured_angle
 from scenes.specs.orbit_angle import EffectsSpec
 from scenes.specs.orbit_setup import resolve_calibration
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
+from twin.orbit.angle.measured_angle import run_measured_angle
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import schemes_tested
-from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.line_camera import along_track_angle, line_cameras
+from twin.orbit.flight.payload_changes import changed_payload
 
 run = partial(invoke, command.app)
 TIGHT = 1e-9
@@ -494,3 +497,53 @@ def test_look_angles_are_another_way_to_know_the_same_line(campaign, files) -> N
     free = sigma > 0.0
     # distortion now counts from the laboratory's principal point and grows with f: 0.04 /m^2 x (39 mm)^2 of the changes
     assert np.abs((before.values - after.values)[free] / sigma[free]).max() < 0.05
+
+
+def angle_file(folder, **changes):
+    """A test of intersection angles on exported files."""
+    errors = read_yaml(folder / "calibrate.yaml").data["errors"]
+    data = {"name": "angle", "camera": "./camera.yaml", "data": ".", "errors": errors, **changes}
+    (folder / "angle.yaml").write_text(dump_yaml(data))
+    return folder / "angle.yaml"
+
+
+def no_thermal() -> dict:
+    """Biases that do not drift during a pass, which no sigma of an angle holds."""
+    tracker = WHOLE.test.errors.star_tracker
+    still = tracker.model_copy(update={"thermal": type(tracker.thermal)()})
+    return {"errors": WHOLE.test.errors.model_copy(update={"star_tracker": still})}
+
+
+def test_intersection_angles_of_measured_passes(tmp_path) -> None:
+    """Four campaigns of two passes: alpha and beta against the true camera, whose principal points have moved by 60 um
+    or 19 arcsec; within the sigmas, false alarm 1e-6 to either side. Readings are shared, so that sigmas are a bound."""
+    z = []
+    for seed in range(4):
+        setup = small(**no_thermal())
+        file = export(tmp_path / str(seed), setup, flown(setup, seed))
+        found = run_measured_angle(resolve_measured_angle(angle_file(file.parent)), None, 0)
+        true = line_cameras(changed_payload(setup.test, setup.camera))
+        for one in found.passes:
+            truth = np.array([along_track_angle(true[a], true[b]) for a, b in one.pairs.values()])
+            along = one.estimate.along
+            assert np.abs(truth - one.along_track).min() > 15.0 * np.pi / 648000
+            z.append((along.values - truth) / along.sigma)
+    square = float(np.sum(np.square(z)))
+    assert chi2.sf(square, np.size(z)) > 1e-6
+    assert chi2.cdf(square, np.size(z)) > 1e-6
+
+
+def test_the_angle_command_on_measurements(files) -> None:
+    """Other time, other angles; numbers in angle.json; a line without points is refused by its key."""
+    folder = files.parent
+    file = angle_file(folder, angles={"wide": ["forward", "aft"]}, time="1 s")
+    result = run("angle", file, "--out", folder / "run", "--quiet")
+    assert result.exit_code == 0, result.output
+    numbers = json.loads((folder / "run/angle.json").read_text())["measured"]["Beijing"]
+    assert numbers["time_s"] == 1.0
+    assert numbers["points"] == {"forward": 44, "aft": 44}
+    assert numbers["along_track"]["wide_deg"] == pytest.approx(49.98, abs=0.02)
+    assert 0.05 < numbers["along_track"]["wide_sigma_arcsec"] < 1.0
+    refused = run("angle", angle_file(folder, angles={"wide": ["forward", "multispectral"]}), "--out", folder / "no")
+    assert refused.exit_code == 2
+    assert "angles.wide" in refused.stderr

@@ -12,8 +12,8 @@ from typing import Any
 
 import typer
 
-from scenes.specs.measured.orbit_data_setup import resolve_any_calibration
-from scenes.specs.orbit_setup import resolve_angle, resolve_monitor, resolve_simulate
+from scenes.specs.measured.orbit_data_setup import resolve_any_angle, resolve_any_calibration
+from scenes.specs.orbit_setup import resolve_monitor, resolve_simulate
 from twin.orbit.orbit_tests import ORBIT_TESTS
 from twin.run.command import add_test
 
@@ -49,10 +49,13 @@ add_test(
     app,
     PROGRAM,
     "angle",
-    resolve_angle,
+    resolve_any_angle,
     ORBIT_TESTS["angle"],
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
+
+    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
+    against those of the laboratory.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points.
