@@ -516,7 +516,7 @@ def no_thermal() -> dict:
 
 def test_intersection_angles_of_measured_passes(tmp_path) -> None:
     """Four campaigns of two passes: alpha and beta against the true camera, whose principal points have moved by 60 um
-    or 19 arcsec; within the sigmas, false alarm 1e-6 to either side. Readings are shared, so that sigmas are a bound."""
+    or 19 arcsec; within the sigmas, false alarm 1e-6 to either side."""
     z = []
     for seed in range(4):
         setup = small(**no_thermal())

@@ -20,6 +20,13 @@ from twin.run.command import add_test
 PROGRAM = "twin.orbit"
 
 
+def simulation_export(run: Any) -> Mapping[str, str]:
+    """What was measured in simulated images, as files."""
+    from twin.orbit.calibration.calibration_export import simulation_exported
+
+    return simulation_exported(run)
+
+
 def calibration_export(run: Any) -> Mapping[str, str]:
     """What a calibration measured, as files."""
     from twin.orbit.calibration.calibration_export import exported
@@ -110,10 +117,12 @@ add_test(
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 
     simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
-    truth knows is in artefacts/truth.json.
+    truth knows is in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
+    reads.
 
     Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
     """,
+    simulation_export,
 )
 
 
