@@ -23,7 +23,7 @@ from rich.console import Console
 
 from optics.numerics.backend import BackendUnavailable
 from optics.numerics.llvm import LibraryMissing
-from scenes.file_kinds import FILE_KINDS
+from scenes.kinds.file_kinds import FILE_KINDS
 from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
 from scenes.specs.load import INSTRUMENTS, library_names

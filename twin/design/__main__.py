@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from optics.numerics.threads import cores
-from scenes.file_kinds import kind_of
+from scenes.kinds.file_kinds import kind_of
 from scenes.models.camera_design import resolve_design
 from scenes.models.monitor_layout import resolve_monitor_design
 from scenes.yaml.errors import InputError

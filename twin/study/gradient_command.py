@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from scenes.file_kinds import read_for
+from scenes.kinds.file_kinds import read_for
 from scenes.models.camera_sharpness import blur_warnings
 from twin.run.cli import InputErrorText, Options, print_verdict, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings, run_command
