@@ -7,12 +7,14 @@ if __name__ == "__main__":
 
     end_quietly()
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+from scenes.specs.measured.orbit_data_setup import resolve_any_angle, resolve_any_calibration
+from scenes.specs.orbit_setup import resolve_monitor, resolve_simulate
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import DISTANCE, parse_quantity
 from twin.orbit.orbit_tests import ORBIT_TESTS
@@ -24,6 +26,21 @@ if TYPE_CHECKING:
     from twin.orbit.export.export_run import ExportSource
 
 PROGRAM = "twin.orbit"
+
+
+def simulation_export(run: Any) -> Mapping[str, str]:
+    """What was measured in simulated images, as files."""
+    from twin.orbit.calibration.calibration_export import simulation_exported
+
+    return simulation_exported(run)
+
+
+def calibration_export(run: Any) -> Mapping[str, str]:
+    """What a calibration measured, as files."""
+    from twin.orbit.calibration.calibration_export import exported
+
+    return exported(run)
+
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
@@ -47,10 +64,13 @@ add_test(
     app,
     PROGRAM,
     "angle",
-    resolve_angle,
+    resolve_any_angle,
     ORBIT_TESTS["angle"],
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
+
+    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
+    against those of the laboratory.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points.
@@ -63,16 +83,20 @@ add_test(
     app,
     PROGRAM,
     "calibrate",
-    resolve_calibration,
+    resolve_any_calibration,
     ORBIT_TESTS["calibrate"],
     """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
-    parameters tested on all fields without ground control (paper 003).
+    parameters tested on all fields without ground control (paper 003); simulated, or on measured passes.
+
+    A file with `data: DIR` runs on the measurements of that folder: orbit, attitude, line times, ground and image
+    points. `--export DIR` writes such a folder of what the run measured, with a test file calibrate.yaml.
 
     calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
     plan and height of every field before calibration and by each scheme.
 
     Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
     """,
+    calibration_export,
 )
 
 add_test(
@@ -101,10 +125,12 @@ add_test(
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 
     simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
-    truth knows is in artefacts/truth.json.
+    truth knows is in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
+    reads.
 
     Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
     """,
+    simulation_export,
 )
 
 

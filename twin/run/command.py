@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from optics.numerics.backend import Backend, load_backend
-from scenes.specs.file_kinds import read_for
+from scenes.kinds.file_kinds import read_for
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
     AsJson,
@@ -235,7 +235,7 @@ def run_test(
 
         procedure, report = load()
         # a folder that cannot be made is told before the run
-        folder = None if options.export is None else _export_folder(setup, procedure, options.export, options.force)
+        folder = None if options.export is None else _export_folder(setup, options.export, options.force)
         number = setup.test.seed if options.seed is None else options.seed
         run, given = procedure.performed(setup, session.backend, number, session.advance)
         if folder is not None and export is not None:
@@ -255,14 +255,14 @@ def run_test(
     run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
 
 
-def _export_folder(setup: Any, procedure: Procedure[Any, Any], target: Path, force: bool) -> RunFolder:
+def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
     """The folder of ``--export``, checked before anything is computed.
 
     Raises:
-        InputError: the test is one of measurements, which are files already.
+        InputError: the test names measurements, which are files already.
         RunFolderError: the folder cannot be made.
     """
-    if not isinstance(setup, procedure.setup):
+    if "measured" in type(setup.test).model_fields:
         text = "measurements are files already; --export writes those of a simulated bench"
         raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
     try:

@@ -14,13 +14,14 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import KeyPath
-from twin.orbit.calibration.observations import FieldPoints, ImagePoints, PassData
+from twin.orbit.calibration.observations import FieldPoints, PassData
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import Patch, PatchError, fly_patch, imaged_lines
 from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
+from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.run.procedure import Advance, BenchError
 from twin.run.random_streams import stream
 
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from scenes.specs.orbit_scene import GroundSpec
     from scenes.specs.orbit_setup import CalibrationSetup
 
-UNIT = 0.1
-"""Pixels: unit of weight of measured image points, whose own covariances count in it."""
 BEYOND = 0.1
 """Pixels: standard deviation added to what the matching claims, for what no fit shows: another season's light (RMS of
 matches 0.11 px where 0.06 is claimed), the attitude between its readings. A tie point has it where it was chosen."""
@@ -219,7 +218,7 @@ class Imager:
         sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
         both = known.followed_by(tie)
         points = FieldPoints(
-            replace(data, unit=UNIT * max(data.pitch.values())),
+            data,
             both.images,
             both.ground,
             np.arange(both.count) < known.count,

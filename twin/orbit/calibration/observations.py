@@ -16,17 +16,20 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import pixel_places
+from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
+from twin.orbit.measured.pass_measurements import ImagePoints
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_angle import EffectsSpec
+    from scenes.specs.three_line_camera import LineCameraSpec
 
 
 EFFECTS = ("light_time", "aberration", "refraction")
@@ -84,48 +87,10 @@ def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
     return np.asarray(found)
 
 
+_SAME_PHASE = 1e-6
+"""Of an interval between readings: times of readings are rounded."""
 _HEIGHTS = (-500.0, 9000.0)
 """Metres: of land. A control point outside of them is refused by the calibration, not here."""
-
-
-@dataclass(frozen=True, eq=False)
-class ImagePoints:
-    """Image points of one line camera.
-
-    Attributes:
-        point: (n,) which ground point each of them shows.
-        line, pixel: (n,) image coordinates; the centre of the first line's first pixel is (0, 0).
-        covariance: (n, 2, 2) of line and pixel, pixels squared.
-    """
-
-    point: np.ndarray
-    line: np.ndarray
-    pixel: np.ndarray
-    covariance: np.ndarray
-
-    @classmethod
-    def of(cls, point: ArrayLike, line: ArrayLike, pixel: ArrayLike, covariance: ArrayLike) -> ImagePoints:
-        """covariance: (n, 2, 2), or one (2, 2) for all.
-
-        Raises:
-            ValueError: shapes that do not match, values that are not finite.
-        """
-        which, at, along = np.array(point, np.intp), np.array(line, np.float64), np.array(pixel, np.float64)
-        if which.ndim != 1 or at.shape != which.shape or along.shape != which.shape:
-            raise ValueError("image points: point, line and pixel must be rows of one length")
-        spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (len(which), 2, 2)))
-        if not all(np.all(np.isfinite(v)) for v in (at, along, spread)):
-            raise ValueError("image points: a value is not finite; leave out what was not measured")
-        return cls(which, at, along, spread)
-
-    def taken(self, keep: ArrayLike) -> ImagePoints:
-        """Some of them, by mask or index."""
-        where = np.asarray(keep)
-        return ImagePoints(self.point[where], self.line[where], self.pixel[where], self.covariance[where])
-
-    def numbered(self, first: int) -> ImagePoints:
-        """The same, their ground points counted from ``first``."""
-        return replace(self, point=self.point - first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +103,9 @@ class PassData:
         models: line -> the same camera as the adjustment has it.
         pitch: line -> of its pixels, metres.
         height: mean of the ground above the ellipsoid, metres.
-        unit: metres in the focal plane; where given, every ray carries the covariance of its own image point in units
-            of it squared. None: all image points of a campaign weigh alike.
+        unit: metres in the focal plane; every ray carries the covariance of its own image point in units of it
+            squared. None: rays carry none.
+        lines: line -> what the payload's file says of it, for CCDs that do not lie in one line; None where they do.
     """
 
     name: str
@@ -148,6 +114,30 @@ class PassData:
     pitch: Mapping[str, float]
     height: float
     unit: float | None = None
+    lines: Mapping[str, LineCameraSpec] | None = None
+
+    def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
+        """Where pixels (n,) of a line lie in its focal plane, (n, 2), metres."""
+        if self.lines is not None:
+            return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
+        y = self.pitch[name] * (pixel - 0.5 * (self.sensors[name].camera.pixels - 1))
+        return np.column_stack([np.zeros_like(y), y])
+
+    @property
+    def phase(self) -> float:
+        """Of the attitude's readings: time of one of them from the next whole multiple of their interval, seconds.
+
+        Readings of the orbit are as far from their multiples at most, half of their interval, which shared noise does
+        not know: its variance then is that of another place between two readings.
+        """
+        path = next(iter(self.sensors.values())).trajectory
+        if not isinstance(path, TabulatedTrajectory):
+            return 0.0
+        time, step = path.table.attitude_time, path.attitude_interval
+        # a table may begin with an odd end
+        reading = float(time[1 + int(np.argmin(np.abs(np.diff(time[1:]) - step)))]) if len(time) > 2 else float(time[0])
+        phase = reading - step * round(reading / step)
+        return phase if abs(phase) > _SAME_PHASE * step else 0.0
 
     @property
     def earth(self) -> Earth:
@@ -177,10 +167,10 @@ class PassData:
         for name, row in images.items():
             sensor = self.sensors[name]
             seconds = sensor.time(row.line)
-            y = self.pitch[name] * (row.pixel - 0.5 * (sensor.camera.pixels - 1))
-            image = np.column_stack([np.zeros_like(y), y])
+            image = self.places(name, row.pixel)
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
-            rays = Rays.of(row.point, image, station, attitude, seconds)
+            # the noise of readings is shared by its own clock, which ticks at the readings
+            rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
             found[name] = rays if self.unit is None else replace(rays, spread=self._spread(name, row) / self.unit**2)
         return found
 
@@ -193,7 +183,7 @@ class PassData:
         self,
         images: Mapping[str, ImagePoints],
         ground: np.ndarray,
-        sigma: float | tuple[float, float],
+        covariance: float | tuple[float, float] | np.ndarray,
         removed: LightEffects,
         control: np.ndarray | None = None,
     ) -> CalibrationField:
@@ -202,7 +192,8 @@ class PassData:
         Args:
             images: line -> their image points.
             ground: (m, 3) given coordinates, ITRS, metres.
-            sigma: of each coordinate, or of each axis in plan and of the height, metres.
+            covariance: (m, 3, 3) of the coordinates, m^2, of ties not used; or a sigma of each coordinate, or of each
+                axis in plan and of the height, metres.
             removed: effects on the light that are taken out.
             control: (m,) which of them are control, the others are ties; None for all.
 
@@ -211,7 +202,7 @@ class PassData:
             ValueError: a point outside the image.
         """
         # the calibration's own check comes first: a place without a height has no refraction
-        field = CalibrationField.of(self.name, self.rays(images), ground, sigma, control)
+        field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
         return replace(field, rays=self._corrected(field.rays, images, removed, self._heights(ground)))
 
     def check_rays(self, images: Mapping[str, ImagePoints], removed: LightEffects, noise: Noise) -> dict[str, Rays]:

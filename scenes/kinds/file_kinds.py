@@ -12,6 +12,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measured.orbit_data import MeasuredAngleSpec, MeasuredCalibrationSpec, OrbitDataSpec
 from scenes.specs.measurement import MeasurementSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
@@ -89,6 +90,9 @@ FILE_KINDS = (
     FileKind("orbit_calibration", OrbitCalibrationSpec, "an in-orbit calibration", "twin.orbit calibrate"),
     FileKind("orbit_simulate", OrbitSimulateSpec, "a simulation of images of the ground", "twin.orbit simulate"),
     FileKind("orbit_monitor", OrbitMonitorSpec, "a test of monitoring in orbit", "twin.orbit monitor"),
+    FileKind("measured_calibration", MeasuredCalibrationSpec, "a calibration on measurements", "twin.orbit calibrate"),
+    FileKind("measured_angle", MeasuredAngleSpec, "intersection angles on measurements", "twin.orbit angle"),
+    FileKind("orbit_data", OrbitDataSpec, "measurements of passes", place="`data: DIR` of a test on measurements"),
     FileKind(
         "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"
     ),
