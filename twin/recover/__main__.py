@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from scenes.specs.file_kinds import read_for
 
+from scenes.kinds.file_kinds import read_for
 from scenes.specs.measurement_setup import MeasurementSetup, resolve_measurement
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
 from twin.run.command import Result, Session, print_report, run_command

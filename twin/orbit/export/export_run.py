@@ -16,7 +16,7 @@ import numpy as np
 import tifffile
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.file_kinds import kind_of
+from scenes.kinds.file_kinds import kind_of
 from scenes.specs.orbit_setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import read_yaml
