@@ -28,7 +28,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.load import load_instrument
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
-from twin.design import monitor_design
+from twin.design import monitor_design, monitor_report
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
 from twin.design.monitor_design import MONITOR_DESIGN, MonitorDesignRun, run_monitor_design
@@ -61,7 +61,7 @@ vary:
   spread_y: [100 mm, 112 mm]
 goal: {angle: 0.05 arcsec, d_f: 2 um}
 limits: {pupil_share: 20 percent}
-search: {beams: 2, layouts: 20, rounds: 1, changed: 1, exact: 1}
+search: {beams: 2, layouts: 20, rounds: 1, changed: 1, exact: 1, starts: 1}
 """
 FIRST = Beam(0.22, 0.0, 0.034, np.radians(1.22), 2.4, 0.5, 0.15, 0.06, 0.05)
 SECOND = Beam(0.13, 0.0, 0.034, np.radians(1.25), 2.65, 0.65, 0.1, 0.06, 0.11)
@@ -141,15 +141,15 @@ def with_light(path: MonitorPath, times: float, frames: int) -> MonitorPath:
 
 
 def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBench, path: MonitorPath) -> None:
-    even = replace(bench.detector, prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
+    even = replace(bench.detector(), prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
     once = spot_noise(with_light(path, 1.0, 4), even)
     assert spot_noise(with_light(path, 1.0, 12), even) == pytest.approx(once / 3.0, rel=1e-12)
     # shot noise alone, but for what rounding to grey values adds
     assert spot_noise(with_light(path, 2.0, 4), even) == pytest.approx(once / 2.0, rel=0.01)
-    stated = bench._information(bench.start, alike=False)["mirrors.yaml"].disturbances
+    stated = bench.information(bench.start, FIRST)["mirrors.yaml"].disturbances
     shared = np.array([not is_own(body) for body in stated.bodies])
     own = stated.scaled(shared.astype(float))
-    one = Information(own, once, bench.rows)
+    one = Information(own, once, bench.rows, np.zeros(4))
     twice = replace(
         one,
         disturbances=replace(own, spots=np.concatenate([own.spots, own.spots])),
@@ -167,7 +167,7 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
     """N photons through a round aperture tell a place to wavelength / (2 pi NA sqrt(N)), and a shift is of two images.
     Pinhole and pixel, and rounding to grey values, fill the dark rings, which tell much of it.
     """
-    even = replace(bench.detector, prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
+    even = replace(bench.detector(), prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
     lit = with_light(path, 1.0, 4)
     electrons = 4 * even.quantum_efficiency * np.array([channel.photons for channel in lit.channels])
     airy = lit.wavelength / (2.0 * np.pi * lit.numerical_aperture * np.sqrt(electrons)) / lit.pitch
@@ -181,7 +181,7 @@ def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorP
     start = path.instrument
     channels = tuple(replace(c, photons=0.25 * c.photons) if c.side == "left" else c for c in start.channels)
     uneven = MonitorPath(replace(start, channels=channels), path.backend)
-    taken, own = (np.diag(spot_noise(uneven, bench.detector, alike)) for alike in (True, False))
+    taken, own = (np.diag(spot_noise(uneven, bench.detector(), alike)) for alike in (True, False))
     assert taken == pytest.approx(own, rel=0.02)
     assert own[0] > 1.5 * own[2]
 
@@ -235,7 +235,14 @@ def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path:
     again = load_instrument(file)
     assert again.channels_of("forward") == layout_spec(whole.setup, best.facts.beams).channels_of("forward")
     numbers = MONITOR_DESIGN.numbers(whole)
-    assert numbers["search"]["beams_tried"] == 3
+    assert numbers["search"]["beams_tried"] == 6
+    assert list(numbers["ends"]) == ["gf7_pair", "start 1"]
+    assert sorted(name for group in numbers["optima"] for name in group) == ["gf7_pair", "start 1"]
+    first, second = whole.found.ends
+    # a start of its own draws other beams
+    assert not {b for f in first.layouts for b in f.beams} & {b for f in second.layouts for b in f.beams}
+    text = monitor_report.starts_text(whole)
+    assert ("same goal" in text) == (len(numbers["optima"]) == 1)
     assert next(iter(numbers["layouts"])) == "better"
 
 

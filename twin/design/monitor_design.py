@@ -19,7 +19,7 @@ from scenes.models.monitor_layout import (
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts
-from twin.design.layout_search import Found, Search, merit
+from twin.design.layout_search import Found, Search, merit, optima
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import ghost_warnings, stray_light
 from twin.run.procedure import Advance, BenchError, Procedure, silent
@@ -130,7 +130,7 @@ def _ghosts(
         job=JobSpec(instrument=setup.test.instrument),
         instrument=layout_spec(setup, facts.beams),
         cameras=setup.cameras,
-        detector=setup.detector,
+        detector=setup.detectors.get(facts.beams[0].area_ccd, setup.detector),
     )
     experiment = MonitorExperiment(job, backend)
     return ghost_warnings(experiment, stray_light(experiment, {}, paths, seed))
@@ -204,10 +204,12 @@ def beam_numbers(beam: Beam) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for item in fields(beam):
         value = getattr(beam, item.name)
-        if item.name == "prisms":
-            out["prisms"] = value
+        if item.name in ("prisms", "area_ccd"):
+            out[item.name] = value
         elif item.name == "field":
             out["field_deg"] = degrees(value)
+        elif item.name == "photons":
+            out["photons"] = value
         else:
             out[f"{item.name}_mm"] = 1e3 * value
     return out
@@ -269,9 +271,17 @@ def monitor_design_numbers(run: MonitorDesignRun) -> dict[str, Any]:
             "layouts_compared": found.compared,
             "layouts_built": found.built,
             "layouts_standing": len(found.layouts),
-            "merit_by_round": list(found.progress),
             "refused": dict(found.refused),
         },
+        "ends": {
+            end.name: {
+                "merit_by_round": list(end.progress),
+                "merit_by_refinement": list(end.refined),
+                "best": layout_numbers(run, end.layouts[0]) if end.layouts else None,
+            }
+            for end in found.ends
+        },
+        "optima": [[end.name for end in group] for group in optima(found, run.bench)],
     }
 
 
