@@ -44,7 +44,7 @@ class LayoutNumber:
         beams: the layout.
         beam: which of them, counted from 0.
         name: of the number, one of ``monitor_layout.CONTINUOUS``.
-        order: of the differences, 4 or 6.
+        order: of the differences, 2, 4 or 6.
     """
 
     beams: Layout
@@ -72,7 +72,7 @@ class Slope:
         number: which.
         refused: why it cannot be told, empty where it can; nothing else is then known.
         values: disturbances -> quantity -> d(sigma)/d(number), SI.
-        errors: likewise, by how much each may be wrong.
+        errors: likewise, by how much each may be wrong; empty for differences of second order, which have no lower ones.
         brightest: derivative of how full the brightest pixel of each of C spots is, (C,), per SI unit.
     """
 
@@ -125,7 +125,7 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
         number: of a layout.
     """
     low, high = ranges(bench.setup)[number.name]
-    step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS[number.order - 2]
+    step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS.get(number.order - 2, {})
     try:
         here = _known_here(bench, number.beams)
         best, lower = ({name: _Sum.none(one) for name, one in here.items()} for _ in range(2))
@@ -136,11 +136,13 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
                     lower[name].add(sign * low_order.get(k, 0.0) / step, one)
     except (InputError, AimError, BeamMissedError, ValueError) as error:
         return Slope(number, refused=str(error))
-    values, errors = {}, {}
+    values: dict[str, dict[str, float]] = {}
+    errors: dict[str, dict[str, float]] = {}
     for name, one in here.items():
         slopes = {key: one.slopes(key) for key in one.quantities if one.sigma(key) > 0.0}
         values[name] = {key: best[name].along(*slope) for key, slope in slopes.items()}
-        errors[name] = {key: abs(values[name][key] - lower[name].along(*slope)) for key, slope in slopes.items()}
+        if low_order:
+            errors[name] = {key: abs(values[name][key] - lower[name].along(*slope)) for key, slope in slopes.items()}
     return Slope(number, values=values, errors=errors, brightest=next(iter(best.values())).brightest)
 
 

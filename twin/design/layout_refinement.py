@@ -29,7 +29,7 @@ WORTH = 1e-3
 """Share of the largest ratio that a number has to be worth over its whole range to be moved; most of those that place
 prisms are worth less, and only take room."""
 _KEPT = 0.2  # share of what a step promised that makes it a good one
-_ORDER = 4  # of the differences: their errors are far below what a step can make use of
+_ORDER = 2  # of the differences: right to a per cent, which is all that a step can make use of
 
 Ask = Callable[[str, Sequence[Any]], list[Any]]
 """Part of the search and items -> what comes of them."""
