@@ -106,9 +106,7 @@ def agrees_with_rebuilt_layouts(bench: LayoutBench, number: LayoutNumber) -> Non
         [known_of(bench, number.moved(bench, sign * k * h))[STATED_NAME] for sign in (1.0, -1.0)] for k in (1.0, 2.0)
     )
     for key in ("angle", "forward/d_f", "backward/d_f"):
-        one, two = (
-            (up.sigma(key) - down.sigma(key)) / (2.0 * k * h) for (up, down), k in ((near, 1.0), (far, 2.0))
-        )
+        one, two = ((up.sigma(key) - down.sigma(key)) / (2.0 * k * h) for (up, down), k in ((near, 1.0), (far, 2.0)))
         plain, noise = (4.0 * one - two) / 3.0, 2e-9 * here.sigma(key) / h
         value, error = slope.values[STATED_NAME][key], slope.errors[STATED_NAME][key]
         assert abs(value - plain) <= 1e-5 * abs(plain) + noise + error, (number.name, key)

@@ -72,7 +72,7 @@ class Slope:
         number: which.
         refused: why it cannot be told, empty where it can; nothing else is then known.
         values: disturbances -> quantity -> d(sigma)/d(number), SI.
-        errors: likewise, by how much each may be wrong; empty for differences of second order, which have no lower ones.
+        errors: likewise, by how much each may be wrong; empty for differences of second order, below which is none.
         brightest: derivative of how full the brightest pixel of each of C spots is, (C,), per SI unit.
     """
 

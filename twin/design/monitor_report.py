@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.monitor_layout import layout_spec
+from scenes.models.monitor_layout import layout_spec, number_of
 from twin.design.layout_bench import LayoutFacts
 from twin.design.layout_search import ALIKE, optima
 from twin.design.monitor_design import GOAL_NAMES, UNITS, MonitorDesignRun, Point, verdict
@@ -111,7 +111,10 @@ def starts_text(run: MonitorDesignRun) -> str:
         each = "; ".join(
             f"{value:.4g} ({', '.join(end.name for end in group)})" for value, group in zip(best, groups, strict=True)
         )
-        text = f"The searches end at {len(groups)} optima that differ by more than {100.0 * ALIKE:.0f} %: {each}"
+        text = (
+            f"The searches end at {len(groups)} goals that differ by more than {100.0 * ALIKE:.0f} %: {each}. These are "
+            "several optima, or searches that were too short to come to one"
+        )
     return f"{text}; {lost} found no layout that stands." if lost else f"{text}."
 
 
@@ -121,9 +124,9 @@ def _starts_table(run: MonitorDesignRun) -> Table:
         if not end.layouts:
             rows.append([end.name, 0, *[float("nan")] * 3, ""])
             continue
-        best = end.layouts[0]
+        best, own = end.layouts[0], end.progress[-1]
         through = "; ".join(f"{1e3 * beam.pupil_x:.0f}, {1e3 * beam.pupil_y:.0f}" for beam in best.beams)
-        rows.append([end.name, len(best.beams), end.progress[-1], run.merit(best), 100.0 * best.pupil_share, through])
+        rows.append([end.name, len(best.beams), own, run.merit(best), 100.0 * best.pupil_share, through])
     heads = ("from", "beams per end", "σ / goal before gradients", "σ / goal", "pupil [%]", "pupil x, y [mm]")
     places = (None, None, 4, 4, 1, None)
     return Table("starts", "Where each start ends", "The best layout of every search.", heads, rows, places)
@@ -131,16 +134,17 @@ def _starts_table(run: MonitorDesignRun) -> Table:
 
 def _beams_table(run: MonitorDesignRun) -> Table:
     heads = ("layout", "beam", "pupil x [mm]", "pupil y [mm]", "width [mm]", "field [deg]", "180° prism [m]")
-    more = ("0° prism [m]", "shift [mm]", "facet x [mm]", "facet y [mm]", "prisms")
+    more = ("0° prism [m]", "shift [mm]", "facet x [mm]", "facet y [mm]", "photons [1e6]", "prisms", "area CCD")
     rows: list[list[Cell]] = []
     for name, facts in _named(run):
         for n, beam in enumerate(facts.beams, 1):
             mm = [1e3 * v for v in (beam.pupil_x, beam.pupil_y, beam.width)]
             rest = [1e3 * v for v in (beam.shift, beam.spread_x, beam.spread_y)]
             places = [float(np.degrees(beam.field)), beam.prism_180_distance, beam.prism_0_distance]
-            rows.append([name, n, *mm, *places, *rest, beam.prisms])
+            light = 1e-6 * number_of(run.setup, beam, "photons")
+            rows.append([name, n, *mm, *places, *rest, light, beam.prisms, beam.area_ccd])
     title = "Beams of the layouts"
-    places_shown = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, None)
+    places_shown = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, 1, None, None)
     return Table("beams", title, "Each stands at both ends of both lines.", (*heads, *more), rows, places_shown)
 
 
