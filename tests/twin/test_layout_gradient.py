@@ -154,16 +154,17 @@ WANTED = {"angle": 0.05 * np.pi / 648000.0, "d_f": 2e-6}
 
 class Valley:
     """Layouts whose sigmas are known in closed form: the angle's grows away from one place, d_f's away from another,
-    and both fall with light until pixels are full. Bodies stand in the way beyond a pupil_x.
+    and both fall with light until pixels are full. Bodies stand in the way beyond a pupil_x, by half as much as the
+    0-deg prism stands nearer than 0.5 m less where they may be moved aside.
     """
 
-    def __init__(self, bench: LayoutBench, most_x: float = 1.0) -> None:
-        self.bench, self.most_x = bench, most_x
+    def __init__(self, bench: LayoutBench, most_x: float = 1.0, aside: bool = False) -> None:
+        self.bench, self.most_x, self.aside = bench, most_x, aside
         self.asked: list[str] = []
 
     def facts(self, beams: tuple[Beam, ...]) -> LayoutFacts:
         (beam,) = beams
-        if beam.pupil_x > self.most_x:
+        if beam.pupil_x > self.most_x + 0.5 * max(0.5 - beam.prism_0_distance, 0.0) * self.aside:
             return LayoutFacts(beams, refused="in the way")
         angle = 1.0 + 40.0 * (beam.pupil_x - 0.2) ** 2 + 100.0 * (beam.pupil_y - 0.01) ** 2
         d_f = 1.0 + 90.0 * (beam.pupil_x - 0.1) ** 2 + 100.0 * (beam.pupil_y + 0.02) ** 2
@@ -198,7 +199,7 @@ def test_refinement_ends_where_no_ratio_can_fall(bench: LayoutBench) -> None:
     """The least of the larger of two ratios, found by scipy from the closed form alone."""
     valley = Valley(bench)
     begun = replace(FIRST, pupil_x=0.24, pupil_y=0.05, photons=4e6)
-    way = refined(bench, valley.ask, "part", valley.facts((begun,)), 40)
+    way = refined(bench, valley.ask, "part", valley.facts((begun,)), 40, np.random.default_rng(1))
     merits = [merit(facts.sigmas, bench) for facts in way]
     assert merits == sorted(merits, reverse=True)
     x, y = np.meshgrid(np.linspace(0.03, 0.25, 2201), np.linspace(-0.06, 0.06, 1201))
@@ -218,13 +219,24 @@ def test_refinement_goes_round_what_stands_in_the_way(bench: LayoutBench) -> Non
     """Toward x = 0.165 bodies stand beyond x = 0.12; y and light still find their best."""
     valley = Valley(bench, most_x=0.12)
     begun = replace(FIRST, pupil_x=0.1, pupil_y=0.05, photons=4e6)
-    way = refined(bench, valley.ask, "part", valley.facts((begun,)), 40)
+    way = refined(bench, valley.ask, "part", valley.facts((begun,)), 40, np.random.default_rng(1))
     found = way[-1].beams[0]
     assert found.pupil_x <= 0.12
     assert way[-1].brightest[0] == pytest.approx(FULLEST, rel=1e-6)
     at = np.linspace(-0.06, 0.06, 2001)
     least = np.min(1.0 + 40.0 * (found.pupil_x - 0.2) ** 2 + 100.0 * (at - 0.01) ** 2)
     assert merit(way[-1].sigmas, bench) <= 1.01 * least * (1.0 + 0.1 / (FULLEST / 0.5))
+
+
+def test_refinement_makes_room_with_numbers_that_no_goal_depends_on(bench: LayoutBench) -> None:
+    """Bodies stand in the way beyond x = 0.12 unless the 0-deg prism is moved aside."""
+    valley = Valley(bench, most_x=0.12, aside=True)
+    begun = replace(FIRST, pupil_x=0.1, pupil_y=0.05, photons=4e6, prism_0_distance=0.5)
+    way = refined(bench, valley.ask, "part", valley.facts((begun,)), 40, np.random.default_rng(1))
+    stuck = refined(bench, Valley(bench, 0.12).ask, "part", valley.facts((begun,)), 40, np.random.default_rng(1))
+    assert way[-1].beams[0].pupil_x > 0.13
+    assert way[-1].beams[0].prism_0_distance < 0.5
+    assert merit(way[-1].sigmas, bench) < 0.97 * merit(stuck[-1].sigmas, bench)
 
 
 def test_no_step_is_taken_where_none_is_better(bench: LayoutBench) -> None:
@@ -236,7 +248,7 @@ def test_no_step_is_taken_where_none_is_better(bench: LayoutBench) -> None:
         flat = {STATED_NAME: dict.fromkeys(facts.sigmas[STATED_NAME], 0.0)}
         return [Slope(item, values=flat) for item in items]
 
-    assert refined(bench, ask, "part", facts, 5) == [facts]
+    assert refined(bench, ask, "part", facts, 5, np.random.default_rng(1)) == [facts]
     assert level.asked == len(CONTINUOUS)
 
 

@@ -4,8 +4,9 @@ What is wanted is the least of a largest ratio: of each quantity that is left to
 lies where several ratios are equal, and has no gradient of its own. So each step is a linear programme over all ratios
 at once, within a box about the layout and within the ranges of its numbers (Fletcher and Sainz de la Maza, Math.
 Programming 43, 235, 1989); the box grows where the layout that is then built keeps what was promised, and shrinks where
-it does not. Whether bodies have room is asked of every layout that is built; where they have none, the step's numbers
-are changed one by one, and those that make the layout better stay.
+it does not. Whether bodies have room is asked of every layout that is built. Where they have none, the numbers that no
+goal depends on, most of those that place prisms, are drawn anew a few times to make room for the step; if that does not
+help, its numbers are changed one by one, and those that make the layout better stay.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ FIRST_BOX = 0.1
 LEAST_BOX = 2e-3
 """The same below which nothing more is sought."""
 WORTH = 1e-3
-"""Share of the largest ratio that a number has to be worth over its whole range to be moved; most of those that place
-prisms are worth less, and only take room."""
+"""Share of the largest ratio that a number has to be worth over its whole range to be moved for its own sake."""
+ROOM, ROOM_STEP = 8, 0.06
+"""How often room is sought for a step, and by how much all else is changed then, relative to its range, rms."""
 _KEPT = 0.2  # share of what a step promised that makes it a good one
 _ORDER = 2  # of the differences: right to a per cent, which is all that a step can make use of
 
@@ -51,7 +53,9 @@ def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dic
     }
 
 
-def refined(bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, steps: int) -> list[LayoutFacts]:
+def refined(
+    bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, steps: int, rng: np.random.Generator
+) -> list[LayoutFacts]:
     """Layouts on the way from one to the best near it, each better than the one before.
 
     Args:
@@ -60,16 +64,15 @@ def refined(bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, steps: 
         part: of the search, for the progress.
         facts: of the layout to begin with, which can stand.
         steps: gradients that are asked for, at most.
+        rng: source of all that is drawn to make room.
 
     Returns:
         At least the first.
     """
     way, box = [facts], FIRST_BOX
-    numbers: tuple[LayoutNumber, ...] | None = None
+    every = numbers = numbers_of(bench, facts.beams, _ORDER)
     for _ in range(steps):
         here = way[-1]
-        if numbers is None:
-            numbers = numbers_of(bench, here.beams, _ORDER)
         slopes = ask(f"{part}: slopes", [replace(one, beams=here.beams) for one in numbers])
         slopes = [slope for slope in slopes if not slope.refused and _worth(bench, here, slope) > WORTH]
         if not slopes:
@@ -81,7 +84,11 @@ def refined(bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, steps: 
             change, promised = _step(bench, here, slopes, box)
             if promised <= 0.0:
                 break
-            found = ask(f"{part}: layout", [_moved(bench, here.beams, numbers, change)])[0]
+            wanted = _moved(bench, here.beams, numbers, change)
+            found = ask(f"{part}: layout", [wanted])[0]
+            if found.refused:
+                idle = [one for one in every if (one.beam, one.name) not in {(n.beam, n.name) for n in numbers}]
+                found = _with_room(bench, ask, part, wanted, idle, rng)
             if found.refused:
                 found = _one_by_one(bench, ask, part, here, slopes, change)
             gained = _largest(here, bench) - _largest(found, bench)
@@ -145,6 +152,15 @@ def _moved(bench: LayoutBench, beams: Layout, numbers: Sequence[LayoutNumber], c
         value = number_of(bench.setup, out[number.beam], number.name) + float(part) * (high - low)
         out[number.beam] = out[number.beam].changed({number.name: float(np.clip(value, low, high))})
     return tuple(out)
+
+
+def _with_room(
+    bench: LayoutBench, ask: Ask, part: str, beams: Layout, idle: Sequence[LayoutNumber], rng: np.random.Generator
+) -> LayoutFacts:
+    """The best that stands of a layout with its idle numbers drawn anew; one that is refused where none does."""
+    tried = [_moved(bench, beams, idle, ROOM_STEP * rng.standard_normal(len(idle))) for _ in range(ROOM if idle else 0)]
+    found = [facts for facts in ask(f"{part}: room", tried) if not facts.refused]
+    return min(found, key=lambda facts: _largest(facts, bench), default=LayoutFacts(beams, refused="no room"))
 
 
 def _one_by_one(

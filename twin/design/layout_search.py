@@ -222,7 +222,11 @@ class _OneSearch:
             progress.append(self._best())
             step = step if progress[-1] < 0.98 * progress[-2] else 0.5 * step
         layouts = self._standing()
-        way = refined(self.bench, self.ask, self._part("refinement"), layouts[0], spec.refine) if layouts else []
+        way = (
+            refined(self.bench, self.ask, self._part("refinement"), layouts[0], spec.refine, self.rng)
+            if layouts
+            else []
+        )
         return End(
             self.name or self.setup.instrument.name,
             (*reversed(way[1:]), *layouts),

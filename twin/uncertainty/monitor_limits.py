@@ -159,9 +159,7 @@ def find_limits(
         return None
     cameras = experiment.cameras
     before = np.sqrt(np.diag(stated.parameter_covariance))
-    found = tuple(
-        q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > UNMOVED
-    )
+    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > UNMOVED)
     if not found:
         return None
     rows = np.stack([quantity.row for quantity in found])
