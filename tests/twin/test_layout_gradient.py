@@ -11,7 +11,16 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from optics.numerics.backend import Backend, load_backend
-from scenes.models.monitor_layout import CONTINUOUS, Beam, MonitorDesignSetup, resolve_monitor_design
+from scenes.models.monitor_layout import (
+    CONTINUOUS,
+    Beam,
+    MonitorDesignSetup,
+    changed_beam,
+    drawn_beam,
+    layout_spec,
+    resolve_monitor_design,
+    start_beams,
+)
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
 from twin.design.layout_gradient import LayoutNumber, Slope, known_of, numbers_of, slope_of
 from twin.design.layout_refinement import refined
@@ -147,6 +156,27 @@ def test_spots_that_fill_their_pixels_are_refused(bench: LayoutBench) -> None:
     assert 0.1 < facts.brightest.max() < FULLEST
     # d_f of one beam is limited by what its light cannot know, not by noise
     assert 0.9 < facts.sigmas[STATED_NAME]["forward/d_f"] / dim.sigmas[STATED_NAME]["forward/d_f"] < 1.0
+
+
+def test_another_area_ccd_counts_the_same_spots_in_other_pixels(bench: LayoutBench, tmp_path: Path) -> None:
+    (tmp_path / STATED_NAME).write_text(STATED, "utf-8")
+    ccds = "area_ccds: {coarse: {detector: monitor_ccd, pitch: 12 um, rows: 96, columns: 96}, "
+    ccds += "fine: {detector: monitor_ccd, pitch: 9 um, rows: 128, columns: 128}}\n"
+    (tmp_path / "design.yaml").write_text(DESIGN + ccds, "utf-8")
+    setup = resolve_monitor_design(tmp_path / "design.yaml")
+    assert [beam.area_ccd for beam in start_beams(setup)] == ["coarse"]
+    rng = np.random.default_rng(1)
+    assert {drawn_beam(setup, rng).area_ccd for _ in range(20)} == {"coarse", "fine"}
+    assert changed_beam(setup, replace(FIRST, area_ccd="fine"), 0.1, rng).area_ccd == "fine"
+    chosen = LayoutBench(setup, bench.backend)
+    coarse, fine = (known_of(chosen, (replace(FIRST, area_ccd=name),))[STATED_NAME] for name in ("coarse", "fine"))
+    assert layout_spec(setup, (replace(FIRST, area_ccd="fine"),)).monitor.area_ccd.pitch == 9e-6
+    # one path: what is told apart is a place in metres over the pitch
+    assert fine.disturbances.spots == pytest.approx(coarse.disturbances.spots * 12.0 / 9.0, rel=1e-9, abs=1e-12)
+    assert fine.brightest == pytest.approx(coarse.brightest * (9.0 / 12.0) ** 2, rel=0.02)
+    # response differs over more pixels, which helps, and each adds its own dark noise, which harms
+    ratio = np.sqrt(np.diag(fine.noise) / np.diag(coarse.noise)) * 9.0 / 12.0
+    assert np.all((ratio > 0.7) & (ratio < 1.2))
 
 
 WANTED = {"angle": 0.05 * np.pi / 648000.0, "d_f": 2e-6}

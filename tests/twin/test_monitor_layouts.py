@@ -347,6 +347,14 @@ def test_workers_change_nothing(setup: MonitorDesignSetup, backend: Backend, who
         ("disturbances: [mirrors.yaml]", "disturbances: [weather]", "no such name in disturbances"),
         ("limits: {pupil_share: 20 percent}", "limits: {mass: 20 m}", "mass"),
         ("instrument: gf7_pair", "instrument: gf8_pair", "no such name in instruments"),
+        ("pupil_y: [0 mm, 20 mm]", "photons: [8.0e+6, 4.0e+6]", "the range ends before it begins"),
+        ("pupil_y: [0 mm, 20 mm]", "photons: [0, 4.0e+6]", "photons"),
+        ("search: {beams: 2,", "search: {starts: -1, beams: 2,", "starts"),
+        (
+            "beams: 2",
+            "beams: 2\narea_ccds: {a: {detector: monitor_cdd, pitch: 9 um, rows: 128, columns: 128}}",
+            "no such name in detectors",
+        ),
         (
             "beams: 2",
             "beams: 2\nprisms: {a: {prism_180: {material: N-BK7, kind: rhomboid}, prism_0: {material: Zerodur}}}",

@@ -112,8 +112,8 @@ def starts_text(run: MonitorDesignRun) -> str:
             f"{value:.4g} ({', '.join(end.name for end in group)})" for value, group in zip(best, groups, strict=True)
         )
         text = (
-            f"The searches end at {len(groups)} goals that differ by more than {100.0 * ALIKE:.0f} %: {each}. These are "
-            "several optima, or searches that were too short to come to one"
+            f"The searches end at {len(groups)} goals that differ by more than {100.0 * ALIKE:.0f} %: {each}. These "
+            "are several optima, or searches that were too short to come to one"
         )
     return f"{text}; {lost} found no layout that stands." if lost else f"{text}."
 

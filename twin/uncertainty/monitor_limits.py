@@ -35,8 +35,8 @@ FIELD = 0.1 * ARCSEC
 DAY = 86400.0
 MORE_FRAMES = 4
 UNMOVED = 1e-8
-"""Standard deviation before any measurement, arcsec, um or m, up to which a quantity is one that nothing stated changes:
-what rounding makes of a trace is 1e-10."""
+"""Standard deviation before any measurement, arcsec, um or m, up to which a quantity is taken as one that nothing
+stated changes: what rounding makes of a trace is 1e-10."""
 _DRAWS = 100_000
 _STATES = 6
 """Of which the covariance of a shift is averaged; it differs by some per cent from one to another."""
