@@ -24,7 +24,7 @@ from scenes.models.monitor_layout import (
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
 from twin.design.layout_gradient import LayoutNumber, Slope, known_of, numbers_of, slope_of
 from twin.design.layout_refinement import refined
-from twin.design.layout_search import End, Found, merit, optima
+from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
 from twin.monitor.information import Information
 
 STATED = """
@@ -280,6 +280,14 @@ def test_no_step_is_taken_where_none_is_better(bench: LayoutBench) -> None:
 
     assert refined(bench, ask, "part", facts, 5, np.random.default_rng(1)) == [facts]
     assert level.asked == len(CONTINUOUS)
+
+
+def test_beams_that_join_others_are_the_best_and_some_of_all_ranks() -> None:
+    ranked = [Candidate((k,), float(k)) for k in range(20)]
+    assert [one.beams[0] for one in spread(ranked, 6)] == [0, 1, 2, 3, 8, 14]
+    assert spread(ranked, 20) == ranked
+    assert spread(ranked, 50) == ranked
+    assert spread(ranked, 1) == ranked[:1]
 
 
 def test_ends_are_told_apart_by_two_percent(bench: LayoutBench) -> None:

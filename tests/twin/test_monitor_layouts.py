@@ -197,6 +197,11 @@ def test_bodies_of_one_channel_are_told_from_shared_ones() -> None:
 
 def test_beams_that_stand_in_each_other_are_not_combined(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
     assert not touching(facts[0], facts[1])
+    # CCDs of 1.152 mm at 5.51 m and fields near 1.22 deg have room from 0.0120 deg on
+    for apart, room in ((0.0118, False), (0.0121, True)):
+        aside = replace(FIRST, field=FIRST.field + np.radians(apart))
+        assert bench.boards_apart(FIRST, aside) is room
+        assert bench.boards_apart(aside, FIRST) is room
     near = bench.try_beam(replace(SECOND, pupil_x=0.135, spread_y=0.105))
     assert near.refused == ""
     assert touching(facts[1], near)

@@ -167,6 +167,14 @@ class LayoutBench:
         """Quantities of which a goal's value is the worst: ``d_f`` of every camera."""
         return tuple(key for key in self.rows if key == name or key.endswith(f"/{name}"))
 
+    def boards_apart(self, one: Beam, other: Beam) -> bool:
+        """Whether the area CCDs of two beams have room beside each other at an end of every line."""
+        ccd = layout_spec(self.setup, (one,)).monitor.area_ccd
+        return all(
+            abs(camera.line_focal_length * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
+            for camera in self.start.cameras.values()
+        )
+
     def try_beam(self, beam: Beam) -> BeamFacts:
         """A beam alone."""
         try:

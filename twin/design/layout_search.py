@@ -184,6 +184,19 @@ def _promise(one: Candidate) -> tuple[float, tuple[int, ...]]:
     return one.merit, one.beams
 
 
+def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
+    """So many of ranked layouts: half of them the best, the others evenly over the rest. The best are often much alike,
+    and have room for the same few others.
+
+    Args:
+        level: most promising first.
+        width: how many.
+    """
+    best, rest = list(level[: (width + 1) // 2]), level[(width + 1) // 2 :]
+    count = min(width - len(best), len(rest))
+    return [*best, *(rest[k * len(rest) // count] for k in range(count))]
+
+
 class _OneSearch:
     """A search from one set of beams.
 
@@ -294,7 +307,12 @@ class _OneSearch:
         every = [level]
         for _ in range(spec.beams - 1):
             width = max(spec.search.layouts // max((spec.beams - 1) * size, 1), 1)
-            sets = {tuple(sorted({*one.beams, k})) for one in level[:width] for k in range(size) if k not in one.beams}
+            sets = {
+                tuple(sorted({*one.beams, k}))
+                for one in spread(level, width)
+                for k in range(size)
+                if k not in one.beams
+            }
             promising = sorted((self._candidate(beams) for beams in sets if self._alike(beams)), key=_promise)
             standing = (one for one in promising if one.beams in self.built or self._may_stand(one.beams))
             level = [*islice(standing, width + len(self.built))]
@@ -339,7 +357,8 @@ class _OneSearch:
         """Whether prisms of no two beams stand in each other."""
         for pair in combinations(beams, 2):
             if pair not in self.apart:
-                self.apart[pair] = not touching(self.pool[pair[0]], self.pool[pair[1]])
+                one, other = (self.pool[k] for k in pair)
+                self.apart[pair] = self.bench.boards_apart(one.beam, other.beam) and not touching(one, other)
             if not self.apart[pair]:
                 return False
         return True
