@@ -386,7 +386,7 @@ def test_the_file_says_which_design_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "less", "pupil"), [("gf7_pair_two", (12.0, 10.0), 1.3), ("gf7_pair_best", (22.0, 38.0), 1.4)]
+    ("name", "less", "pupil"), [("gf7_pair_two", (12.0, 10.0), 1.3), ("gf7_pair_best", (18.0, 30.0), 1.4)]
 )
 @pytest.mark.parametrize("disturbances", ["orbit", pytest.param("launch", marks=pytest.mark.slow)])
 def test_the_shipped_layouts_know_more(backend, name, less, pupil, disturbances):
