@@ -45,7 +45,11 @@ _FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along
 
 
 def build_instrument(
-    spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool = True
+    spec: InstrumentSpec,
+    camera_specs: Mapping[str, object],
+    backend: Backend,
+    free_beams: bool = True,
+    free_bodies: bool = True,
 ) -> Instrument:
     """Build an instrument.
 
@@ -55,18 +59,22 @@ def build_instrument(
         backend: where to trace while the geometry is worked out.
         free_beams: refuse bodies that stand in the monitor's beams; False for comparisons of layouts that nobody would
             build.
+        free_bodies: refuse bodies that stand in each other, and apertures that reach over their faces; False for
+            derivatives of layouts that are at such a limit.
 
     Raises:
         InputError: prisms or central prism cannot stand as the file says, or the cameras are too different.
     """
     try:
-        return _build(spec, camera_specs, backend, free_beams)
+        return _build(spec, camera_specs, backend, free_beams, free_bodies)
     except MisplacedError as error:
         key = error.key if error.channel is None else spec.key_of(*error.channel, error.key)
         raise spec.error(str(error), key) from error
 
 
-def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool) -> Instrument:
+def _build(
+    spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool, free_bodies: bool
+) -> Instrument:
     check_prisms(spec)
     derived: dict[str, CameraModel] = {}
     for site in spec.cameras.values():
@@ -129,8 +137,9 @@ def _build(spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Ba
         MappingProxyType(lengths),
         _baffles(spec, assembly.tree),
     )
-    check_solids(instrument.assembly, solids)
-    check_clearance(instrument)
+    if free_bodies:
+        check_solids(instrument.assembly, solids)
+        check_clearance(instrument)
     if free_beams:
         check_beams(instrument, backend)
     return instrument

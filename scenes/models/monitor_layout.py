@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -48,12 +48,14 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         cameras: by the name that the instrument gives them.
         detector: data sheet of the area CCDs.
         disturbances: by the name that the design, or the instrument, gives them.
+        detectors: data sheets of the area CCDs that the design may choose from, by its names for them.
     """
 
     instrument: InstrumentSpec
     cameras: Paths[CameraSpec]
     detector: DetectorSpec
     disturbances: Paths[DisturbancesSpec]
+    detectors: Paths[DetectorSpec] = FrozenMap()
 
 
 def resolve_monitor_design(path: str | Path) -> MonitorDesignSetup:
@@ -65,13 +67,14 @@ def resolve_monitor_design(path: str | Path) -> MonitorDesignSetup:
     setup = read_setup(MonitorDesignSetup, path)
     if setup is None:
         test = validate(MonitorDesignSpec, read_yaml(path))
-        instrument, cameras, detector, disturbances = read_design(test)
+        instrument, cameras, detector, disturbances, detectors = read_design(test)
         setup = MonitorDesignSetup.model_construct(
             test=test,
             instrument=instrument,
             cameras=FrozenMap(cameras),
             detector=detector,
             disturbances=FrozenMap(disturbances),
+            detectors=FrozenMap(detectors),
         )
     test, start = setup.test, setup.instrument
     if len(start.cameras) != 2:
@@ -95,6 +98,8 @@ class Beam:
         shift: of its rhomboid, m.
         spread_x, spread_y: of its facet from the apex, m.
         prisms: by their name in the design.
+        photons: of its spot, per frame; None for the monitor's.
+        area_ccd: of all channels, by its name in the design.
     """
 
     pupil_x: float
@@ -107,14 +112,16 @@ class Beam:
     spread_x: float
     spread_y: float
     prisms: str = AS_STARTED
+    photons: float | None = None
+    area_ccd: str = AS_STARTED
 
-    @property
-    def numbers(self) -> np.ndarray:
-        """The continuous ones, (9,), in the order of ``CONTINUOUS``."""
-        return np.array([getattr(self, name) for name in CONTINUOUS])
+    def changed(self, numbers: Mapping[str, float]) -> Beam:
+        """The same with other continuous numbers, by their names."""
+        values: Mapping[str, Any] = numbers
+        return replace(self, **values)
 
 
-CONTINUOUS = tuple(item.name for item in fields(Beam) if item.name != "prisms")
+CONTINUOUS = tuple(item.name for item in fields(Beam) if item.name not in {"prisms", "area_ccd"})
 """Names of what varies continuously."""
 Layout = tuple[Beam, ...]
 
@@ -132,7 +139,8 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
             made, small = one.prism_180, one.prism_0
             x, y = one.pupil_offset
             numbers = (sign * x, y, one.return_face.aperture, one.field, made.distance, small.distance, small.shift)
-            beams.append(Beam(*numbers, *one.spread, prisms=_prisms_of(setup, one)))
+            light = setup.test.photons_per_frame or one.photons_per_frame
+            beams.append(Beam(*numbers, *one.spread, _prisms_of(setup, one), light, _ccd_of(setup)))
     again = layout_spec(setup, tuple(beams))
     for camera in start.cameras:
         own, made_again = start.channels_of(camera), again.channels_of(camera)
@@ -159,6 +167,15 @@ def _prisms_of(setup: MonitorDesignSetup, one: ChannelParts) -> str:
     )
 
 
+def _ccd_of(setup: MonitorDesignSetup) -> str:
+    """Name of the area CCD that the start has."""
+    own = setup.instrument.monitor.area_ccd
+    for name, one in (setup.test.area_ccds or {}).items():
+        if (one.detector, one.pitch, one.rows, one.columns) == (own.detector, own.pitch, own.rows, own.columns):
+            return name
+    return AS_STARTED
+
+
 def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]]]) -> np.ndarray:
     return np.array([[field, *offset, *spread] for field, offset, spread in places])
 
@@ -169,8 +186,8 @@ def _toward(spec: InstrumentSpec, site: MountedCameraSpec) -> float:
 
 
 def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> InstrumentSpec:
-    """The instrument that has these beams; all else as in the start, but for its name, light, frames and the central
-    prism's material.
+    """The instrument that has these beams; all else as in the start, but for its name, light, frames, area CCDs and the
+    central prism's material.
 
     Args:
         setup: the design.
@@ -187,9 +204,11 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> InstrumentSpec:
                 offset = (_toward(start, site) * beam.pupil_x, end * beam.pupil_y)
                 channels[channel_name(side, n)] = _channel(setup, beam, end * beam.field, offset)
         sites[name] = site.model_copy(update={"pupil_offset": None, "channels": FrozenMap(channels)})
-    light = test.photons_per_frame or monitor.reticle.photons_per_frame
-    reticle = monitor.reticle.model_copy(update={"photons_per_frame": light})
-    monitor = monitor.model_copy(update={"reticle": reticle, "frames": test.frames or monitor.frames})
+    reticle = monitor.reticle.model_copy(update={"photons_per_frame": _light(setup)})
+    chosen = (test.area_ccds or {}).get(beams[0].area_ccd)
+    own = {} if chosen is None else {name: getattr(chosen, name) for name in type(chosen).model_fields}
+    ccd = monitor.area_ccd.model_copy(update=own)
+    monitor = monitor.model_copy(update={"reticle": reticle, "frames": test.frames or monitor.frames, "area_ccd": ccd})
     block = start.central_prism
     block = block.model_copy(update={"material": test.central_material or block.material})
     update = {
@@ -200,6 +219,11 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> InstrumentSpec:
         "monitor": monitor,
     }
     return start.model_copy(update=update)
+
+
+def _light(setup: MonitorDesignSetup) -> float:
+    """Photons of a spot and frame where a beam has none of its own."""
+    return setup.test.photons_per_frame or setup.instrument.monitor.reticle.photons_per_frame
 
 
 def channel_name(side: str, number: int) -> str:
@@ -219,6 +243,7 @@ def _channel(setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[
         pupil_offset=offset,
         return_face=ReturnFaceSpec.model_construct(aperture=beam.width),
         spread=(beam.spread_x, beam.spread_y),
+        photons_per_frame=None if beam.photons == _light(setup) else beam.photons,
         prism_180=monitor.prism_180.model_copy(update=large),
         prism_0=monitor.prism_0.model_copy(update=small),
     )
@@ -240,8 +265,8 @@ def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | N
 def drawn_beam(setup: MonitorDesignSetup, rng: np.random.Generator) -> Beam:
     """A beam at random, evenly in all that may vary."""
     start = start_beams(setup)[0]
-    numbers = {name: float(rng.uniform(*ends)) for name, ends in _ranges(setup).items()}
-    return replace(start, **numbers, prisms=_chosen(setup, rng))
+    numbers = {name: float(rng.uniform(*ends)) for name, ends in ranges(setup).items()}
+    return replace(start.changed(numbers), prisms=_chosen(setup, rng), area_ccd=_chosen_ccd(setup, start, rng))
 
 
 def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.random.Generator) -> Beam:
@@ -254,21 +279,34 @@ def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.ran
         rng: source of all that is drawn. About half of the numbers stay, so that single ones are tried, too.
     """
     numbers = {}
-    for name, (low, high) in _ranges(setup).items():
-        value = getattr(beam, name) + (high - low) * step * float(rng.standard_normal()) * float(rng.integers(2))
+    for name, (low, high) in ranges(setup).items():
+        change = step * float(rng.standard_normal()) * float(rng.integers(2))
+        value = number_of(setup, beam, name) + (high - low) * change
         value = 2.0 * low - value if value < low else 2.0 * high - value if value > high else value
         numbers[name] = float(np.clip(value, low, high))
     prisms = _chosen(setup, rng) if rng.random() < step else beam.prisms
-    return replace(beam, **numbers, prisms=prisms)
+    return replace(beam.changed(numbers), prisms=prisms)
 
 
-def _ranges(setup: MonitorDesignSetup) -> dict[str, tuple[float, float]]:
+def number_of(setup: MonitorDesignSetup, beam: Beam, name: str) -> float:
+    """One of a beam's continuous numbers."""
+    value = getattr(beam, name)
+    return _light(setup) if value is None else float(value)
+
+
+def ranges(setup: MonitorDesignSetup) -> dict[str, tuple[float, float]]:
+    """What of each beam varies continuously, from and to, SI."""
     return {name: ends for name in CONTINUOUS if (ends := getattr(setup.test.vary, name)) is not None}
 
 
 def _chosen(setup: MonitorDesignSetup, rng: np.random.Generator) -> str:
     names = tuple(setup.test.prisms or (AS_STARTED,))
     return names[int(rng.integers(len(names)))]
+
+
+def _chosen_ccd(setup: MonitorDesignSetup, start: Beam, rng: np.random.Generator) -> str:
+    names = tuple(setup.test.area_ccds or ())
+    return names[int(rng.integers(len(names)))] if names else start.area_ccd
 
 
 def instrument_file(spec: InstrumentSpec, remark: str) -> str:

@@ -14,7 +14,15 @@ from optics.geometry.sag_terms import SAG_TERMS, SagTerm
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs.detector import PixelPitch
-from scenes.specs.instrument import Frames, GlassName, MadeOf, Photons, check_made, reflector_kinds
+from scenes.specs.instrument import (
+    AreaCcdChoiceSpec,
+    Frames,
+    GlassName,
+    MadeOf,
+    Photons,
+    check_made,
+    reflector_kinds,
+)
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Vector, Wavelength
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
@@ -126,6 +134,7 @@ class CameraDesignSpec(Spec):
 
 LengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]
 FieldRange = Annotated[tuple[float, float], Vector(Quantity(ANGLE, above_zero=True, largest="45 deg"), 2)]
+PhotonRange = tuple[Photons, Photons]
 
 
 class BeamRangesSpec(Spec):
@@ -143,6 +152,7 @@ class BeamRangesSpec(Spec):
         shift: of its rhomboid, metres.
         spread_x: from the central prism's apex to its facet along the base's X, metres.
         spread_y: likewise along Y, metres.
+        photons: of its spot, per frame; spots that would fill their pixels to the brim are refused.
     """
 
     pupil_x: LengthRange | None = None
@@ -154,6 +164,7 @@ class BeamRangesSpec(Spec):
     shift: LengthRange | None = None
     spread_x: LengthRange | None = None
     spread_y: LengthRange | None = None
+    photons: PhotonRange | None = None
 
     @model_validator(mode="after")
     def _from_less_to_more(self) -> "BeamRangesSpec":
@@ -263,6 +274,9 @@ class MonitorSearchSpec(Spec):
             round before found nothing better.
         changed: beams that each round tries.
         exact: layouts that are built as a whole after the first draw, and after each round.
+        refine: steps by exact gradients with which the best layout is improved at last, at most.
+        starts: further searches, each from beams of its own that are drawn at random, and without those of the
+            instrument: do they come to the same end?
     """
 
     beams: Annotated[Whole, Field(ge=1, le=100_000)] = 120
@@ -270,6 +284,8 @@ class MonitorSearchSpec(Spec):
     rounds: Annotated[Whole, Field(ge=0, le=1000)] = 6
     changed: Annotated[Whole, Field(ge=1, le=10_000)] = 24
     exact: Annotated[Whole, Field(ge=1, le=1000)] = 8
+    refine: Annotated[Whole, Field(ge=0, le=1000)] = 0
+    starts: Annotated[Whole, Field(ge=0, le=100)] = 0
 
 
 class MonitorDesignSpec(Spec):
@@ -283,6 +299,7 @@ class MonitorDesignSpec(Spec):
         beams: at each end of a line, at most.
         vary: what may vary of each beam.
         prisms: by a name of one's own, what each beam may have for prisms; the start's, when left out.
+        area_ccds: by a name of one's own, which area CCD all channels may have; the start's, when left out.
         central_material: of the central prism, in place of the start's.
         photons_per_frame: of every spot, in place of the start's.
         frames: of a measurement, in place of the start's.
@@ -299,6 +316,7 @@ class MonitorDesignSpec(Spec):
     beams: Annotated[Whole, Field(ge=1, le=6)]
     vary: BeamRangesSpec
     prisms: Annotated[Named[PrismChoiceSpec], Field(min_length=1)] | None = None
+    area_ccds: Annotated[Named[AreaCcdChoiceSpec], Field(min_length=1)] | None = None
     central_material: GlassName | None = None
     photons_per_frame: Photons | None = None
     frames: Frames | None = None

@@ -209,6 +209,22 @@ class AreaCcdSpec(Spec):
     exposure: Exposure
 
 
+class AreaCcdChoiceSpec(Spec):
+    """An area CCD that the monitor may have: pixels of another size are another detector, with a data sheet of its own.
+
+    Attributes:
+        detector: its data sheet, by name or path.
+        pitch: of its pixels, metres.
+        rows: number of pixel rows.
+        columns: number of pixel columns.
+    """
+
+    detector: Reference
+    pitch: PixelPitch
+    rows: AreaSide
+    columns: AreaSide
+
+
 class ReturnFaceSpec(Spec):
     """The mirror coating of a central prism's facet, which returns the monitor's beam and limits it: diameter,
     metres.

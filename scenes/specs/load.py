@@ -117,9 +117,9 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
 
 def read_design(
     design: MonitorDesignSpec,
-) -> tuple[InstrumentSpec, dict[str, CameraSpec], DetectorSpec, dict[str, DisturbancesSpec]]:
+) -> tuple[InstrumentSpec, dict[str, CameraSpec], DetectorSpec, dict[str, DisturbancesSpec], dict[str, DetectorSpec]]:
     """What a search for a layout refers to: the instrument to start from, its cameras by the name that it gives them,
-    its area CCD and disturbances by their names in the design.
+    its area CCD, disturbances by their names in the design, and data sheets of the area CCDs that it may choose.
 
     Raises:
         InputError: a file is not there or not valid, or nothing is stated to move.
@@ -138,7 +138,11 @@ def read_design(
     for k, reference in enumerate(references):
         key: KeyPath = ("disturbances", k) if owner is design else ("disturbances",)
         stated[reference] = validate(DisturbancesSpec, read_yaml(_find(DISTURBANCES, reference, owner, key)))
-    return start, cameras, load_detector(path_of_detector(start)), stated
+    sheets = {
+        name: load_detector(_find(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
+        for name, one in (design.area_ccds or {}).items()
+    }
+    return start, cameras, load_detector(path_of_detector(start)), stated, sheets
 
 
 def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:

@@ -32,7 +32,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     seconds, motions = [], 0
     for _ in range(3):
         begun = time.monotonic()
-        (found,) = information_of(instrument, list(setup.disturbances.values()), own.detector, bench.backend)
+        (found,) = information_of(instrument, list(setup.disturbances.values()), own.detector(), bench.backend)
         seconds.append(time.monotonic() - begun)
         motions = len(found.disturbances.labels)
     begun = time.monotonic()

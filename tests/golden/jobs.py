@@ -109,6 +109,7 @@ ALL = (
     _job("study_orbit", f"twin.study {RUN % 'study_orbit'} --workers 2 --json"),
     _job("study_gradient", f"twin.study {RUN % 'study_gradient'} --gradient"),
     _job("design", f"twin.design {RUN % 'design'}"),
+    _job("design_monitor", f"twin.design monitor {RUN % 'design_monitor'} --workers 2 --quiet"),
     _job("camera", "twin.camera --refocus monitor --out {out}"),
     _job("validate", f"twin.validate --fast --only {CHECKS} --out {{out}}"),
     _job("validate_bench", "twin.validate --fast --only 001.table2 --out {out} --json"),

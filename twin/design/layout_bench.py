@@ -23,6 +23,7 @@ from scenes.models.clearance import LEAST_GAP, convex_bodies, separation
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.monitor_layout import (
+    AS_STARTED,
     RAYS,
     Beam,
     ImagingBeams,
@@ -43,6 +44,10 @@ from twin.sensors.area_detector import EmvaDetector
 _AROUND = 24
 EDGE_PX = 10.0
 """Room that the fit of a spot needs between its middle and the edge of its area CCD, pixels."""
+FULLEST = 0.9
+"""Largest share of what a pixel can hold that its expected light may fill: the rest is for shot noise and for pixels
+that respond more than others, five standard deviations of both even with a few thousand electrons.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +111,7 @@ class LayoutFacts:
         mass: of its prisms, kg.
         glass_path: longest way of a beam in glass, one way, metres.
         spot_sigma: largest standard deviation of a spot's place, pixels.
+        brightest: how full every spot's brightest pixel is, (C,).
     """
 
     beams: Layout
@@ -118,6 +124,7 @@ class LayoutFacts:
     mass: float = 0.0
     glass_path: float = 0.0
     spot_sigma: float = 0.0
+    brightest: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 class LayoutBench:
@@ -130,9 +137,6 @@ class LayoutBench:
 
     def __init__(self, setup: MonitorDesignSetup, backend: Backend) -> None:
         self.setup, self.backend = setup, backend
-        ccd = setup.instrument.monitor.area_ccd
-        self.detector = EmvaDetector.from_sheet(setup.detector, ccd.exposure)
-        self.room = 0.5 * min(ccd.rows, ccd.columns) - EDGE_PX
 
     @cached_property
     def start(self) -> Instrument:
@@ -154,9 +158,22 @@ class LayoutBench:
         """Quantity -> rows on the parameters; the same in all layouts, which leave the cameras as they are."""
         return quantity_rows(self.start, ground_of(self.start))
 
+    def detector(self, name: str = AS_STARTED) -> EmvaDetector:
+        """Of the area CCD that a beam names."""
+        sheet = self.setup.detectors.get(name, self.setup.detector)
+        return EmvaDetector.from_sheet(sheet, self.setup.instrument.monitor.area_ccd.exposure)
+
     def goals_of(self, name: str) -> tuple[str, ...]:
         """Quantities of which a goal's value is the worst: ``d_f`` of every camera."""
         return tuple(key for key in self.rows if key == name or key.endswith(f"/{name}"))
+
+    def boards_apart(self, one: Beam, other: Beam) -> bool:
+        """Whether the area CCDs of two beams have room beside each other at an end of every line."""
+        ccd = layout_spec(self.setup, (one,)).monitor.area_ccd
+        return all(
+            abs(camera.line_focal_length * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
+            for camera in self.start.cameras.values()
+        )
 
     def try_beam(self, beam: Beam) -> BeamFacts:
         """A beam alone."""
@@ -164,8 +181,8 @@ class LayoutBench:
             instrument = build_instrument(layout_spec(self.setup, (beam,)), self.setup.cameras, self.backend)
             taken, mass = self.imaging.taken(instrument), prism_mass(instrument)
             self._check_limits(pupil_share(taken), mass)
-            information = self._information(instrument, alike=True)
-            self._check_spots(information)
+            information = self.information(instrument, beam, alike=True)
+            self._check_spots(information, instrument)
         except (InputError, AimError, BeamMissedError, OutsideLimitsError, ValueError) as error:
             return BeamFacts(beam, refused=_reason(error))
         bodies = convex_bodies(instrument)
@@ -202,9 +219,9 @@ class LayoutBench:
         share, mass = pupil_share(self.imaging.taken(instrument)), prism_mass(instrument)
         if limited:
             self._check_limits(share, mass)
-        information = self._information(instrument, alike=False)
+        information = self.information(instrument, beams[0])
         if limited:
-            self._check_spots(information)
+            self._check_spots(information, instrument)
         goals = [key for name in self.setup.test.goal.wanted for key in self.goals_of(name)]
         return LayoutFacts(
             beams,
@@ -216,12 +233,29 @@ class LayoutBench:
             mass=mass,
             glass_path=max(sum(lengths.values()) for lengths in instrument.glass_path.values()),
             spot_sigma=max(float(one.spot_sigma.max()) for one in information.values()),
+            brightest=next(iter(information.values())).brightest,
         )
 
-    def _information(self, instrument: Instrument, alike: bool) -> dict[str, Information]:
+    def information(
+        self, instrument: Instrument, beam: Beam, alike: bool = False, single: bool = True
+    ) -> dict[str, Information]:
+        """What an instrument's spots know, by the names of the disturbances.
+
+        Args:
+            instrument: a layout of this design.
+            beam: one of it, which names the area CCD.
+            alike: as of ``information_of``.
+            single: likewise.
+        """
         stated = self.setup.disturbances
         found = information_of(
-            instrument, list(stated.values()), self.detector, self.backend, ground_of(instrument), alike
+            instrument,
+            list(stated.values()),
+            self.detector(beam.area_ccd),
+            self.backend,
+            ground_of(instrument),
+            alike,
+            single,
         )
         return dict(zip(stated, found, strict=True))
 
@@ -232,10 +266,15 @@ class LayoutBench:
         if limits.mass is not None and mass > limits.mass:
             raise OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
 
-    def _check_spots(self, information: Mapping[str, Information]) -> None:
+    def _check_spots(self, information: Mapping[str, Information], instrument: Instrument) -> None:
+        ccd = instrument.spec.monitor.area_ccd
+        room = 0.5 * min(ccd.rows, ccd.columns) - EDGE_PX
         reach = self.setup.test.limits.spot_sigmas * max(float(one.spot_sigma.max()) for one in information.values())
-        if reach > self.room:
-            raise OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {self.room:.3g} px")
+        if reach > room:
+            raise OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {room:.3g} px")
+        fullest = max(float(one.brightest.max()) for one in information.values())
+        if fullest > FULLEST:
+            raise OutsideLimitsError(f"its spots are too bright: pixels are filled to {100.0 * fullest:.3g} percent")
 
 
 class OutsideLimitsError(Exception):

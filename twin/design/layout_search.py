@@ -1,5 +1,5 @@
 """Search for layouts: beams at random, tried alone; their combinations compared without a trace; the best built as a
-whole; their beams changed and combined anew.
+whole; their beams changed and combined anew; the best of all made better by gradients.
 
 Everything that is drawn is drawn here, in one order, and results are taken in the order in which they were asked for:
 so the same seed finds the same, however many workers there are and wherever it was broken off.
@@ -7,33 +7,28 @@ so the same seed finds the same, however many workers there are and wherever it 
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import combinations, zip_longest
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, islice, zip_longest
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 
-from optics.numerics.threads import LIMIT, one_blas_thread
-from scenes.models.monitor_layout import Beam, Layout, changed_beam, drawn_beam, kinds_of, start_beams
-from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, bench_of, combined, touching
+from scenes.models.monitor_layout import Beam, changed_beam, drawn_beam, kinds_of, start_beams
+from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, combined, touching
+from twin.design.layout_refinement import Ask, ratios, refined
 from twin.design.search_journal import Journal
+from twin.design.search_workers import Workers
 from twin.run.procedure import Advance
 
-Result = TypeVar("Result", BeamFacts, LayoutFacts)
-Do = Callable[[Callable[..., Any], Sequence[Any]], Iterable[Any]]
-"""Gives what a piece of work makes of every item, in their order."""
 FIRST_STEP = 0.15
 """Of the first change of a beam, relative to the range of each number."""
 _BATCHES = 4  # of layouts that are built until one stands
 KEPT = 2
 """Layouts of each number of beams whose beams the next round changes."""
+ALIKE = 0.02
+"""Relative difference of what two searches end with that is taken for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,30 +45,76 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What a search found.
+class End:
+    """Where one search came to.
 
     Attributes:
-        start: the layout that it started from.
-        layouts: all that were built as a whole and can stand, best first.
-        refused: why others cannot, with how many.
-        beams: that were tried.
+        name: of where it began: the instrument, or ``start 1``.
+        layouts: all that it built as a whole and that can stand, best first.
+        progress: best merit after the first draw and after each round.
+        refined: merits on the way by gradients; empty for none.
+        tried: beams.
         standing: of these, that can stand alone.
         compared: combinations whose merit was worked out.
         built: of these, built as a whole.
-        progress: best merit after the first draw and after each round.
-        seconds: that each part took.
+        refused: why beams and layouts cannot stand, with how many.
+    """
+
+    name: str
+    layouts: tuple[LayoutFacts, ...]
+    progress: tuple[float, ...]
+    refined: tuple[float, ...]
+    tried: int
+    standing: int
+    compared: int
+    built: int
+    refused: Mapping[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search found, with all its starts.
+
+    Attributes:
+        start: the layout of the instrument that it started from.
+        layouts: all that were built as a whole and can stand, best first.
+        ends: of the search from it, and of those from beams at random.
+        seconds: that it took.
     """
 
     start: LayoutFacts
     layouts: tuple[LayoutFacts, ...]
-    refused: Mapping[str, int]
-    beams: int
-    standing: int
-    compared: int
-    built: int
-    progress: tuple[float, ...]
-    seconds: Mapping[str, float]
+    ends: tuple[End, ...]
+    seconds: float
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Why others cannot stand, with how many."""
+        out: dict[str, int] = {}
+        for end in self.ends:
+            for reason, count in end.refused.items():
+                out[reason] = out.get(reason, 0) + count
+        return out
+
+    @property
+    def beams(self) -> int:
+        """That were tried."""
+        return sum(end.tried for end in self.ends)
+
+    @property
+    def standing(self) -> int:
+        """Beams that can stand alone."""
+        return sum(end.standing for end in self.ends)
+
+    @property
+    def compared(self) -> int:
+        """Combinations whose merit was worked out."""
+        return sum(end.compared for end in self.ends)
+
+    @property
+    def built(self) -> int:
+        """Layouts that were built as a whole."""
+        return sum(end.built for end in self.ends)
 
 
 def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> float:
@@ -83,14 +124,31 @@ def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> floa
         sigmas: disturbances -> quantity -> sigma, SI.
         bench: of the design.
     """
-    wanted = bench.setup.test.goal.wanted
-    return max(
-        own[key] / goal for own in sigmas.values() for name, goal in wanted.items() for key in bench.goals_of(name)
-    )
+    return max(ratios(sigmas, bench).values())
+
+
+def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
+    """Searches by what they end with: each group's merits lie within ``ALIKE`` of its best, the best group first.
+
+    Args:
+        found: of a search; ends without a layout are left out.
+        bench: of the design.
+    """
+
+    def least(end: End) -> float:
+        return merit(end.layouts[0].sigmas, bench)
+
+    groups: list[list[End]] = []
+    for end in sorted((end for end in found.ends if end.layouts), key=least):
+        if groups and least(end) <= (1.0 + ALIKE) * least(groups[-1][0]):
+            groups[-1].append(end)
+        else:
+            groups.append([end])
+    return groups
 
 
 class Search:
-    """A search at work.
+    """A search at work, with its starts.
 
     Args:
         bench: of the design.
@@ -101,11 +159,56 @@ class Search:
     """
 
     def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
-        self.bench, self.setup, self.advance = bench, bench.setup, advance
-        self.workers = workers
-        self.rng = np.random.default_rng(np.random.SeedSequence([seed, 0]))
-        self.config = bench.setup.to_yaml()
-        self.journal = Journal(journal, f"{seed}\n{self.config}")
+        self.bench, self.seed = bench, seed
+        kept = Journal(journal, f"{seed}\n{bench.setup.to_yaml()}")
+        self.workers = Workers(bench, workers, kept, advance)
+
+    def run(self) -> Found:
+        """Search."""
+        begun, setup = time.monotonic(), self.bench.setup
+        beams = start_beams(setup)
+        start = self.bench.judged(beams, self.bench.start, limited=False)
+        with self.workers as workers:
+            ends = [_OneSearch(self.bench, workers.ask, self._rng(0), "").run(beams)]
+            for number in range(1, setup.test.search.starts + 1):
+                name = f"start {number}"
+                ends.append(_OneSearch(self.bench, workers.ask, self._rng(number), name).run(()))
+        every = sorted((f for end in ends for f in end.layouts), key=lambda one: merit(one.sigmas, self.bench))
+        return Found(start, tuple(every), tuple(ends), time.monotonic() - begun)
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.seed, number]))
+
+
+def _promise(one: Candidate) -> tuple[float, tuple[int, ...]]:
+    return one.merit, one.beams
+
+
+def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
+    """So many of ranked layouts: half of them the best, the others evenly over the rest. The best are often much alike,
+    and have room for the same few others.
+
+    Args:
+        level: most promising first.
+        width: how many.
+    """
+    best, rest = list(level[: (width + 1) // 2]), level[(width + 1) // 2 :]
+    count = min(width - len(best), len(rest))
+    return [*best, *(rest[k * len(rest) // count] for k in range(count))]
+
+
+class _OneSearch:
+    """A search from one set of beams.
+
+    Args:
+        bench: of the design.
+        ask: for beams, layouts and slopes.
+        rng: source of everything drawn.
+        name: of where it begins; empty for the instrument that the design starts from.
+    """
+
+    def __init__(self, bench: LayoutBench, ask: Ask, rng: np.random.Generator, name: str) -> None:
+        self.bench, self.setup, self.ask, self.rng, self.name = bench, bench.setup, ask, rng, name
         self.pool: list[BeamFacts] = []
         self.tried: list[Beam] = []
         self.built: dict[tuple[int, ...], LayoutFacts] = {}
@@ -113,62 +216,72 @@ class Search:
         self.apart: dict[tuple[int, int], bool] = {}
         self.refused: dict[str, int] = {}
 
-    def run(self) -> Found:
-        """Search."""
+    def run(self, beams: Sequence[Beam]) -> End:
+        """Search from these beams, and from as many more at random as the design asks for."""
         spec = self.setup.test.search
-        marks: dict[str, float] = {}
-        start = self.bench.judged(start_beams(self.setup), self.bench.start, limited=False)
-        with self._workers() as do, self.journal:
-            clock = time.monotonic()
-            first = [*dict.fromkeys(start_beams(self.setup))]
-            while len(first) < spec.beams:
-                first.append(drawn_beam(self.setup, self.rng))
-            self._try(do, "beams one by one", first)
-            marks["beams"] = time.monotonic() - clock
-            clock = time.monotonic()
-            self._build(do, "layouts as a whole", spec.exact)
-            progress, step = [self._best()], FIRST_STEP
-            for number in range(spec.rounds):
-                parents = self._parents()
-                if not parents:
-                    break
-                changed = [
-                    changed_beam(self.setup, parents[k % len(parents)], step, self.rng) for k in range(spec.changed)
-                ]
-                self._try(do, f"round {number + 1}: beams", changed)
-                self._build(do, f"round {number + 1}: layouts", spec.exact)
-                progress.append(self._best())
-                step = step if progress[-1] < 0.98 * progress[-2] else 0.5 * step
-            marks["rounds"] = time.monotonic() - clock
-        standing = [facts for facts in self.built.values() if not facts.refused]
-        return Found(
-            start,
-            tuple(sorted(standing, key=lambda one: merit(one.sigmas, self.bench))),
-            self.refused,
+        first = [*dict.fromkeys(beams)]
+        while len(first) < spec.beams:
+            first.append(drawn_beam(self.setup, self.rng))
+        self._try(self._part("beams one by one"), first)
+        self._build(self._part("layouts as a whole"), spec.exact)
+        progress, step = [self._best()], FIRST_STEP
+        for number in range(spec.rounds):
+            parents = self._parents()
+            if not parents:
+                break
+            changed = [changed_beam(self.setup, parents[k % len(parents)], step, self.rng) for k in range(spec.changed)]
+            self._try(self._part(f"round {number + 1}: beams"), [*changed, *self._with_other_ccds()])
+            self._build(self._part(f"round {number + 1}: layouts"), spec.exact)
+            progress.append(self._best())
+            step = step if progress[-1] < 0.98 * progress[-2] else 0.5 * step
+        layouts = self._standing()
+        way = (
+            refined(self.bench, self.ask, self._part("refinement"), layouts[0], spec.refine, self.rng)
+            if layouts
+            else []
+        )
+        return End(
+            self.name or self.setup.instrument.name,
+            (*reversed(way[1:]), *layouts),
+            tuple(progress),
+            tuple(merit(facts.sigmas, self.bench) for facts in way[1:]),
             len(self.tried),
             len(self.pool),
             len(self.compared),
             len(self.built),
-            tuple(progress),
-            marks,
+            self.refused,
         )
 
-    def _try(self, do: Do, part: str, beams: Sequence[Beam]) -> None:
+    def _part(self, words: str) -> str:
+        return f"{self.name}: {words}" if self.name else words
+
+    def _standing(self) -> list[LayoutFacts]:
+        standing = [facts for facts in self.built.values() if not facts.refused]
+        return sorted(standing, key=lambda one: merit(one.sigmas, self.bench))
+
+    def _with_other_ccds(self) -> list[Beam]:
+        """The beams of the best layout with each other area CCD, which only all of them together can have."""
+        others, standing = self.setup.test.area_ccds or {}, self._standing()
+        beams = standing[0].beams if standing else ()
+        wanted = [replace(beam, area_ccd=name) for name in others for beam in beams]
+        return [beam for beam in wanted if beam not in self.tried]
+
+    def _try(self, part: str, beams: Sequence[Beam]) -> None:
         """Try beams alone; those that stand join the pool."""
         self.tried += beams
-        for facts in self._asked(do, part, _beam_work, beams):
+        for facts in self.ask(part, beams):
             if facts.refused:
                 self._refuse(facts.refused)
             else:
                 self.pool.append(facts)
 
-    def _build(self, do: Do, part: str, count: int) -> None:
+    def _build(self, part: str, count: int) -> None:
         """Build the most promising layouts that were not built yet, until some stand."""
         for _ in range(_BATCHES):
             chosen = self._chosen(count)
             layouts = [tuple(self.pool[k].beam for k in candidate.beams) for candidate in chosen]
             stood = False
-            for candidate, facts in zip(chosen, self._asked(do, part, _layout_work, layouts), strict=True):
+            for candidate, facts in zip(chosen, self.ask(part, layouts), strict=True):
                 self.built[candidate.beams] = facts
                 stood = stood or not facts.refused
                 if facts.refused:
@@ -178,24 +291,33 @@ class Search:
 
     def _chosen(self, count: int) -> list[Candidate]:
         """The most promising layouts that were not built yet, in turn of each number of beams, the largest first."""
-        waiting = [one for one in self._ranked() if one.beams not in self.built]
-        sizes = sorted({len(one.beams) for one in waiting}, reverse=True)
-        by_size = [[one for one in waiting if len(one.beams) == size] for size in sizes]
-        turns = [one for turn in zip_longest(*(some[:count] for some in by_size)) for one in turn if one is not None]
+        by_size = [[one for one in some if one.beams not in self.built][:count] for some in reversed(self._ranked())]
+        turns = [one for turn in zip_longest(*by_size) for one in turn if one is not None]
         return turns[:count]
 
-    def _ranked(self) -> list[Candidate]:
-        """All beams alone, and to the best of each number of beams every further one; most promising first."""
-        spec = self.setup.test
-        every = [self._candidate((k,)) for k in range(len(self.pool))]
-        level = every
+    def _ranked(self) -> list[list[Candidate]]:
+        """Layouts of one beam, of two, and so on, that may stand, the most promising first: all beams alone, and to the
+        best of each number of beams every further one.
+
+        They are compared before it is asked whether they may stand: that is asked of the most promising ones alone, and
+        a pair whose beams are good together is found though neither is good alone.
+        """
+        spec, size = self.setup.test, len(self.pool)
+        level = sorted((self._candidate((k,)) for k in range(size)), key=_promise)
+        every = [level]
         for _ in range(spec.beams - 1):
-            width = max(spec.search.layouts // max((spec.beams - 1) * len(self.pool), 1), 1)
-            best = sorted(level, key=lambda one: one.merit)[:width]
-            sets = {tuple(sorted({*one.beams, k})) for one in best for k in range(len(self.pool)) if k not in one.beams}
-            level = [self._candidate(beams) for beams in sorted(sets) if self._may_stand(beams)]
-            every = [*every, *level]
-        return sorted(every, key=lambda one: (one.merit, one.beams))
+            width = max(spec.search.layouts // max((spec.beams - 1) * size, 1), 1)
+            sets = {
+                tuple(sorted({*one.beams, k}))
+                for one in spread(level, width)
+                for k in range(size)
+                if k not in one.beams
+            }
+            promising = sorted((self._candidate(beams) for beams in sets if self._alike(beams)), key=_promise)
+            standing = (one for one in promising if one.beams in self.built or self._may_stand(one.beams))
+            level = [*islice(standing, width + len(self.built))]
+            every.append(level)
+        return every
 
     def _candidate(self, beams: tuple[int, ...]) -> Candidate:
         if beams not in self.compared:
@@ -211,11 +333,14 @@ class Search:
         return Candidate(beams, self.compared[beams])
 
     def _may_stand(self, beams: Sequence[int]) -> bool:
-        return self._alike(beams) and self._within(beams) and self._fits(beams)
+        return self._within(beams) and self._fits(beams)
 
     def _alike(self, beams: Sequence[int]) -> bool:
-        """Whether all beams have the same kinds of reflectors: an instrument's channels are traced together."""
-        return len({kinds_of(self.setup, self.pool[k].beam) for k in beams}) == 1
+        """Whether all beams have the same kinds of reflectors, since an instrument's channels are traced together, and
+        the same area CCD.
+        """
+        some = [self.pool[k].beam for k in beams]
+        return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in some}) == 1
 
     def _within(self, beams: Sequence[int]) -> bool:
         """Whether beams together keep the limits of mass and pupil."""
@@ -232,7 +357,8 @@ class Search:
         """Whether prisms of no two beams stand in each other."""
         for pair in combinations(beams, 2):
             if pair not in self.apart:
-                self.apart[pair] = not touching(self.pool[pair[0]], self.pool[pair[1]])
+                one, other = (self.pool[k] for k in pair)
+                self.apart[pair] = self.bench.boards_apart(one.beam, other.beam) and not touching(one, other)
             if not self.apart[pair]:
                 return False
         return True
@@ -241,8 +367,7 @@ class Search:
         """Beams of the best layouts that stand, of each number of beams: a pair may have to change before it is better
         than a beam alone.
         """
-        standing = [facts for facts in self.built.values() if not facts.refused]
-        best = sorted(standing, key=lambda one: merit(one.sigmas, self.bench))
+        best = self._standing()
         sizes = sorted({len(one.beams) for one in best})
         kept = [[one for one in best if len(one.beams) == size][:KEPT] for size in sizes]
         return list(dict.fromkeys(beam for some in reversed(kept) for one in some for beam in one.beams))
@@ -255,53 +380,3 @@ class Search:
         words = ["…" if any(c.isdigit() or c == "/" for c in word) else word for word in reason.split(":")[0].split()]
         kind = " ".join(words)
         self.refused[kind] = self.refused.get(kind, 0) + 1
-
-    def _asked(self, do: Do, part: str, work: Callable[..., Result], items: Sequence[Any]) -> list[Result]:
-        """Results in the order of the items; those that the journal has are not worked out again."""
-        out: dict[int, Result] = {}
-        missing = []
-        for k, item in enumerate(items):
-            known = self.journal.known(item)
-            if known is None:
-                missing.append(k)
-            else:
-                out[k] = known
-        self.advance(part, len(out), len(items))
-        backend = self.bench.backend.name
-        for k, result in zip(missing, do(work, [(self.config, backend, items[m]) for m in missing]), strict=True):
-            out[k] = result
-            self.journal.keep(items[k], result)
-            self.advance(part, len(out), len(items))
-        return [out[k] for k in range(len(items))]
-
-    @contextmanager
-    def _workers(self) -> Iterator[Do]:
-        """What does work on all items, in order, here or in processes of one thread each."""
-        if not self.workers:
-            yield lambda work, items: (_here(work, self.bench, item) for item in items)
-            return
-        before = os.environ.get(LIMIT)
-        os.environ[LIMIT] = "1"  # read by the processes as they start
-        try:
-            with ProcessPoolExecutor(self.workers, multiprocessing.get_context("spawn")) as pool:
-                yield lambda work, items: pool.map(work, items)
-        finally:
-            if before is None:
-                os.environ.pop(LIMIT)
-            else:
-                os.environ[LIMIT] = before
-
-
-def _here(work: Callable[..., Any], bench: LayoutBench, item: tuple[str, str, Any]) -> Any:
-    with one_blas_thread():
-        return bench.try_beam(item[2]) if work is _beam_work else bench.try_layout(item[2])
-
-
-def _beam_work(item: tuple[str, str, Beam]) -> BeamFacts:
-    with one_blas_thread():
-        return bench_of(item[0], item[1]).try_beam(item[2])
-
-
-def _layout_work(item: tuple[str, str, Layout]) -> LayoutFacts:
-    with one_blas_thread():
-        return bench_of(item[0], item[1]).try_layout(item[2])

@@ -16,12 +16,15 @@ from scenes.models.monitor_layout import (
     layout_spec,
     resolve_monitor_design,
 )
+from scenes.specs.channel import channel_of, prism_of
+from scenes.specs.detector import DetectorSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts
-from twin.design.layout_search import Found, Search, merit
+from twin.design.layout_search import Found, Search, merit, optima
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.stray_light import ghost_warnings, stray_light
+from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 from twin.run.procedure import Advance, BenchError, Procedure, silent
 
 MOST_POINTS = 6
@@ -93,11 +96,12 @@ def run_monitor_design(
         journal: file that keeps what was tried, to go on with; None for none.
 
     Raises:
-        InputError: the instrument that it starts from cannot stand.
+        InputError: the instrument that it starts from cannot stand, or throws ghosts on a spot that are not allowed.
         BenchError: no beam and no layout that was tried can stand.
         RunFolderError: the journal is another search's, or cannot be written.
     """
     bench = LayoutBench(setup, backend)
+    _check_start(setup, backend, seed, advance)
     found = Search(bench, workers, seed, journal, advance).run()
     if not found.layouts:
         most = max(found.refused.items(), key=lambda item: item[1], default=("", 0))
@@ -118,22 +122,45 @@ def run_monitor_design(
     return MonitorDesignRun(setup, bench, found, tuple(points))
 
 
+def _check_start(setup: MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
+    """Refuse a start with ghosts, where they are to be traced: every layout has its prisms' tilts.
+
+    Raises:
+        InputError: at the tilt of the prism that throws the strongest one.
+    """
+    spec = setup.instrument
+    for ghost in _traced_ghosts(setup, spec, setup.detector, backend, seed, advance):
+        prism, owner = prism_of(ghost.body or ""), channel_of(f"{ghost.body}/")
+        key = ("monitor",) if prism is None or owner is None else spec.key_of(*owner, ("monitor", prism, "tilt"))
+        problem = f"{ghost.body or ghost.source} throws a ghost on {ghost.channel.ccd_body}: {ghost.text}"
+        raise spec.error(problem, key, allowed=f"ghosts of at most {GHOSTS:g} of a spot's light")
+
+
 def _ghosts(
     setup: MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
-) -> tuple[str, ...]:
-    """What is wrong with a layout's ghosts; nothing where they are not to be traced."""
+) -> tuple[Ghost, ...]:
+    """A layout's ghosts; none where they are not to be traced."""
+    detector = setup.detectors.get(facts.beams[0].area_ccd, setup.detector)
+    return _traced_ghosts(setup, layout_spec(setup, facts.beams), detector, backend, seed, advance)
+
+
+def _traced_ghosts(
+    setup: MonitorDesignSetup,
+    spec: InstrumentSpec,
+    detector: DetectorSpec,
+    backend: Backend,
+    seed: int,
+    advance: Advance,
+) -> tuple[Ghost, ...]:
     paths = setup.test.limits.ghost_paths
     if paths is None:
         return ()
     advance("ghosts", 0, 1)
     job = ResolvedJob.model_construct(
-        job=JobSpec(instrument=setup.test.instrument),
-        instrument=layout_spec(setup, facts.beams),
-        cameras=setup.cameras,
-        detector=setup.detector,
+        job=JobSpec(instrument=setup.test.instrument), instrument=spec, cameras=setup.cameras, detector=detector
     )
     experiment = MonitorExperiment(job, backend)
-    return ghost_warnings(experiment, stray_light(experiment, {}, paths, seed))
+    return ghosts(experiment, stray_light(experiment, {}, paths, seed))
 
 
 def _texts(facts: LayoutFacts, bench: LayoutBench) -> dict[str, str]:
@@ -204,10 +231,12 @@ def beam_numbers(beam: Beam) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for item in fields(beam):
         value = getattr(beam, item.name)
-        if item.name == "prisms":
-            out["prisms"] = value
+        if item.name in ("prisms", "area_ccd"):
+            out[item.name] = value
         elif item.name == "field":
             out["field_deg"] = degrees(value)
+        elif item.name == "photons":
+            out["photons"] = value
         else:
             out[f"{item.name}_mm"] = 1e3 * value
     return out
@@ -269,9 +298,17 @@ def monitor_design_numbers(run: MonitorDesignRun) -> dict[str, Any]:
             "layouts_compared": found.compared,
             "layouts_built": found.built,
             "layouts_standing": len(found.layouts),
-            "merit_by_round": list(found.progress),
             "refused": dict(found.refused),
         },
+        "ends": {
+            end.name: {
+                "merit_by_round": list(end.progress),
+                "merit_by_refinement": list(end.refined),
+                "best": layout_numbers(run, end.layouts[0]) if end.layouts else None,
+            }
+            for end in found.ends
+        },
+        "optima": [[end.name for end in group] for group in optima(found, run.bench)],
     }
 
 

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.monitor_layout import layout_spec
+from scenes.models.monitor_layout import layout_spec, number_of
 from twin.design.layout_bench import LayoutFacts
+from twin.design.layout_search import ALIKE, optima
 from twin.design.monitor_design import GOAL_NAMES, UNITS, MonitorDesignRun, Point, verdict
 from twin.main_job.light_path_plots import side_view_svg
 from twin.pictures.light_paths import trace_light_paths
@@ -50,6 +51,7 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     drawings = tuple(_drawing(run, point) for point in run.points[:2])
     sections = (
         Section("The front", (_search_text(run),), (front, _beams_table(run))),
+        *([Section("Several starts", (starts_text(run),), (_starts_table(run),))] if len(found.ends) > 1 else []),
         Section("What limits it", (), (causes, *(_cause_table(run, name) for name in setup.disturbances))),
         Section("The layouts", (), (pupils, *drawings)),
         Section(
@@ -89,22 +91,60 @@ def _search_text(run: MonitorDesignRun) -> str:
     refused = sorted(found.refused.items(), key=lambda item: -item[1])[:3]
     if refused:
         text += " Most were refused since " + "; ".join(f"{reason} ({count})" for reason, count in refused) + "."
-    steps = ", ".join(f"{value:.3g}" for value in found.progress)
-    return f"{text} The best ratio to the goal after the first draw and after each round: {steps}."
+    first = found.ends[0]
+    steps = ", ".join(f"{value:.3g}" for value in first.progress)
+    text += f" The best ratio to the goal after the first draw and after each round: {steps}"
+    if first.refined:
+        text += "; then by gradients: " + ", ".join(f"{value:.4g}" for value in first.refined)
+    return f"{text}."
+
+
+def starts_text(run: MonitorDesignRun) -> str:
+    """Whether all starts come to the same end."""
+    groups, count = optima(run.found, run.bench), len(run.found.ends)
+    lost = count - sum(len(group) for group in groups)
+    best = [run.merit(group[0].layouts[0]) for group in groups]
+    worst = max(run.merit(end.layouts[0]) for group in groups for end in group)
+    if len(groups) == 1:
+        text = f"All {count - lost} searches end within {100.0 * (worst / best[0] - 1.0):.2g} % of the same goal"
+    else:
+        each = "; ".join(
+            f"{value:.4g} ({', '.join(end.name for end in group)})" for value, group in zip(best, groups, strict=True)
+        )
+        text = (
+            f"The searches end at {len(groups)} goals that differ by more than {100.0 * ALIKE:.0f} %: {each}. These "
+            "are several optima, or searches that were too short to come to one"
+        )
+    return f"{text}; {lost} found no layout that stands." if lost else f"{text}."
+
+
+def _starts_table(run: MonitorDesignRun) -> Table:
+    rows: list[list[Cell]] = []
+    for end in run.found.ends:
+        if not end.layouts:
+            rows.append([end.name, 0, *[float("nan")] * 3, ""])
+            continue
+        best, own = end.layouts[0], end.progress[-1]
+        through = "; ".join(f"{1e3 * beam.pupil_x:.0f}, {1e3 * beam.pupil_y:.0f}" for beam in best.beams)
+        rows.append([end.name, len(best.beams), own, run.merit(best), 100.0 * best.pupil_share, through])
+    heads = ("from", "beams per end", "σ / goal before gradients", "σ / goal", "pupil [%]", "pupil x, y [mm]")
+    places = (None, None, 4, 4, 1, None)
+    return Table("starts", "Where each start ends", "The best layout of every search.", heads, rows, places)
 
 
 def _beams_table(run: MonitorDesignRun) -> Table:
     heads = ("layout", "beam", "pupil x [mm]", "pupil y [mm]", "width [mm]", "field [deg]", "180° prism [m]")
-    more = ("0° prism [m]", "shift [mm]", "facet x [mm]", "facet y [mm]", "prisms")
+    more = ("0° prism [m]", "shift [mm]", "facet x [mm]", "facet y [mm]", "photons [1e6]", "prisms", "area CCD")
     rows: list[list[Cell]] = []
     for name, facts in _named(run):
         for n, beam in enumerate(facts.beams, 1):
             mm = [1e3 * v for v in (beam.pupil_x, beam.pupil_y, beam.width)]
             rest = [1e3 * v for v in (beam.shift, beam.spread_x, beam.spread_y)]
             places = [float(np.degrees(beam.field)), beam.prism_180_distance, beam.prism_0_distance]
-            rows.append([name, n, *mm, *places, *rest, beam.prisms])
+            light = 1e-6 * number_of(run.setup, beam, "photons")
+            rows.append([name, n, *mm, *places, *rest, light, beam.prisms, beam.area_ccd])
     title = "Beams of the layouts"
-    places_shown = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, None)
+    places_shown = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, 1, None, None)
     return Table("beams", title, "Each stands at both ends of both lines.", (*heads, *more), rows, places_shown)
 
 

@@ -16,10 +16,16 @@ import numpy as np
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models.monitor_layout import Beam
 from twin.design.layout_bench import BeamFacts, LayoutFacts, Seen
+from twin.design.layout_gradient import LayoutNumber, Slope
 from twin.run.run_folder import RunFolderError
 from twin.run.versions import source_digest
 
-_CLASSES: Mapping[str, type[Any]] = {cls.__name__: cls for cls in (Beam, BeamFacts, LayoutFacts, Seen)}
+_CLASSES: Mapping[str, type[Any]] = {
+    cls.__name__: cls for cls in (Beam, BeamFacts, LayoutFacts, LayoutNumber, Seen, Slope)
+}
+
+Item = Beam | tuple[Beam, ...] | LayoutNumber
+"""What can be tried."""
 
 
 class Journal:
@@ -71,11 +77,11 @@ class Journal:
             if kind is None:
                 self.file.unlink(missing_ok=True)
 
-    def known(self, item: Beam | tuple[Beam, ...]) -> Any:
-        """What came of a beam or a layout, None if it was not tried."""
+    def known(self, item: Item) -> Any:
+        """What came of a beam, a layout or a number of one, None if it was not tried."""
         return self._known.get(_name(item))
 
-    def keep(self, item: Beam | tuple[Beam, ...], result: BeamFacts | LayoutFacts) -> None:
+    def keep(self, item: Item, result: BeamFacts | LayoutFacts | Slope) -> None:
         """Keep what came of it."""
         if self._out is not None:
             self._write(json.dumps({"of": _name(item), "is": _encoded(result)}))
@@ -86,7 +92,7 @@ class Journal:
         self._out.flush()
 
 
-def _name(item: Beam | tuple[Beam, ...]) -> str:
+def _name(item: Item) -> str:
     return repr(item)
 
 

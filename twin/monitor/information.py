@@ -42,11 +42,13 @@ class Information:
         disturbances: stated, with their derivatives: D spot coordinates, K cameras.
         noise: (D, D) px^2 of the shifts, of the images before and after together.
         quantities: name -> (n, 4 K) rows on all parameters; the quantity's variance is the mean of the rows'.
+        brightest: (C,) expected light of every spot's brightest pixel, as a share of what a pixel can hold.
     """
 
     disturbances: Disturbances
     noise: np.ndarray
     quantities: Mapping[str, np.ndarray]
+    brightest: np.ndarray
 
     @cached_property
     def fisher(self) -> np.ndarray:
@@ -72,6 +74,18 @@ class Information:
     def sigma(self, name: str) -> float:
         """What is left of a quantity, SI."""
         return _spread(self.quantities[name], self.posterior)
+
+    def slopes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of a quantity's sigma by A, (D, M), and by the noise R, (D, D); SI per pixel and per px^2.
+
+        The gain is the one of least variance, so that its own change does not count: with w = gain' row the variance
+        changes by 2 w' dA C (A' w - B' row) + w' dR w.
+        """
+        stated, rows = self.disturbances, self.quantities[name]
+        weights = rows @ self.gain
+        left = (weights @ stated.spots - rows @ stated.parameters) @ stated.correlation
+        scale = 2.0 * self.sigma(name) * len(rows)
+        return 2.0 * weights.T @ left / scale, weights.T @ weights / scale
 
     def sigma_before(self, name: str) -> float:
         """The same without any measurement."""
@@ -107,6 +121,7 @@ def information_of(
     backend: Backend,
     ground: GroundGeometry | None = None,
     alike: bool = False,
+    single: bool = True,
 ) -> list[Information]:
     """What an instrument's spots know, one for each statement of what moves.
 
@@ -117,16 +132,22 @@ def information_of(
         backend: where to trace.
         ground: of a pair; the height is then one of the quantities.
         alike: spots of one camera and one beam width are taken to have the same noise.
+        single: pictures of the spots in single precision, as all others; in double where they are differentiated.
 
     Raises:
         InputError: the disturbances name a body that the instrument does not have.
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
     path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
-    noise = spot_noise(path, detector, alike)
+    noise, brightest = _noise_of_spots(path, detector, alike, single)
     rows = quantity_rows(instrument, ground)
     return [
-        Information(disturbances_of(motions_of_spec(spec, instrument), path, thermal, instrument, backend), noise, rows)
+        Information(
+            disturbances_of(motions_of_spec(spec, instrument), path, thermal, instrument, backend),
+            noise,
+            rows,
+            brightest,
+        )
         for spec in stated
     ]
 
@@ -172,17 +193,25 @@ def spot_noise(path: MonitorPath, detector: EmvaDetector, alike: bool = False) -
     Raises:
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
+    return _noise_of_spots(path, detector, alike, single=True)[0]
+
+
+def _noise_of_spots(
+    path: MonitorPath, detector: EmvaDetector, alike: bool, single: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """What ``spot_noise`` gives, and the share of what a pixel can hold that every spot's brightest one gets, (C,)."""
     channels, spec = path.channels, path.instrument.spec
     groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
     shown = tuple(c for c in channels if c in groups.values())
     own = path if len(shown) == len(channels) else MonitorPath(replace(path.instrument, channels=shown), path.backend)
-    photons = own.expected_photons([{}], margin=_SLOPE)[0]
+    photons = own.expected_photons([{}], margin=_SLOPE, single=single)[0]
     exposure = spec.monitor.area_ccd.exposure
     model, dark = detector.noise_model(exposure), float(detector.expected_dn(np.zeros((1, 1)), exposure)[0, 0])
-    out = np.zeros((len(channels), 2, len(channels), 2))
+    out, brightest = np.zeros((len(channels), 2, len(channels), 2)), np.zeros(len(channels))
     for k, channel in enumerate(channels):
         like = groups[(channel.camera, channel.aperture) if alike else channel.key]
         image = photons[shown.index(like)] * (channel.photons / like.photons)
         light = detector.expected_dn(image, exposure) - dark
         out[k, :, k, :] = 2.0 * image_bound(light[None], dark, model, spec.monitor.frames)[0]
-    return out.reshape(2 * len(channels), -1)
+        brightest[k] = light.max() / (detector.saturation_dn - dark)
+    return out.reshape(2 * len(channels), -1), brightest

@@ -16,8 +16,9 @@ from scipy.signal import fftconvolve
 
 from optics.geometry.tree import State
 from optics.waves.diffraction import Grid, image
+from scenes.specs.channel import Channel, prism_of
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.families import Touch, family_name
+from twin.path_tracing.families import Event, Touch, family_name
 from twin.path_tracing.path_result import Family
 from twin.path_tracing.stray_rays import StrayResult, trace_stray
 
@@ -120,8 +121,45 @@ def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
     return np.asarray(spots / spots.sum(axis=(1, 2), keepdims=True))
 
 
+@dataclass(frozen=True)
+class Ghost:
+    """Ghosts on one area CCD that have more than GHOSTS of its own spot's light.
+
+    Attributes:
+        channel: whose area CCD it is.
+        source: channel that the strongest comes from, ``<camera>/<side>``.
+        body: path of the prism that throws it, the first whose face reflects what it should let pass; None where it
+            comes from nothing but nominal surfaces in another order.
+        text: all in words.
+    """
+
+    channel: Channel
+    source: str
+    body: str | None
+    text: str
+
+
 def ghost_warnings(experiment: MonitorExperiment, light: StrayLight) -> tuple[str, ...]:
     """One warning for each area CCD on which ghosts of any source have more than GHOSTS of its own spot's light."""
+    return tuple(ghost.text for ghost in ghosts(experiment, light))
+
+
+def _thrower(family: Family, usual: tuple[Touch, ...]) -> str | None:
+    known = {(touch.part, touch.event) for touch in usual}
+    for touch in family.touches:
+        prism = prism_of(touch.part)
+        if prism is not None and touch.event == Event.REFLECT and (touch.part, touch.event) not in known:
+            return f"{touch.part.partition(f'/{prism}/')[0]}/{prism}"
+    return None
+
+
+def ghosts(experiment: MonitorExperiment, light: StrayLight) -> tuple[Ghost, ...]:
+    """Area CCDs on which ghosts of any source have more than GHOSTS of their own spot's light.
+
+    Args:
+        experiment: the monitor.
+        light: traced.
+    """
     out, traced = [], light.traced
     for channel in experiment.path.channels:
         name = f"{channel.key}/area_ccd"
@@ -137,10 +175,11 @@ def ghost_warnings(experiment: MonitorExperiment, light: StrayLight) -> tuple[st
             share, source, family = max(found, key=lambda one: one[0])
             off = np.hypot(*np.subtract(family.centroid, own.centroid)) / experiment.path.pitch
             usual = traced.runs[source].nominal(f"{source}/area_ccd").touches
-            out.append(
+            text = (
                 f"ghosts on the area CCD of {channel.key} have {100.0 * total:.2g} % of its spot's light and pull the "
                 f"spot by that share of what it moves and they do not; the strongest, {100.0 * share:.2g} %, comes "
                 f"from {source} by {family_name(family.touches, usual)}, {off:.3g} px from the spot: another tilt of "
                 "that prism, or another field, leads it aside"
             )
+            out.append(Ghost(channel, source, _thrower(family, usual), text))
     return tuple(out)

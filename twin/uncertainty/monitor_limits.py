@@ -34,6 +34,9 @@ FIELD = 0.1 * ARCSEC
 500 km, what control points of that accuracy give."""
 DAY = 86400.0
 MORE_FRAMES = 4
+UNMOVED = 1e-8
+"""Standard deviation before any measurement, arcsec, um or m, up to which a quantity is taken as one that nothing
+stated changes: what rounding makes of a trace is 1e-10."""
 _DRAWS = 100_000
 _STATES = 6
 """Of which the covariance of a shift is averaged; it differs by some per cent from one to another."""
@@ -139,7 +142,8 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
 def find_limits(
     experiment: MonitorExperiment, noise: np.ndarray, frames: int, second_monitor: bool = False
 ) -> MonitorLimits | None:
-    """What limits the readings; None where nothing is stated to move.
+    """What limits the readings of all quantities that what is stated changes; None where nothing is stated to move, or
+    nothing that changes a camera.
 
     Args:
         experiment: the instrument.
@@ -154,7 +158,10 @@ def find_limits(
     if stated is None:
         return None
     cameras = experiment.cameras
-    found = limits.quantities(cameras, experiment.ground)
+    before = np.sqrt(np.diag(stated.parameter_covariance))
+    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > UNMOVED)
+    if not found:
+        return None
     rows = np.stack([quantity.row for quantity in found])
     still = np.zeros((1, len(experiment.path.channels), 2))
     shifts = Shifts(still, still, noise[None], cameras, stated)

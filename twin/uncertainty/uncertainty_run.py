@@ -58,7 +58,14 @@ def run_uncertainty(
     experiment = MonitorExperiment(resolved, backend)
     noise = expected_covariance(experiment, resolved.frames)
     limits = find_limits(experiment, noise, resolved.frames, second_monitor=True)
-    assert limits is not None
+    if limits is None:
+        raise InputError(
+            Issue(
+                "nothing that is stated to move changes a camera, so that there is nothing to be measured",
+                found=str(resolved.disturbances.name),
+                allowed="disturbances of cameras, their mirrors or focal planes",
+            )
+        )
     advance(SPREAD, 1, 1)
     seed, coverage = resolved.job.render.seed, None
     if states:
