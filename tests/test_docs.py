@@ -31,6 +31,7 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
+from scenes.specs.measurement_setup import read_frame_table
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
@@ -125,8 +126,13 @@ def test_every_block_is_of_a_sort_that_is_tested() -> None:
 
 
 def tables() -> list[Piece]:
-    """Contents of CSV files: of a course's table."""
+    """Contents of CSV files: of a course's table, or of a measurement's frames."""
     return blocks("csv")
+
+
+def of_frames(block: Piece) -> bool:
+    """Whether a table lists files of frames."""
+    return block.text.startswith("channel,")
 
 
 def models_of(text: str) -> list[type[Any]]:
@@ -154,7 +160,19 @@ def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument, backend) -> N
         build_instrument(spec, {site.camera: load_camera(site.camera) for site in spec.cameras.values()}, backend)
 
 
-@pytest.mark.parametrize("block", tables(), ids=str)
+@pytest.mark.parametrize("block", [block for block in tables() if of_frames(block)], ids=str)
+def test_a_table_of_frames_can_be_read(block: Piece, tmp_path: Path) -> None:
+    heads, *rows = (line.split(",") for line in block.text.splitlines())
+    for row in rows:
+        (tmp_path / row[heads.index("file")]).touch()
+    (tmp_path / "table.csv").write_text(block.text, "utf-8")
+    channels = tuple(dict.fromkeys(row[heads.index("channel")] for row in rows))
+    frames, times = read_frame_table(tmp_path / "table.csv", channels)
+    assert sum(len(one.before) + sum(map(len, one.after)) for one in frames.values()) == len(rows)
+    assert times
+
+
+@pytest.mark.parametrize("block", [block for block in tables() if not of_frames(block)], ids=str)
 def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(block.text, "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ncourse: {table: table.csv}\n", "utf-8")
