@@ -31,6 +31,7 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
+from scenes.specs.measurement_setup import read_frame_table
 from scenes.specs.resolved import resolve
 from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
@@ -138,6 +139,8 @@ MEASURED = {
     "docs/measured_orbit.md": tuple(COLUMNS.values()),
 }
 """Page whose tables are measurements and no courses -> columns of the sorts of table that it shows."""
+FRAMES = "docs/measured_frames.md"
+"""Page whose tables list files of frames."""
 
 
 def models_of(text: str) -> list[type[Any]]:
@@ -177,7 +180,19 @@ def test_a_table_of_measurements_can_be_read(block: Piece, tmp_path: Path) -> No
     assert len(found[0]) == len(block.text.splitlines()) - 1
 
 
-@pytest.mark.parametrize("block", [block for block in tables() if block.page not in MEASURED], ids=str)
+@pytest.mark.parametrize("block", [block for block in tables() if block.page == FRAMES], ids=str)
+def test_a_table_of_frames_can_be_read(block: Piece, tmp_path: Path) -> None:
+    heads, *rows = (line.split(",") for line in block.text.splitlines())
+    for row in rows:
+        (tmp_path / row[heads.index("file")]).touch()
+    (tmp_path / "table.csv").write_text(block.text, "utf-8")
+    channels = tuple(dict.fromkeys(row[heads.index("channel")] for row in rows))
+    frames, times = read_frame_table(tmp_path / "table.csv", channels)
+    assert sum(len(one.before) + sum(map(len, one.after)) for one in frames.values()) == len(rows)
+    assert times
+
+
+@pytest.mark.parametrize("block", [block for block in tables() if block.page not in (*MEASURED, FRAMES)], ids=str)
 def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(block.text, "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ncourse: {table: table.csv}\n", "utf-8")

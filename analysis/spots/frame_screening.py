@@ -38,6 +38,7 @@ _UNLIKE = 0.01
 _FEWEST_UNLIKE = 40
 _BORDER_PX = 4
 _SATURATION_SIGMAS = 4.0
+_LEAST_SHARE, _UNKNOWN = 1e-3, 1e12
 _MOST_MOVES, _SMALL_PX, _LARGEST_PX = 4, 0.1, 5.0
 """A frame that has moved by more than the second is compared with the reference there, so often at most, up to the
 third."""
@@ -251,7 +252,9 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
             shifted = ndimage.shift(reference[k], place, order=3, mode="nearest") if np.any(place) else reference[k]
             basis = _basis(shifted)
             solution, inverse = _robust(basis, frame, weight)
-            further = -solution[1:3] / solution[0]
+            # of frames without light nothing can be said
+            share = max(abs(float(solution[0])), _LEAST_SHARE)
+            further = -solution[1:3] / share
             if np.max(np.abs(further)) < _SMALL_PX or np.max(np.abs(place + further)) > _LARGEST_PX:
                 break
             place = place + further
@@ -261,7 +264,7 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
         light[k], level[k] = solution[0], solution[-1]
         # a spot that has moved by d is its reference minus d times the slope
         offset[k] = place + further
-        spread[k] = inverse[1:3, 1:3] / solution[0] ** 2
+        spread[k] = np.clip(inverse[1:3, 1:3], -_UNKNOWN, _UNKNOWN) / share**2
     # of two frames that differ the brighter one was struck
     struck = z > threshold if count == 2 else np.abs(z) > threshold
     for k in range(count):

@@ -166,7 +166,7 @@ def _found(
 ) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
     """Frames in a folder, or listed in a table; and the times of a series, none for a single state."""
     if is_file(place) and place.suffix.lower() == ".csv":
-        return _FrameTable(place, channels).read()
+        return read_frame_table(place, channels)
     if is_file(place):
         raise spec.error(
             "neither a folder nor a table", ("frames",), found=spec.frames,
@@ -193,6 +193,19 @@ def _found(
             files[when] = (str((place / file).absolute()),)
         frames[channel] = ChannelFramesSpec.model_construct(before=files[BEFORE], after=(files[AFTER],))
     return frames, ()
+
+
+def read_frame_table(path: Path, channels: tuple[str, ...]) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
+    """Frames of every channel, by their absolute paths, and the times of a series; none for a single state.
+
+    Args:
+        path: of the CSV table.
+        channels: that it has to list.
+
+    Raises:
+        InputError: the table cannot be read, with its line.
+    """
+    return _FrameTable(path, channels).read()
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from twin.study.__main__ import app as study
 
 FOLDERS = {
     "examples/study": "study",
+    "examples/measured": "measurement",
     "examples/design_monitor": "monitor_design",
     "examples/design": "camera_design",
     "examples/": "job",

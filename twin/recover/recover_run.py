@@ -84,19 +84,22 @@ class _Bench:
         return crosstalk(self.experiment, {name: spread[np.ix_(k, k)] for name, k in own.items()})
 
 
-def run_recover(setup: MeasurementSetup, backend: Backend, advance: Advance = silent) -> RecoverRun:
+def run_recover(
+    setup: MeasurementSetup, backend: Backend, advance: Advance = silent, experiment: MonitorExperiment | None = None
+) -> RecoverRun:
     """Measure the spots and read what they say.
 
     Args:
         setup: the measurement.
         backend: where the instrument is traced.
         advance: told what is being done.
+        experiment: the instrument where it has been built already; results are the same.
 
     Raises:
         InputError: files that cannot be read, or spots that cannot be measured, by name.
     """
     advance(CALIBRATE, 0, 1)
-    bench = _modelled(setup, backend) if setup.model is not None else _formulas(setup)
+    bench = _modelled(setup, backend, experiment) if setup.model is not None else _formulas(setup)
     advance(CALIBRATE, 1, 1)
     count = len(setup.channels)
     channels = read_measurement(setup, bench.noise, bench.ccd, lambda done: advance(READ, done, count))
@@ -115,9 +118,9 @@ def run_recover(setup: MeasurementSetup, backend: Backend, advance: Advance = si
     return RecoverRun(setup, tuple(readings), results, bench.pitch, (*bench.warnings, *_unlike(results)))
 
 
-def _modelled(setup: MeasurementSetup, backend: Backend) -> _Bench:
+def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Bench:
     assert setup.model is not None
-    experiment = MonitorExperiment(setup.model, backend)
+    experiment = MonitorExperiment(setup.model, backend) if experiment is None else experiment
     ccd = setup.model.instrument.monitor.area_ccd
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
     return _Bench(

@@ -1,0 +1,150 @@
+"""What real frames hold beside the spot is found and corrected, and sigmas hold; clean frames are left as they are."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from analysis.spots.frame_screening import screen_frames
+from analysis.spots.screened_fit import one_shape
+from analysis.spots.spot_positions import SpotError, difference_covariance
+from analysis.spots.static_defects import examine
+from optics.numerics.threads import one_blas_thread
+from scenes.models.disturbances import state_of
+from scenes.specs.job import JobSpec
+from scenes.specs.resolved import resolve_job
+from tests.twin.dirty_frames import KINDS, draw, measurement
+
+SETS = 200
+FALSE_ALARM = 1e-3
+STANDING = tuple(kind for kind in KINDS if kind != "movement")
+"""All dirt in which sigma is not that of a few frames' scatter."""
+TOLD = {
+    "bad pixels": ("bad pixels",),
+    "cosmic rays": ("cosmic rays",),
+    "background": ("uneven background",),
+    "other light": (),
+    "saturation": ("saturation",),
+    "reflection": ("second light",),
+    "vibration": ("smear",),
+    "movement": ("movement between frames",),
+    "missing frames": ("missing light",),
+}
+"""Kind of dirt -> what it is called in the findings."""
+
+
+@pytest.fixture(scope="module")
+def bench(experiment):
+    """(shape of one spot, detector, noise)."""
+    pair = experiment("gf7_pair")
+    calibration = pair.calibration
+    return one_shape(calibration.template, 0, calibration.template.shape), pair.detector, calibration.noise
+
+
+def squares(bench, kinds, seeds):
+    """Chi-square of every corrected shift against the truth (two coordinates), and the findings of each set."""
+    template, detector, noise = bench
+    out, told = [], []
+    with one_blas_thread():
+        for seed in seeds:
+            drawn = draw(template, detector, kinds, seed)
+            work = measurement(drawn, template, noise, "vibration" in kinds)
+            assert work.search() == []
+            assert work.measure() == []
+            first, second = work.positions
+            error = (second.position - first.position)[0] - drawn.shift
+            out.append(float(error @ np.linalg.solve(difference_covariance(first, second, noise)[0], error)))
+            result = work.result()
+            told.append((result.before, result.after[0]))
+    return np.array(out), told
+
+
+@pytest.mark.parametrize("kind", [*KINDS, pytest.param("all", marks=pytest.mark.slow)])
+def test_dirt_is_found_and_corrected(bench, kind):
+    """Few sets of each kind."""
+    kinds = STANDING if kind == "all" else (kind,)
+    count = 2
+    found, told = squares(bench, kinds, range(1000, 1000 + count))
+    # known from eight degrees of freedom, a movement's sigma has heavier tails: chi-square is divided by nearly F
+    limit = chi2.isf(1e-6, 2 * count) * (4.0 if kind == "movement" else 1.0)
+    assert found.sum() < limit
+    for spots in told:
+        names = {finding.kind for spot in spots for finding in spot.findings}
+        # with all together light and well may leave nothing saturated
+        for one in kinds:
+            assert set(TOLD[one]) <= names or (kind == "all" and one == "saturation")
+
+
+def test_without_the_corrections_dirt_does_harm(bench):
+    """The test above could fail: the same frames taken as they are."""
+    template, detector, noise = bench
+    for kind in ("bad pixels", "background", "reflection", "movement"):
+        worst = 0.0
+        for seed in range(1000, 1003):
+            drawn = draw(template, detector, (kind,), seed)
+            work = measurement(drawn, template, noise, corrections="none")
+            assert work.search() == []
+            if work.measure():
+                worst = np.inf
+                continue
+            first, second = work.positions
+            error = (second.position - first.position)[0] - drawn.shift
+            worst = max(worst, float(error @ np.linalg.solve(difference_covariance(first, second, noise)[0], error)))
+        assert worst > chi2.isf(1e-6, 2)
+
+
+def test_clean_frames_are_not_touched(bench):
+    found, told = squares(bench, (), range(2000, 2010))
+    assert found.sum() < chi2.isf(1e-4, 20)
+    for spots in told:
+        for spot in spots:
+            assert spot.clean
+            assert spot.cost == 0.0
+            assert spot.used.all()
+
+
+def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
+    """Spots of instruments that are as far from nominal as launch leaves them have another shape, and are clean."""
+    job = JobSpec.model_validate({"instrument": "gf7_pair", "disturbances": "launch"})
+    pair = experiment("gf7_pair").stating(resolve_job(job))
+    amounts = pair.stated.draw(np.random.default_rng(4), 6)
+    states = [state_of(row, pair.stated.components, pair.thermal) for row in amounts]
+    frames = pair.frames_after(pair.path.expected_photons(states), 9, 5)
+    template, noise = pair.calibration.template, pair.calibration.noise
+    measured = 0
+    with one_blas_thread():
+        for state in frames:
+            for i, spot in enumerate(state):
+                try:
+                    found = examine(screen_frames(spot, noise), noise, one_shape(template, i, spot.shape[1:]))
+                except SpotError:
+                    continue  # a spot that left the CCD
+                assert found.clean, [f"{one.kind}: {one.text}" for one in found.findings]
+                measured += 1
+    assert measured > 12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["clean", *(kind for kind in KINDS if kind != "movement"), "all"])
+def test_corrected_estimates_hold_their_sigmas(bench, kind):
+    """200 sets of frames of each kind, and of all together: chi-square within its limits, nothing refused."""
+    kinds = {"clean": (), "all": STANDING}.get(kind, (kind,))
+    found, told = squares(bench, kinds, range(SETS))
+    low, high = (chi2.isf(p, 2 * SETS) for p in (1.0 - FALSE_ALARM / 2.0, FALSE_ALARM / 2.0))
+    assert low < found.sum() < high
+    assert found.max() < chi2.isf(FALSE_ALARM / SETS, 2)
+    if kind == "clean":
+        assert all(spot.clean for spots in told for spot in spots)
+
+
+@pytest.mark.slow
+def test_movement_between_frames_holds_its_sigma(bench):
+    """Of a covariance that is known from nine frames the mean square over it is 1, with heavier tails than chi-square:
+    Hotelling's T^2 of the sum of two states lies between those of 8 and of 16 degrees of freedom.
+    """
+    found, _ = squares(bench, ("movement",), range(SETS))
+    nu, p = 8, 2
+    # mean of T^2 is p nu / (nu - p - 1), which the estimate divides out; variance of F(p, nu - p + 1) scaled likewise
+    d2 = nu - p + 1
+    relative = 2.0 * (p + d2 - 2) / (p * (d2 - 4))
+    sigma = p * np.sqrt(relative / SETS)
+    assert abs(found.mean() - p) < 3.3 * sigma

@@ -1,0 +1,317 @@
+"""python -m twin.recover: the closed loop through files, other kinds of files, series, geometry, refusals."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from typer.testing import CliRunner
+
+from scenes.specs.measurement_setup import resolve_measurement
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from tests.twin.study_bench import ROOT
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_job import render_job
+from twin.recover.__main__ import app
+from twin.recover.recover_report import recover_numbers, recover_report
+from twin.recover.recover_run import run_recover
+from twin.render import app as render_app
+from twin.run.data_files import FrameFacts, tiff
+
+JOB = ROOT / "scenes/examples/perturb.yaml"
+HEAD = "instrument: gf7_pair\ndisturbances: launch\n"
+
+
+@pytest.fixture(scope="module")
+def run(backend):
+    return render_job(resolve(JOB), backend)
+
+
+@pytest.fixture(scope="module")
+def images(run, tmp_path_factory):
+    """A folder of frames as twin.render writes them."""
+    folder = tmp_path_factory.mktemp("run") / "images"
+    folder.mkdir()
+    for i, channel in enumerate(run.experiment.path.channels):
+        for when, frames in (("before", run.before[i]), ("after", run.after[i])):
+            (folder / f"{channel.camera}_{channel.side}_{when}.tiff").write_bytes(tiff(frames, FrameFacts()))
+    return folder
+
+
+def measured(folder, text, backend, run, name="measurement.yaml"):
+    """Of the instrument that the run has built."""
+    file = folder / name
+    file.write_text(text)
+    return run_recover(resolve_measurement(file), backend, experiment=run.experiment)
+
+
+def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, images, backend):
+    found = measured(images.parent, HEAD + "frames: images\n", backend, run)
+    assert all(spot.clean for channel in found.channels for _, spot in channel.states())
+    numbers, expected = recover_numbers(found), stated(run.recovered_dict())
+    assert {key: numbers[key] for key in expected} == expected
+    assert found.last.recovered_dict() == run.recovered_dict()
+    report = recover_report(found)
+    assert "the frames are clean" in report.verdict
+    assert "truth" not in report.verdict
+
+
+def test_packed_fits_and_listed_files_are_the_same_measurement(run, images, backend, tmp_path):
+    """LZW TIFF, FITS cubes, one file a frame, a CSV table: to the bit."""
+    first = tifffile.imread(images / "forward_left_before.tiff")
+    lines = ["channel,when,file"]
+    for number, path in enumerate(sorted(images.glob("*.tiff"))):
+        camera, side, when = path.stem.split("_")
+        frames = tifffile.imread(path)
+        if number % 3 == 0:
+            fits.PrimaryHDU(frames).writeto(tmp_path / f"{path.stem}.fits")
+            lines.append(f"{camera}/{side},{when},{path.stem}.fits")
+        elif number % 3 == 1:
+            tifffile.imwrite(tmp_path / path.name, frames, compression="lzw", byteorder=">", photometric="minisblack")
+            lines.append(f"{camera}/{side},{when},{path.name}")
+        else:
+            for k, frame in enumerate(frames):
+                tifffile.imwrite(tmp_path / f"{path.stem}_{k}.tif", frame)
+                lines.append(f"{camera}/{side},{when},{path.stem}_{k}.tif")
+    assert first.shape == (9, 96, 96)
+    (tmp_path / "frames.csv").write_text("\n".join(lines) + "\n")
+    found = measured(tmp_path, HEAD + "frames: frames.csv\n", backend, run)
+    assert found.last.recovered_dict() == run.recovered_dict()
+
+
+def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
+    """Parts of the CCD with their offsets, fewer frames after, three times of which the middle one is the state before:
+    shifts agree with those of the whole frames within what the left out rings and frames say.
+    """
+    text = HEAD + "times: [0 min, 10 min, 20 min]\nframes:\n"
+    for channel in run.experiment.path.channels:
+        key = f"{channel.camera}_{channel.side}"
+        before, after = (tifffile.imread(images / f"{key}_{when}.tiff") for when in ("before", "after"))
+        tifffile.imwrite(tmp_path / f"{key}_b.tif", before[:, 10:86, 8:90], photometric="minisblack")
+        for name, frames in (("a0", after[:5]), ("a1", before), ("a2", after)):
+            tifffile.imwrite(tmp_path / f"{key}_{name}.tif", frames[:, 6:92, 4:92], photometric="minisblack")
+        files = ", ".join(f"{key}_{name}.tif" for name in ("a0", "a1", "a2"))
+        text += f"  {channel.key}: {{before: {key}_b.tif, after: [{files}], offset: [10, 8], offset_after: [6, 4]}}\n"
+    found = measured(tmp_path, text, backend, run)
+    assert found.times == (0.0, 600.0, 1200.0)
+    whole = run.recovery
+    for k, frames in ((0, 5), (2, 9)):
+        r = found.readings[k].recovery
+        # the frames are the same or some of them: what differs is at most the noise of one measurement
+        np.testing.assert_array_less(np.abs(r.after - whole.after), 4.0 * whole.sigma_after)
+        assert np.all(r.sigma_after > 0.999 * whole.sigma_after)
+        assert found.readings[k].frames == frames
+    middle = found.readings[1].recovery
+    np.testing.assert_allclose(middle.shift, 0.0, atol=2e-3)
+    assert recover_numbers(found)["times_s"] == [0.0, 600.0, 1200.0]
+    assert len(recover_numbers(found)["series"]) == 3
+
+
+def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, images, backend):
+    """The formulas with the three numbers that a data sheet has, and the spot's shape from its own frames."""
+    text = "template: measured\ndetector: monitor_ccd\nexposure: 10 ms\nframes: images\ngeometry:\n"
+    for name, camera in run.experiment.cameras.items():
+        g = camera.geometry
+        look = np.degrees(camera.look_rad)
+        text += (
+            f"  {name}: {{focal_length: {g.focal_length_m:.9f} m, separation: {g.separation_m:.9f} m, pixel: 12 um, "
+            f"look: {look:.6f} deg, field: {np.degrees(g.field_beta_rad):.6f} deg}}\n"
+        )
+    found = measured(images.parent, text, backend, run, "geometry.yaml")
+    whole, r = run.recovery, found.last.recovery
+    shift, sigma = r.shift - whole.shift, np.sqrt(np.diagonal(whole.shift_covariance, axis1=1, axis2=2))
+    # both shifts are of the same frames; that of the learnt shape has less to go by, the noise of one image more
+    np.testing.assert_array_less(np.abs(shift), 3.0 * sigma)
+    own = np.sqrt(np.diagonal(r.shift_covariance, axis1=1, axis2=2))
+    np.testing.assert_array_less(sigma, 1.2 * own)
+    np.testing.assert_array_less(own, 1.5 * sigma)
+    assert list(found.last.estimators) == ["paper_single", "paper_joint", "derived", "model"]
+    for name in run.experiment.cameras:
+        one, other = whole.parameters[name]["paper_single"], r.parameters[name]["paper_single"]
+        np.testing.assert_array_less(np.abs(one.vector - other.vector), 3.0 * np.sqrt(2.0) * one.sigma_noise)
+
+
+def test_dark_and_flat_frames_take_the_pattern_off(run, images, backend, tmp_path):
+    """Corrected frames of spots that moved by many pixels have less noise of pattern; photon transfer gives the data
+    sheet.
+    """
+    detector, seed = run.experiment.detector, run.seed
+    pattern = run.experiment.pattern(seed)
+    exposure = run.experiment.exposure
+    shape = (len(run.experiment.path.channels), *run.experiment.path.shape)
+    dark = detector.expose(np.zeros(shape), pattern, 40, exposure, 71)
+    level = 0.5 * detector.full_well_e / detector.quantum_efficiency
+    flat = detector.expose(np.full(shape, level), pattern, 40, exposure, 72)
+    text = HEAD + f"frames: {images}\nphoton_transfer: measured\n"
+    for what, frames in (("dark", dark), ("flat", flat)):
+        text += f"{what}:\n"
+        for i, channel in enumerate(run.experiment.path.channels):
+            name = f"{what}_{channel.camera}_{channel.side}.fits"
+            fits.PrimaryHDU(frames[i]).writeto(tmp_path / name)
+            text += f"  {channel.key}: {name}\n"
+    found = measured(tmp_path, text, backend, run)
+    sheet = detector
+    for result in found.channels:
+        t = result.channel.transfer
+        # 4.5 sigma: once in 1e4 for 16 numbers
+        assert abs(t.gain_dn_per_e - sheet.system_gain_dn_per_e) < 4.5 * t.gain_sigma
+        dark_noise = np.hypot(sheet.dark_noise_e, np.sqrt(sheet.dark_current_e_per_s * exposure))
+        assert abs(t.dark_noise_e - dark_noise) < 4.5 * t.dark_noise_sigma
+        assert abs(t.prnu - sheet.prnu) < 4.5 * t.prnu_sigma
+        assert abs(t.dsnu_e - sheet.dsnu_e) < 4.5 * t.dsnu_sigma
+        assert t.gain_sigma < 0.01 * t.gain_dn_per_e
+    moved = slice(4, 8)  # the backward camera's spots moved by 10 pixels
+    own = np.sqrt(np.diagonal(found.last.recovery.shift_covariance[0]))[moved]
+    without = np.sqrt(np.diagonal(run.recovery.shift_covariance[0]))[moved]
+    assert np.all(own < 0.9 * without)
+    # their difference is at most the pattern's part, which the corrected ones are free of
+    away = np.abs(found.last.recovery.shift - run.recovery.shift)[0, moved]
+    assert np.all(away < 4.0 * np.sqrt(without**2 - own**2) + own)
+
+
+def spoilt(folder, images, name, change):
+    """A copy of the frames with one file changed."""
+    shutil.copytree(images, folder / "images")
+    path = folder / "images" / name
+    frames = tifffile.imread(path)
+    changed = change(frames.copy())
+    tifffile.imwrite(path, changed, photometric="rgb" if changed.ndim > 3 else "minisblack")
+
+
+def no_spot(frames):
+    frames[:] = 100
+    return frames
+
+
+def at_the_edge(frames):
+    return np.roll(frames, -34, axis=2)
+
+
+def half_dark(frames):
+    frames[:6] = 100
+    return frames
+
+
+def burnt(frames):
+    """Ten thousand times the light: shot noise of the data sheet's gain, a well that is full at 16100."""
+    light = 1e4 * np.maximum(frames.mean(axis=0) - 100.0, 0.0)
+    level = 100.0 + np.random.default_rng(1).normal(light, np.sqrt(0.16 * light + 4.0), frames.shape)
+    return np.clip(level, 0, 16100).astype(np.uint16)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem", "remedy"),
+    [
+        (no_spot, "no spot", "the right file, with the light on"),
+        (at_the_edge, "too near the edge", "10 pixels or more inside"),
+        (half_dark, "6 of 9 frames hold less than half of the light", "with the light on"),
+        (burnt, "too much of the spot is missing (saturation", "less light"),
+        (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
+        (lambda f: np.pad(f, ((0, 0), (0, 9), (0, 0))), "do not lie on the CCD of 96 x 96 pixels", "with its offset"),
+        (lambda f: np.stack([f, f, f], -1), "colours", "raw frames of a CCD"),
+    ],
+)
+def test_frames_that_cannot_be_used_are_refused_by_name(run, images, backend, tmp_path, change, problem, remedy):
+    spoilt(tmp_path, images, "backward_right_after.tiff", change)
+    with pytest.raises(InputError) as error:
+        measured(tmp_path, HEAD + "frames: images\n", backend, run)
+    told = str(error.value)
+    assert problem in told
+    assert remedy in told
+    assert "backward_right_after.tiff" in told
+    assert "measurement.yaml:3: frames.backward/right.after" in told
+
+
+def call(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words], terminal_width=200)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+PLAIN = "forward/left: {before: a.tif, after: b.tif}"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("frames: images\n", ["an instrument or its geometry is needed"]),
+        (HEAD, ["this is a job of the monitor"]),
+        (HEAD + "template: twin\ncorrections: none\n", ["'frames' is missing"]),
+        (HEAD + "frames: imges\n", ["no such folder", "measurement.yaml:3: frames"]),
+        (HEAD + "frames: measurement.yaml\n", ["neither a folder nor a table"]),
+        (HEAD + "frames: empty\n", ["no frames of forward/left before", "forward_left_before.tiff"]),
+        (HEAD + "frames: images\nsmear: 1\n", ["unknown key", "'smear'"]),
+        (HEAD + "frames: images\ncorrections: auto\n", ["not one of the choices", "automatic"]),
+        (HEAD + "frames: images\ndark: nodark.fits\n", ["no such file", "measurement.yaml:4: dark.all"]),
+        (HEAD + "frames: images\nflat: a.tif\n", ["flat frames are of no use without dark frames"]),
+        (HEAD + "frames: images\nphoton_transfer: measured\n", ["dark: FILES and flat: FILES"]),
+        (HEAD + "frames: images\nexposure: 10 m\n", ["measurement.yaml:4: exposure"]),
+        (HEAD + "frames: images\ndetector: monitor_cd\n", ["did you mean 'monitor_ccd'"]),
+        (HEAD + f"frames:\n  {PLAIN}\n", ["no such file", "a.tif"]),
+        (HEAD + "frames:\n  forwad/left: {before: a.tif, after: b.tif}\n", ["no such channel", "did you mean"]),
+        (HEAD + f"times: [0 s, 1 s]\nframes:\n  {PLAIN}\n", ["not as many entries as times"]),
+        ("geometry: {f: {focal_length: 1 m, separation: 1 m, pixel: 9 um}}\nframes: images\n", ["template: measured"]),
+        (HEAD + "geometry: {f: {focal_length: 1 m, separation: 1 m, pixel: 9 um}}\nframes: images\n", ["both"]),
+        (HEAD + "frames: bad.csv\n", ["bad.csv:2", "no such channel"]),
+        (HEAD + "frames: heads.csv\n", ["heads.csv:1", "not the head of a column"]),
+    ],
+)
+def test_bad_measurement_files(images, tmp_path, text, told):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.csv").write_text("channel,when,file\nforward/lft,before,x.tif\n")
+    (tmp_path / "heads.csv").write_text("channel,wen,file\n")
+    (tmp_path / "images").symlink_to(images)
+    (tmp_path / "measurement.yaml").write_text(text)
+    result = call(tmp_path / "measurement.yaml", "--out", tmp_path / "out")
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    for part in told:
+        assert part in result.stderr
+    assert not (tmp_path / "out").exists()
+    assert "Traceback" not in result.stderr
+
+
+def test_a_job_is_told_from_a_measurement(images, tmp_path):
+    result = call(JOB, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "this is a job of the monitor, which twin.recover does not read; python -m twin.render" in result.stderr
+
+
+def test_random_changes_of_the_file_never_end_in_a_traceback(images, tmp_path):
+    """Bytes of a measurement's YAML changed, left out and doubled."""
+    text = (HEAD + f"frames:\n  {PLAIN}\nvibration: none\ntemplate: twin\ndark: {{all: [a.tif]}}\n").encode()
+    random = np.random.default_rng(5)
+    for _ in range(150):
+        data = bytearray(text)
+        for _ in range(random.integers(1, 4)):
+            at = int(random.integers(len(data)))
+            kind = random.integers(3)
+            data[at : at + int(kind > 0)] = bytes([random.integers(256)] * int(kind < 2) * int(random.integers(1, 3)))
+        path = tmp_path / "measurement.yaml"
+        path.write_bytes(data)
+        with pytest.raises(InputError) as error:
+            resolve_measurement(path)
+        assert "measurement.yaml" in str(error.value) or "no such" in str(error.value)
+
+
+@pytest.mark.slow
+def test_the_closed_loop_of_both_commands(tmp_path):
+    """Run folder of twin.render -> its images -> twin.recover -> the same recovered.json; and again by config.yaml."""
+    words = [str(JOB), "--out", str(tmp_path / "run"), "--quiet"]
+    assert CliRunner().invoke(render_app, words).exit_code == 0
+    (tmp_path / "m.yaml").write_text(HEAD + "frames: run/images\n")
+    assert call(tmp_path / "m.yaml", "--out", tmp_path / "one", "--quiet").exit_code == 0
+    assert call(tmp_path / "one/config.yaml", "--out", tmp_path / "two", "--quiet").exit_code == 0
+    job, one, two = (json.loads((tmp_path / name / "recovered.json").read_text()) for name in ("run", "one", "two"))
+    assert one == two
+    for key in ("schema", "reference_frames", "cameras", "spots", "intersection_angle", "ground", "disturbances",
+                "centroid", "frames"):  # fmt: skip
+        assert one[key] == job[key]
+    page = (tmp_path / "one/report.html").read_text()
+    assert "What the fitted shape leaves over" in page
+    assert Path(tmp_path / "one/artefacts/spots-forward.svg").exists()
