@@ -552,3 +552,31 @@ def test_the_angle_command_on_measurements(files) -> None:
     refused = run("angle", angle_file(folder, angles={"wide": ["forward", "multispectral"]}), "--out", folder / "no")
     assert refused.exit_code == 2
     assert "angles.wide" in refused.stderr
+    refused = run("angle", angle_file(folder, time="10 min"), "--out", folder / "no")
+    assert refused.exit_code == 2
+    assert "time: orbit or attitude are not known then" in " ".join(refused.stderr.split())
+
+
+def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(campaign, files) -> None:
+    """Aberration by the derivative of noisy positions, 0.1 m/s or 3e-10 rad off; orbit and attitude at the same times
+    in one table."""
+    folder = files.parent / "Beijing"
+    edit(folder / "orbit.csv", lambda heads, rows: (heads[:4], [row[:4] for row in rows]))
+    _, again = read_back(files)
+    assert again.passes[0].measurements.platform.velocity is None
+    same(simultaneous(campaign), simultaneous(again), 0.01)
+    data = dict(read_yaml(files.parent / "data.yaml").data)
+    one = dict(data["passes"]["Beijing"])
+    with (folder / "attitude.csv").open() as stream:
+        attitude = np.loadtxt(stream, delimiter=",", skiprows=1)
+    with (folder / "orbit.csv").open() as stream:
+        orbit = np.loadtxt(stream, delimiter=",", skiprows=1)
+    place = CubicSpline(orbit[:, 0], orbit[:, 1:])(attitude[:, 0])
+    rows = np.column_stack([attitude[:, 0], place, attitude[:, 1:]])
+    text = "time [s],x [m],y [m],z [m],q1,q2,q3,q4\n" + "\n".join(",".join(map(repr, r)) for r in rows.tolist())
+    (folder / "platform.csv").write_text(text)
+    del one["orbit"], one["attitude"]
+    data["passes"] = {**data["passes"], "Beijing": {**one, "platform": "Beijing/platform.csv"}}
+    (files.parent / "data.yaml").write_text(dump_yaml(data))
+    # the orbit's readings are now told as 8 a second: their noise is stated by an interval
+    same(simultaneous(campaign), simultaneous(read_back(files)[1]), 0.01)
