@@ -1,0 +1,180 @@
+"""Foreign prescriptions as their own programs and other people's read and trace them, for the oracle tests."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optics.geometry.pose import Pose
+from optics.numerics.backend import Backend
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from optics.waves.imaging import aim_collimated
+from scenes.lens.prescription import SEQUENCE, Glasses, Prescription
+
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Positions (N, 3) and directions (N, 3) in the image's frame, metres, and optical paths (N,), metres."""
+LEAST_BEAM = 1e-4
+
+
+def beams(
+    backend: Backend, lens: Prescription, stop_radius: float, rays: int = 60
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Collimated beams through the stop, one a field: launch points (N, 3), the chief ray first, and direction."""
+    bare = lens.assembly(apertures=False)
+    names = [s.name for s in lens.surfaces]
+    to_stop = assemble(bare, [names[: lens.stop + 1]])
+    rng = np.random.default_rng(8)
+    r, t = stop_radius * np.sqrt(rng.uniform(size=rays)), rng.uniform(0.0, 2.0 * np.pi, rays)
+    target = np.stack([r * np.cos(t), r * np.sin(t)], axis=-1)
+    target[0] = 0.0
+    out = []
+    for x, y in dict.fromkeys(lens.fields or ((0.0, 0.0),)):
+        direction = np.array([np.tan(x), np.tan(y), 1.0])
+        direction /= np.linalg.norm(direction)
+        launch = aim_collimated(backend, to_stop, direction, -0.01 * direction, target)[0][0]
+        out.append((launch, direction))
+    return out
+
+
+def ours(backend: Backend, lens: Prescription, launch: np.ndarray, direction: np.ndarray) -> Rays:
+    """The twin's trace."""
+    traced = trace(backend, assemble(lens.assembly(apertures=False), [SEQUENCE]), make_rays(backend, launch, direction))
+    position, leaving, path, valid = (a[0] for a in traced.numpy())
+    assert valid.all()
+    return position, leaving, path
+
+
+class Rayoptics:
+    """ray-optics' own reading of a .zmx or .seq file."""
+
+    def __init__(self, path: Path) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            logging.disable(logging.CRITICAL)
+            try:
+                if path.suffix.lower() == ".zmx":
+                    from rayoptics.zemax.zmxread import read_lens_file
+                else:
+                    from rayoptics.codev.cmdproc import read_lens as read_lens_file
+                self.model = read_lens_file(path)[0]
+            finally:
+                logging.disable(logging.NOTSET)
+        self.sequence = self.model["seq_model"]
+        self.sequence.gaps[0].thi = 0.0  # rays then start in the frame of the first surface, not 1e10 mm away
+        self.sequence.compute_global_coords()
+        self.sequence.update_model()
+        self.scale = {"mm": 1e-3, "inches": 25.4e-3, "cm": 1e-2}[self.model["system_spec"].dimensions]
+        self.wave = float(self.model["optical_spec"]["wvls"].central_wvl)
+
+    def glasses(self) -> list[tuple[str, float]]:
+        """Names and indices of its glasses, in the order of the light."""
+        return [
+            (g.medium.name(), float(g.medium.rindex(self.wave)))
+            for g in self.sequence.gaps
+            if abs(float(g.medium.rindex(self.wave)) - 1.0) > 1e-3
+        ]
+
+    def trace(self, launch: np.ndarray, direction: np.ndarray, defocus: bool) -> Rays:
+        """Through all surfaces, to the image moved by the file's defocus."""
+        from rayoptics.raytr.raytrace import trace_raw
+
+        first = Pose(self.sequence.gbl_tfrms[0][0], self.sequence.gbl_tfrms[0][1] * self.scale).inverse()
+        shift = self.model["optical_spec"].defocus.focus_shift * self.scale if defocus else 0.0
+        place, heading, length = [], [], []
+        for point in launch:
+            start = first.apply(point) / self.scale
+            path = list(self.sequence.path(self.wave))
+            ray, path_length, _ = trace_raw(
+                iter(path), start, first.rotation @ direction, self.wave, intersect_obj=False
+            )
+            p, d = np.asarray(ray[-1][0]) * self.scale, np.asarray(ray[-1][1])
+            step = shift / d[2]
+            place.append(p + step * d - np.array([0.0, 0.0, shift]))
+            heading.append(d)
+            length.append(path_length * self.scale + step)
+        return np.array(place), np.array(heading), np.array(length)
+
+
+class Optiland:
+    """optiland's own reading of a .zmx or .seq file."""
+
+    def __init__(self, path: Path) -> None:
+        from optiland.fileio import load_codev_file, load_zemax_file
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.optic = (load_zemax_file if path.suffix.lower() == ".zmx" else load_codev_file)(str(path))
+            self.wave = float(self.optic.primary_wavelength)
+        for surface in self.optic.surfaces:
+            if hasattr(surface.geometry, "tol"):
+                surface.geometry.tol = 1e-14
+            surface.aperture = None
+
+    def glasses(self) -> list[tuple[str, float]]:
+        """Names and indices of its glasses, in the order of the light."""
+        out = []
+        for surface in self.optic.surfaces:
+            index = float(np.ravel(surface.material_post.n(self.wave))[0])
+            if abs(index - 1.0) > 1e-3 and not surface.interaction_model.is_reflective:
+                out.append((str(getattr(surface.material_post, "name", "")), index))
+        return out
+
+    def trace(self, launch: np.ndarray, direction: np.ndarray, defocus: bool) -> Rays:
+        """Through all surfaces."""
+        from optiland.rays import RealRays
+
+        n = len(launch)
+        columns = [np.array(1e3 * launch[:, i]) for i in range(3)] + [np.full(n, direction[i]) for i in range(3)]
+        rays = RealRays(*columns, np.ones(n), np.full(n, self.wave))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.optic.surfaces.trace(rays, record=False)
+            frame = self.optic.surfaces[-1].geometry.cs
+            turn, shift = frame.get_rotation_matrix(), frame.position_in_gcs
+        own = Pose(np.asarray(turn), np.array([float(np.ravel(c)[0]) for c in shift]) * 1e-3).inverse()
+        place = own.apply(1e-3 * np.stack([rays.x, rays.y, rays.z], axis=-1))
+        heading = np.stack([rays.L, rays.M, rays.N], axis=-1) @ own.rotation.T
+        return place, heading, 1e-3 * np.asarray(rays.opd)
+
+
+class Spy(dict):  # type: ignore[type-arg]
+    """Glasses of any name, which remembers which were asked for and in which order."""
+
+    def __init__(self, indices: list[float]) -> None:
+        super().__init__()
+        self.indices, self.asked = indices, []
+
+    def get(self, key: str, default: Any = None) -> Callable[[float], float]:
+        """The next index of the other program's."""
+        k = len(self.asked)
+        self.asked.append(key)
+        index = self.indices[k] if k < len(self.indices) else 1.5
+        return lambda wavelength: index
+
+
+def read_alike(read: Callable[[Path, Glasses], Prescription], path: Path, peer: Any) -> Prescription:
+    """Our reading with the other program's indices, for a comparison of geometry and not of catalogues."""
+    return read(path, Spy([index for _, index in peer.glasses()]))
+
+
+def differences(first: Rays, second: Rays) -> dict[str, float]:
+    """Largest differences of positions (m), directions and optical paths less the chief ray's (m), and of spots (m)."""
+
+    def spot(place: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.sum((place[:, :2] - place[:, :2].mean(axis=0)) ** 2, axis=-1))))
+
+    def wave(rays: Rays, launch_phase: float = 0.0) -> np.ndarray:
+        return np.asarray(rays[2] - rays[2][0])
+
+    return {
+        "position": float(np.max(np.abs(first[0] - second[0]))),
+        "direction": float(np.max(np.abs(first[1] - second[1]))),
+        "spot": abs(spot(first[0]) - spot(second[0])),
+        "path": float(np.max(np.abs(wave(first) - wave(second)))),
+    }
