@@ -19,9 +19,10 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
 from scenes.lens.shapes import facing
+from scenes.models.camera_design import camera_file
 from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
-from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
 
 PITCH = 7e-6
@@ -48,6 +49,9 @@ class Width(NamedTuple):
     pitch: float = PITCH
 
 
+AS_IN_FILE = Width()
+
+
 @dataclass(frozen=True, eq=False)
 class ReadCamera:
     """A camera made of a prescription.
@@ -66,8 +70,22 @@ class ReadCamera:
     difference: float
     rays: int
 
+    def told(self, lens: Prescription) -> list[str]:
+        """What there is to say of it."""
+        spec = self.camera
+        mirrors = sum(m.light is None for m in spec.mirrors.values())
+        faces = sum(m.light == "refracts" for m in spec.mirrors.values())
+        parts = [f"{mirrors} mirrors"] + ([f"{faces} faces of lenses"] if faces else [])
+        angles = [f"{math.degrees(a):.4g}" for a in (spec.field.x, spec.field.y, spec.field_bias)]
+        return [
+            f"{lens.name}: {', '.join(parts)}, stop {spec.stop}, f {spec.focal_length:.6g} m, entrance pupil "
+            f"{spec.entrance_pupil:.6g} m, field {angles[0]} x {angles[1]} deg about {angles[2]} deg",
+            f"{self.rays} rays through both meet the image within {self.difference:.1e} m",
+            *(f"note: {note}" for note in self.notes),
+        ]
 
-def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = Width()) -> ReadCamera:
+
+def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS_IN_FILE) -> ReadCamera:
     """Make a camera of a prescription.
 
     Args:
@@ -105,7 +123,9 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = Wi
     pixels = 2.0 * focal * math.tan(half_x) / width.pitch
     if not 2.0 <= pixels <= 1e6:
         problem = "a line CCD over the whole field would have too few or too many pixels"
-        raise lens.error(problem, None, f"{pixels:.4g} of {format_quantity(width.pitch, LENGTH)}", "2 to 1000000: --pitch")
+        raise lens.error(
+            problem, None, f"{pixels:.4g} of {format_quantity(width.pitch, LENGTH)}", "2 to 1000000: --pitch"
+        )
     plain["focal_length"] = format_quantity(float(f"{focal:.6g}"), LENGTH)
     plain["entrance_pupil"] = format_quantity(pupil, LENGTH)
     plain["line"]["pixels"] = math.ceil(pixels)
@@ -149,9 +169,7 @@ def _image(lens: Prescription) -> tuple[float, float]:
     return z, (tilt if abs(tilt) > 1e-15 else 0.0)
 
 
-def _surfaces(
-    lens: Prescription, notes: list[Note]
-) -> tuple[dict[str, Any], str, Prescription, dict[str, str]]:
+def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], str, Prescription, dict[str, str]]:
     """Surfaces as a camera's file has them, the stop among them, the prescription of those that came along, names."""
     out: dict[str, Any] = {}
     taken: dict[str, str] = {}
@@ -229,8 +247,9 @@ def _field(lens: Prescription, surfaces: dict[str, Any], notes: list[Note]) -> t
     upright = not any({"decentre", "rotate", "sag"} & set(s) for s in surfaces.values()) and not _image(lens)[1]
     largest = float(np.max(np.hypot(x, y)))
     if upright and largest > 0.0 and (np.all(x == 0.0) or np.all(y == 0.0)) and 0.0 in (*np.hypot(x, y),):
-        notes.append(Note(0, "field", f"{len(x)} angles on one side of the axis taken as half a field about it"))
-        return 0.0, largest, largest
+        text = f"a circle of {math.degrees(largest):.6g} deg about the axis; the square in it is taken"
+        notes.append(Note(0, "field", text))
+        return 0.0, largest / math.sqrt(2.0), largest / math.sqrt(2.0)
     bias = 0.5 * float(y.max() + y.min())
     half_x, half_y = float(np.max(np.abs(x))), 0.5 * float(y.max() - y.min())
     if half_x == 0.0 and half_y == 0.0:
@@ -303,3 +322,16 @@ def _compared(lens: Prescription, origin: Prescription, model: CameraModel, back
             raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
         places.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
     return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
+
+
+def camera_text(made: ReadCamera, lens: Prescription) -> str:
+    """Text of the camera's file, with what did not come along at its head."""
+    remark = [f"Read from {lens.file} by python -m scenes.lens read."]
+    remark += [f"{name}: {surface}" for name, surface in made.names.items() if name != surface]
+    remark += [str(note) for note in made.notes]
+    return camera_file(made.camera, printable_lines(remark))
+
+
+def printable_lines(lines: list[str]) -> str:
+    """Lines as one text without what a reader of YAML would refuse in a remark."""
+    return "\n".join(printable(line) for line in lines)

@@ -51,7 +51,17 @@ def prescription_of(model: CameraModel) -> Prescription:
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
     """Middle, ends and corners of the field, angles about x and y whose tangents are the light's, radians."""
     spec = model.spec
-    shares = [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)]
+    shares = [
+        (0.0, 0.0),
+        (1.0, 0.0),
+        (-1.0, 0.0),
+        (0.0, 1.0),
+        (0.0, -1.0),
+        (1.0, 1.0),
+        (1.0, -1.0),
+        (-1.0, 1.0),
+        (-1.0, -1.0),
+    ]
     return tuple((x * spec.field.x, spec.field_bias + y * spec.field.y) for x, y in shares)
 
 
@@ -96,7 +106,9 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
 def _left_out(state: Mapping[str, object], root: str) -> list[Note]:
     """Bodies of a state that a camera's prescription does not have."""
     ours = {BASE, root}
-    carried = [p for p in state if p in ours or (p.startswith(f"{root}/") and "/monitor" not in p and "area_ccd" not in p)]
+    carried = [
+        p for p in state if p in ours or (p.startswith(f"{root}/") and "/monitor" not in p and "area_ccd" not in p)
+    ]
     strangers = [p for p in state if p not in carried]
     return [Note(0, path, "is no part of this camera: not carried") for path in strangers]
 

@@ -57,15 +57,34 @@ def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], 
     if set(given) <= set(_POLYNOMIAL) and not surface.terms:
         term = XYPolynomial(**{_POLYNOMIAL[k]: c / radius ** sum(k) for k, c in given.items()})
         return replace(surface, terms=(term,))
+    return surface.with_figure(ZernikeFigure(radius, (0.0, 0.0), zernike_of(given)))
+
+
+def zernike_of(coefficients: Mapping[tuple[int, int], float]) -> dict[int, float]:
+    """Zernike terms, Noll index -> amplitude, of a polynomial on the unit disk, (a, b) -> coefficient of x^a y^b."""
+    order = max((a + b for a, b in coefficients), default=0)
     size = triangle_size(order)
     matrix, wanted = np.zeros((size, size)), np.zeros(size)
     for j in range(1, size + 1):
         for a, b, c in cartesian_terms(j):
             matrix[triangle_index(a, b), j - 1] += c
-    for (a, b), c in given.items():
+    for (a, b), c in coefficients.items():
         wanted[triangle_index(a, b)] = c
-    terms = np.linalg.solve(matrix, wanted)
-    return surface.with_figure(ZernikeFigure(radius, (0.0, 0.0), {j + 1: float(t) for j, t in enumerate(terms)}))
+    return {j: float(t) for j, t in enumerate(np.linalg.solve(matrix, wanted), start=1) if t}
+
+
+def moved_polynomial(
+    coefficients: Mapping[tuple[int, int], float], centre: tuple[float, float]
+) -> dict[tuple[int, int], float]:
+    """A polynomial in x - cx and y - cy as one in x and y."""
+    out: dict[tuple[int, int], float] = {}
+    cx, cy = centre
+    for (a, b), c in coefficients.items():
+        for i in range(a + 1):
+            for j in range(b + 1):
+                part = c * comb(a, i) * (-cx) ** (a - i) * comb(b, j) * (-cy) ** (b - j)
+                out[i, j] = out.get((i, j), 0.0) + part
+    return out
 
 
 def clear(

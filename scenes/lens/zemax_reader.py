@@ -41,10 +41,10 @@ SHAPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XPOLYNOM", "SZERNSAG", "COORDBRK"
 OF_NO_EFFECT = frozenset(
     # the program's version and windows, drawings, solves whose values stand in the file, optimisation, tolerances,
     # coatings and polarisation, weights of fields and wavelengths, physical optics, hammer settings
-    "VERS AUTH IWDP STUD PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN VANN POLS GLRS GSTD NSCD COFN "
-    "LUID EERA SSID FIMP HIDE MIRR SLAB POPS MEMA PPAR VPAR PZUP MAZH OPDX EFFL EFLY WFNO BLNK TOL TOLE MOFF TRAC DMFS ACOS "
-    "GLCB REAX REAY REAZ COAT PKUP VCON VDSZ EDGE ZVDX ZVDY ZVCX ZVCY ZVAN WWGN WWGT NOTE TCMM TCED CONF GLCZ GLCA "
-    "GLCC MNCA MXCA MNEA MNCG MXCG MNEG RGLA PMAG TOTR OPTH PRIM COMM ENVD ".split()
+    "VERS AUTH IWDP STUD PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN VANN POLS GLRS GSTD NSCD "
+    "COFN LUID EERA SSID FIMP HIDE MIRR SLAB POPS MEMA PPAR VPAR PZUP MAZH OPDX EFFL EFLY WFNO BLNK TOL TOLE MOFF "
+    "TRAC DMFS ACOS GLCB REAX REAY REAZ COAT PKUP VCON VDSZ EDGE ZVDX ZVDY ZVCX ZVCY ZVAN WWGN WWGT NOTE TCMM "
+    "TCED CONF GLCZ GLCA GLCC MNCA MXCA MNEA MNCG MXCG MNEG RGLA PMAG TOTR OPTH PRIM COMM ENVD".split()
 )
 
 _SYSTEM = frozenset("MODE NAME UNIT ENPD FNUM OBNA FLOA FTYP XFLN YFLN WAVM WAVL WAVN PWAV VDXN VDYN VCXN VCYN".split())
@@ -52,8 +52,16 @@ _ON_SURFACES = frozenset(
     "TYPE STOP CURV CONI PARM XDAT DISZ GLAS DIAM FLAP CLAP SQAP ELAP OBSC SQOB ELOB OBDC USAP SCBD".split()
 )
 
-_EDGES = {"CLAP": "clear", "FLAP": "clear", "SQAP": "rectangle", "ELAP": "ellipse", "OBSC": "hole", "SQOB": "", "ELOB": ""}
-"""Statement -> the aperture that it gives; nothing for those that are not carried."""
+_EDGES = {
+    "CLAP": "clear",
+    "FLAP": "clear",
+    "SQAP": "rectangle",
+    "ELAP": "ellipse",
+    "OBSC": "hole",
+    "SQOB": "",
+    "ELOB": "",
+}
+"""Statement -> the aperture that it gives; other obscurations are not carried."""
 
 
 @dataclass
@@ -209,7 +217,7 @@ def _positive(source: Source, s: Statement, what: str) -> float:
 def _wave(source: Source, s: Statement, micrometres: float) -> float:
     if not 0.1 <= micrometres <= 100.0:
         raise source.error("no wavelength of light", s.line, s.text, "0.1 to 100 um")
-    return micrometres * 1e-6
+    return micrometres / 1e6
 
 
 def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
@@ -246,8 +254,8 @@ def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
                 problem = "a surface with a tilt or decentre of its own"
                 raise source.error(problem, s.line, s.text, "coordinate breaks (COORDBRK) in its place")
         case _:
-            what = _EDGES[s.command]
-            if not what:
+            what = _EDGES.get(s.command)
+            if what is None:
                 source.note(s, "this obscuration is not carried")
                 return
             surface.edges[what] = (s, source.finite(s, 0, "its size"), source.finite(s, 1, "its size"))

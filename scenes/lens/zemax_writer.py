@@ -56,7 +56,10 @@ def zemax_text(lens: Prescription) -> str:
         stop = [r for r in rest if r == "STOP"]
         others = [r for r in rest if r != "STOP"]
         far = "INFINITY" if math.isinf(thickness) else _number(thickness * MM)
-        body = [*stop, f"TYPE {kind}", f"CURV {_number(curvature / MM)} 0 0 0 0", *others, f"DISZ {far}"]
+        # a semi-diameter stands before the edge that it is the size of: readers take the edge as a change of it
+        edges = [r for r in others if r.split()[0] in ("DIAM", "CLAP", "SQAP", "ELAP", "OBDC")]
+        shape = [r for r in others if r not in edges]
+        body = [*stop, f"TYPE {kind}", f"CURV {_number(curvature / MM)} 0 0 0 0", *shape, f"DISZ {far}", *edges]
         lines.append(f"SURF {number}")
         lines.extend(f"  {line}" for line in body)
         number += 1
@@ -72,8 +75,6 @@ def zemax_text(lens: Prescription) -> str:
         rest = [f"COMM {given.name}", *rest, *_edges(given.aperture)]
         if k == lens.stop:
             rest.append("STOP")
-            radius = given.aperture.bounds[1] - given.aperture.centre[0] if given.aperture else 0.0
-            rest.append(f"DIAM {_number(radius * MM)} 1 0 0 1")
         if given.interaction is Interaction.REFLECT:
             rest.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         if out:
@@ -111,11 +112,12 @@ def _edges(aperture: Aperture | None) -> list[str]:
         case None:
             return []
         case Circle(radius, centre, inner):
-            lines = [f"CLAP {_number(inner * MM)} {_number(radius * MM)} 0"]
+            size, line = radius, f"CLAP {_number(inner * MM)} {_number(radius * MM)} 0"
         case Rectangle(half_x, half_y, centre):
-            lines = [f"SQAP {_number(half_x * MM)} {_number(half_y * MM)} 0"]
+            size, line = math.hypot(half_x, half_y), f"SQAP {_number(half_x * MM)} {_number(half_y * MM)} 0"
         case Ellipse(half_x, half_y, centre):
-            lines = [f"ELAP {_number(half_x * MM)} {_number(half_y * MM)} 0"]
+            size, line = max(half_x, half_y), f"ELAP {_number(half_x * MM)} {_number(half_y * MM)} 0"
+    lines = [f"DIAM {_number((size + math.hypot(*centre)) * MM)} 1 0 0 1", line]
     if any(centre):
         lines.append(f"OBDC {_number(centre[0] * MM)} {_number(centre[1] * MM)}")
     return lines
@@ -124,7 +126,9 @@ def _edges(aperture: Aperture | None) -> list[str]:
 def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
     """Kind of a surface and the statements of its shape."""
     if given.interaction is Interaction.REFRACT:
-        raise _cannot(lens, given, "a face of a lens: a .zmx names a glass, and a camera's file an index", "batoid YAML")
+        raise _cannot(
+            lens, given, "a face of a lens: a .zmx names a glass, and a camera's file an index", "batoid YAML"
+        )
     shape = given.surface
     conic = [f"CONI {_number(shape.conic)}"] if shape.conic else []
     if isinstance(shape.figure, GridFigure):

@@ -94,7 +94,8 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
     edges = obstacles(model)
     for name in (*model.mirrors, IMAGE):
-        edge, pose = edges[name], model.image_body
+        edge, pose = edges.get(name, model.apertures.get(name)), model.image_body
+        assert edge is not None
         low, high = edge.bounds[2 * axis], edge.bounds[2 * axis + 1]
         other = edge.centre[1 - axis]
         across = np.linspace(low, high, 80)
