@@ -13,14 +13,15 @@ from optics.geometry.pose import rotation_vector
 from optics.geometry.sag_terms import SAG_TERMS
 from optics.geometry.surface import Surface
 from optics.numerics.backend import Backend
-from optics.raytrace.aim import AimError
+from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Interaction
+from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
 from scenes.lens.shapes import facing
 from scenes.models.camera_design import camera_file
-from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
+from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
@@ -294,8 +295,19 @@ def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backe
             problem = "an F-number of a system with surfaces that are turned or off the axis"
             raise lens.error(problem, lens.pupil.line, allowed=allowed)
         axial = _derived(lens, {**plain, "field_bias": "0 deg"}, backend)
-        return float(axial.first_order.focal_length[0]) / lens.pupil.value
+        return _axial_focal_length(axial, backend) / lens.pupil.value
     raise lens.error("a numerical aperture in object space", lens.pupil.line, allowed=allowed)
+
+
+def _axial_focal_length(model: CameraModel, backend: Backend) -> float:
+    """Of rays beside the axis, wherever the image stands, metres."""
+    bare, names = model.bare_assembly(apertures=False), model.mirrors
+    stop = names.index(model.spec.stop)
+    centre = field_direction(model.spec, 0.0, 0.0)
+    launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
+    axes = transverse_axes(centre[None], LINE_AXIS[None])
+    matrix = ray_matrix(backend, assemble(bare, ["imaging"]), stop, launch, centre[None], axes)
+    return float(1.0 / np.sqrt(np.abs(np.linalg.det(matrix.direction_by_position[0]))))
 
 
 def _compared(lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend) -> tuple[float, int]:

@@ -13,14 +13,17 @@ from optics.geometry.tree import AT_REST, State
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription, Pupil
 from scenes.models.camera_assembly import line_body
-from scenes.models.camera_model import IMAGE, LIGHT, CameraModel, indices
+from scenes.models.camera_model import IMAGE, LIGHT, CameraModel
 from scenes.models.instrument_model import Instrument
 from scenes.specs.channel import BASE
 
 
 def prescription_of(model: CameraModel) -> Prescription:
     """A camera as designed."""
-    spec, behind = model.spec, indices(model.spec)
+    spec, behind, index = model.spec, {}, 1.0
+    for name, mirror in spec.mirrors.items():
+        index = index if mirror.index is None else mirror.index
+        behind[name] = index
     surfaces = [
         LensSurface(
             name,
@@ -32,7 +35,6 @@ def prescription_of(model: CameraModel) -> Prescription:
         )
         for name, mirror in spec.mirrors.items()
     ]
-    index = behind[model.mirrors[-1]]
     surfaces.append(LensSurface(IMAGE, model.image_body, plane(), Interaction.PASS, index))
     return Prescription(
         spec.name,

@@ -360,7 +360,8 @@ def _made(
     try:
         aperture = _aperture(source, surface, system.scale)
     except ValueError as error:
-        raise source.error(str(error), surface.line) from None
+        line = max(s.line for s, _, _ in surface.edges.values())
+        raise source.error(str(error), line) from None
     kind = surface.glass[0].upper() if surface.glass else ""
     if kind == "MIRROR":
         made = LensSurface(name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, medium)

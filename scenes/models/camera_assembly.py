@@ -9,7 +9,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from scenes.models.camera_model import LIGHT, CameraModel, derive_camera, indices
+from scenes.models.camera_model import LIGHT, CameraModel, derive_camera, glass_indices, lenses
 from scenes.specs.camera import CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.course import noll
@@ -47,14 +47,15 @@ def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
 def camera_elements(name: str, root: str, model: CameraModel) -> dict[str, Element]:
     """Mirrors and line CCD, by ``NAME/M1`` ... and ``NAME/line``."""
     out = {}
-    behind = indices(model.spec)
+    glass = lenses(model.spec)
     for mirror in model.mirrors:
         key = f"{name}/{mirror}"
         surface, aperture = model.surfaces[mirror], model.apertures[mirror]
         how = LIGHT[model.spec.mirrors[mirror].light]
-        out[key] = Element(key, f"{root}/{mirror}", surface, how, aperture, behind[mirror])
+        solid = f"{root}/{glass[mirror]}" if mirror in glass else None
+        out[key] = Element(key, f"{root}/{mirror}", surface, how, aperture, solid=solid)
     key = f"{name}/line"
-    out[key] = Element(key, line_body(root), plane(), Interaction.PASS, index_after=behind[model.mirrors[-1]])
+    out[key] = Element(key, line_body(root), plane(), Interaction.PASS)
     return out
 
 
@@ -77,7 +78,8 @@ ROOT = "camera"
 def camera_alone(model: CameraModel) -> Assembly:
     """The camera by itself: bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ..."""
     tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
-    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model))
+    index = {f"{ROOT}/{lens}": n for lens, n in glass_indices(model.spec).items()}
+    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model), index)
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,25 +201,33 @@ def surface_of(mirror: MirrorSpec) -> Surface:
 LIGHT = {None: Interaction.REFLECT, "refracts": Interaction.REFRACT, "passes": Interaction.PASS}
 
 
-def indices(spec: CameraSpec) -> dict[str, float]:
-    """Refractive index behind each surface for the light from the scene."""
-    out, index = {}, 1.0
+def lenses(spec: CameraSpec) -> dict[str, str]:
+    """Face -> the lens that it is a face of, called by its first face; so light may go either way."""
+    out, inside = {}, ""
     for name, mirror in spec.mirrors.items():
-        index = index if mirror.index is None else mirror.index
-        out[name] = index
+        if mirror.light == "refracts":
+            out[name] = inside or name
+            inside = "" if inside else name
     return out
+
+
+def glass_indices(spec: CameraSpec) -> dict[str, float]:
+    """Lens -> its refractive index at the design wavelength."""
+    first = dict.fromkeys(lenses(spec).values())
+    return {name: index for name in first if (index := spec.mirrors[name].index) is not None}
 
 
 def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:
     bodies = [Body(name, mirror_pose(m)) for name, m in spec.mirrors.items()]
     bodies.append(Body(IMAGE, image_pose(spec)))
-    behind = indices(spec)
+    glass = lenses(spec)
     elements = {
-        name: Element(name, name, surface, LIGHT[spec.mirrors[name].light], apertures.get(name), behind[name])
+        name: Element(name, name, surface, LIGHT[spec.mirrors[name].light], apertures.get(name), solid=glass.get(name))
         for name, surface in surfaces.items()
     }
-    elements[IMAGE] = Element(IMAGE, IMAGE, plane(), Interaction.PASS, index_after=behind[next(reversed(behind))])
-    return Assembly(RigidTree(tuple(bodies)), elements, {"imaging": (*spec.mirrors, IMAGE)})
+    elements[IMAGE] = Element(IMAGE, IMAGE, plane(), Interaction.PASS)
+    sequences = {"imaging": (*spec.mirrors, IMAGE)}
+    return Assembly(RigidTree(tuple(bodies)), elements, sequences, glass_indices(spec))
 
 
 def _apertures(

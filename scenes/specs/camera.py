@@ -327,7 +327,8 @@ class MirrorSpec(Spec):
         aspheric: terms A4, A6, ... of the sag beyond the conic's, 1/m^3, 1/m^5, ...; empty for a pure conic.
         sag: further terms of the sag, by kind, each with its numbers.
         light: what it does there, left out for a mirror; a plane that it passes is there to be the stop.
-        index: refractive index behind a face of a lens, where light goes to, at the design wavelength.
+        index: refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it
+            leaves the lens.
     """
 
     z: Length
@@ -425,6 +426,22 @@ class CameraSpec(Spec):
                 nearest(self.stop, self.mirrors),
                 ("stop",),
             )
+        return self
+
+    @model_validator(mode="after")
+    def _lenses_stand_in_air(self) -> "CameraSpec":
+        inside = ""
+        for name, mirror in self.mirrors.items():
+            if mirror.index is None:
+                continue
+            if (mirror.index == 1.0) != bool(inside):
+                problem = "a lens has a face into glass and a face out of it, with nothing cemented to it"
+                allowed = "index: 1 where light leaves glass" if inside else "an index above 1 where light enters glass"
+                raise Problem(problem, f"{mirror.index:g}", allowed, within=("mirrors", name, "index"))
+            inside = "" if inside else name
+        if inside:
+            problem = "light enters glass and does not leave it"
+            raise Problem(problem, inside, "a face with index: 1 behind it", within=("mirrors", inside))
         return self
 
     @model_validator(mode="after")

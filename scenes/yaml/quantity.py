@@ -183,6 +183,8 @@ Time = Annotated[float, Quantity(TIME)]
 """Seconds."""
 Temperature = Annotated[float, Quantity(TEMPERATURE, smallest="0 K")]
 """Kelvin, absolute."""
+
+
 @dataclass(frozen=True)
 class RadiusQuantity(Quantity):
     """A radius of curvature: a length, or ``flat`` for a plane, whose radius is infinite."""
