@@ -28,6 +28,8 @@ _OVER = Pose(np.diag([1.0, -1.0, -1.0]))
 _TURNS = {"rotX": 0, "rotY": 1, "rotZ": 2}
 _SHIFTS = {"x": 0, "y": 1, "z": 2}
 DEEPEST = 20
+LARGEST_FILE = 100_000
+"""Bytes: four times the largest of batoid's own; to read them takes a second or two."""
 MOST_SURFACES = 2000
 
 
@@ -342,7 +344,10 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
 def _loaded(path: str | Path) -> object:
     """The contents of a YAML file that may name parts of itself again, with the places of its keys."""
     source = Source(str(path))
-    text = "\n".join(decoded(read_bytes(path), source))
+    content = read_bytes(path)
+    if len(content) > LARGEST_FILE:
+        raise source.error("too large for a telescope", 1, f"{len(content)} bytes", f"at most {LARGEST_FILE}")
+    text = "\n".join(decoded(content, source))
     try:
         return YAML(typ="rt", pure=True).load(text)
     except MarkedYAMLError as error:

@@ -96,6 +96,7 @@ class _System:
     pupil: Pupil | None = None
     field_type: int = 0
     field_count: int = 0
+    field_line: int = 1
     wave_count: int = 0
     x: tuple[float, ...] = ()
     y: tuple[float, ...] = ()
@@ -190,9 +191,9 @@ def _take_system(system: _System, s: Statement) -> None:
             system.field_count = source.whole(s, 2, "the number of fields", 0, 10_000, 1)
             system.wave_count = source.whole(s, 3, "the number of wavelengths", 0, 10_000, 1)
         case "XFLN":
-            system.x = numbers("a field")
+            system.x, system.field_line = numbers("a field"), s.line
         case "YFLN":
-            system.y = numbers("a field")
+            system.y, system.field_line = numbers("a field"), s.line
         case "WAVM":
             number = source.whole(s, 0, "the wavelength's number", 1, 10_000)
             system.waves[number] = _wave(source, s, source.finite(s, 1, "the wavelength"))
@@ -327,7 +328,7 @@ def _fields(system: _System) -> tuple[tuple[float, float], ...]:
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
     for value in (*x, *y):
         if not abs(value) < 89.0:
-            raise system.source.error("a field beyond 89 deg", None, value)
+            raise system.source.error("a field beyond 89 deg", system.field_line, value)
     return tuple((math.radians(a), math.radians(b)) for a, b in zip(x, y, strict=True))
 
 

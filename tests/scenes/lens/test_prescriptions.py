@@ -239,7 +239,7 @@ WRONG = {
     "order": ("SURF 3", "SURF 4", "surfaces are not in their order", 0),
     "tilt": ("SQAP 70 65 0", "SCBD 1 0 0 0 0 90 0 0", "a surface with a tilt or decentre of its own", 0),
     "two stops": ("SURF 5", "SURF 5\n  STOP", "a second stop", 0),
-    "negative edge": ("SURF 2", "SURF 2\n  CLAP 0 -5 0", "a circular aperture needs", 0),
+    "negative edge": ("SURF 5", "SURF 5\n  CLAP 0 -5 0", "a circular aperture needs", 1),
     "ignored": ("  COMM frame", "  IGNR 1", "a surface that is to be ignored", 0),
 }
 """Words of the file -> other words, what is said of them, and by how many lines the place lies behind them."""
