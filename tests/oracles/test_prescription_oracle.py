@@ -82,7 +82,8 @@ def held(backend, path: Path, kind: type[Rayoptics] | type[Optiland]) -> None:
     read = read_zemax if path.suffix.lower() == ".zmx" else read_codev
     peer = kind(path)
     lens = read_alike(read, path, peer)
-    assert peer.wave == pytest.approx(lens.wavelength * (1e9 if kind is Rayoptics else 1e6), rel=1e-12)
+    if path.name != "achroMangin_ok.seq":  # names no reference; ray-optics takes the first wavelength, here the middle
+        assert peer.wave == pytest.approx(lens.wavelength * (1e9 if kind is Rayoptics else 1e6), rel=1e-12)
     fields = beams(backend, lens, 0.5)
     assert fields
     for launch, direction in fields:
@@ -144,6 +145,27 @@ def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
         found = differences(mine, tuple(part[valid] for part in theirs))
         for what, value in found.items():
             assert value < TOLERANCE[what], (what, value)
+
+
+ZEMAX_FIELDS = ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))
+"""Shares of 1.75 deg along x and y, of the rays that Zemax has traced."""
+
+
+def test_as_zemax_traces_lsst(backend) -> None:
+    """Every surface of three rays, by Zemax' own listing; it prints eleven digits, 1e-10 m at six metres."""
+    batoid = pytest.importorskip("batoid")
+    lens = read_batoid(Path(batoid.__file__).parent / "data/LSST/LSST_g_500.yaml", 500e-9)
+    system = assemble(lens.assembly(apertures=False), [SEQUENCE])
+    listed = np.loadtxt(HERE / "lsst_zemax_rays.csv", delimiter=",", skiprows=3)
+    for ray, shares in enumerate(ZEMAX_FIELDS):
+        start, *points = 1e-3 * listed[listed[:, 0] == ray][:, 2:]
+        direction = np.array([*np.tan(np.radians(1.75) * np.array(shares)), 1.0])
+        direction /= np.linalg.norm(direction)
+        traced = trace(backend, system, make_rays(backend, start[None], direction), keep=range(len(lens.surfaces)))
+        assert len(points) == len(lens.surfaces) == 12
+        for k, (surface, point) in enumerate(zip(lens.surfaces, points, strict=True)):
+            place = surface.pose.apply(traced.hit(k)[0, 0])
+            np.testing.assert_allclose(place, point, rtol=0, atol=1e-10, err_msg=surface.name)
 
 
 def test_a_tilted_surface_of_batoid_is_refused() -> None:
