@@ -136,7 +136,9 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
     model = _derived(lens, plain, backend)
     difference, rays = _compared(lens, origin, model, backend)
     if not difference < SAME:
-        raise AssertionError(f"the camera does not trace as its prescription does: {difference} m")
+        raise lens.error(
+            "the camera would not trace as this prescription does", None, f"{difference:.2g} m apart", "1 nm"
+        )
     return ReadCamera(model.spec, taken, tuple(notes), difference, rays)
 
 
