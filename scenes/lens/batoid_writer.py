@@ -10,11 +10,10 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
-from optics.geometry.zernike import monomials, order_of, triangle_index
 from optics.raytrace.assembly import Interaction
 from scenes.lens.camera_writer import rounded
 from scenes.lens.prescription import LensSurface, Note, Prescription
-from scenes.lens.shapes import LARGEST_ORDER, moved_polynomial, polynomial_of, turned_over, zernike_of
+from scenes.lens.shapes import LARGEST_ORDER, about_vertex, polynomial_of, turned_over, zernike_of
 from scenes.yaml.yaml_file import dump_yaml
 
 _OVER = Pose(np.diag([1.0, -1.0, -1.0]))
@@ -90,10 +89,7 @@ def _surface(lens: Prescription, given: LensSurface) -> dict[str, Any]:
         radius = figure.radius
         if any(figure.centre) or freeform:
             radius += math.hypot(*figure.centre)
-            order = order_of(figure.terms)
-            table = monomials(figure.terms, order, figure.radius)
-            about = {(a, n - a): float(table[triangle_index(a, n - a)]) for n in range(order + 1) for a in range(n + 1)}
-            for pair, value in moved_polynomial(about, figure.centre).items():
+            for pair, value in about_vertex(figure).items():
                 freeform[pair] = freeform.get(pair, 0.0) + value
     base: dict[str, Any] = {"type": "Plane"}
     if shape.curvature:

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optics.geometry.pose import rotation_vector
-from optics.geometry.sag_terms import SAG_TERMS
-from optics.geometry.surface import Surface
+from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
+from optics.geometry.surface import Surface, ZernikeFigure
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Interaction
@@ -230,9 +230,17 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
 
 def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str, Any]:
     """Further terms of a sag as a camera's file has them."""
-    if shape.figure is not None:
-        problem = "Zernike terms, or a polynomial of an order above 4, which a camera's file has no place for"
-        raise lens.error(problem, surface.line, surface.name, "conics, even powers, polynomials of orders 2 to 4")
+    terms = list(shape.terms)
+    if isinstance(shape.figure, ZernikeFigure):
+        last = max(shape.figure.terms, default=0)
+        if last > LAST_NOLL:
+            problem = "Zernike terms, or a polynomial, beyond what a camera's file has a place for"
+            raise lens.error(problem, surface.line, f"Z{last}", f"Z1 to Z{LAST_NOLL}, polynomials to order 7")
+        given = {f"Z{j}": a for j, a in shape.figure.terms.items()}
+        x0, y0 = shape.figure.centre
+        terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **given))
+    elif shape.figure is not None:
+        raise lens.error("a figure on a grid, which a camera's file has no place for", surface.line, surface.name)
     kinds = {kind: name for name, kind in SAG_TERMS.items()}
     return {
         kinds[type(term)]: {
@@ -240,7 +248,7 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
             for key, power in term.POWERS.items()
             if (value := getattr(term, key)) != 0.0
         }
-        for term in shape.terms
+        for term in terms
     }
 
 

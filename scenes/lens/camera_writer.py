@@ -12,6 +12,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import AT_REST, State
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription, Pupil
+from scenes.lens.shapes import joined
 from scenes.models.camera_assembly import line_body
 from scenes.models.camera_model import IMAGE, LIGHT, CameraModel
 from scenes.models.instrument_model import Instrument
@@ -28,7 +29,7 @@ def prescription_of(model: CameraModel) -> Prescription:
         LensSurface(
             name,
             model.mirror_pose(name),
-            model.surfaces[name],
+            joined(model.surfaces[name]),
             LIGHT[mirror.light],
             behind[name],
             model.apertures[name],
@@ -93,7 +94,7 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
         pose = design @ Pose(placed.rotation[0, k], placed.translation[0, k])
         element = assembly.elements[f"{camera}/{name}"]
         size = float(placed.scale[0, k])
-        shape = element.figured(state.get(body, AT_REST)).grown(size)
+        shape = joined(element.figured(state.get(body, AT_REST)).grown(size))
         aperture = None if element.aperture is None else element.aperture.grown(size)
         surfaces.append(LensSurface(name, pose, shape, element.interaction, 1.0, aperture))
     k = placed.index[line_body(root)]

@@ -10,9 +10,9 @@ import numpy as np
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.sag_terms import XYPolynomial
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
-from optics.geometry.zernike import cartesian_terms, noll_to_nm, triangle_index, triangle_size
+from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
 from scenes.lens.prescription import LensSurface
 
 LARGEST_ORDER = 10
@@ -85,6 +85,44 @@ def moved_polynomial(
                 part = c * comb(a, i) * (-cx) ** (a - i) * comb(b, j) * (-cy) ** (b - j)
                 out[i, j] = out.get((i, j), 0.0) + part
     return out
+
+
+def joined(surface: Surface) -> Surface:
+    """The surface with the Zernike terms of its own sag in its figure: one set of them, as other programs have it.
+
+    Raises:
+        ValueError: the figure is one on a grid, or terms about two places are of too high an order to be joined.
+    """
+    own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
+    if own is None:
+        return surface
+    rest = tuple(term for term in surface.terms if term is not own)
+    given = {j: float(a) for j, a in own.amplitudes.items() if a}
+    centre = (float(own.x0), float(own.y0))
+    figure = surface.figure
+    shape = replace(surface, terms=rest, figure=ZernikeFigure(float(own.radius), centre, given) if given else None)
+    if figure is None or not given:
+        return replace(shape, figure=figure) if figure is not None else shape
+    if not isinstance(figure, ZernikeFigure):
+        raise ValueError("Zernike terms of a sag beside a figure on a grid")
+    total: dict[tuple[int, int], float] = {}
+    assert isinstance(shape.figure, ZernikeFigure)
+    for one in (shape.figure, figure):
+        for pair, value in about_vertex(one).items():
+            total[pair] = total.get(pair, 0.0) + value
+    if max(a + b for a, b in total) > LARGEST_ORDER:
+        raise ValueError(f"Zernike terms beyond order {LARGEST_ORDER}")
+    radius = max(one.radius + float(np.hypot(*one.centre)) for one in (shape.figure, figure))
+    terms = zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in total.items()})
+    return replace(shape, figure=ZernikeFigure(radius, (0.0, 0.0), terms))
+
+
+def about_vertex(figure: ZernikeFigure) -> dict[tuple[int, int], float]:
+    """A figure as a polynomial in x and y: (a, b) -> c_ab, m^(1-a-b)."""
+    order = max(figure.order, 0)
+    table = monomials(figure.terms, order, figure.radius)
+    own = {(n - b, b): float(table[triangle_index(n - b, b)]) for n in range(order + 1) for b in range(n + 1)}
+    return moved_polynomial(own, figure.centre)
 
 
 def clear(
