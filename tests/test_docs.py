@@ -367,6 +367,7 @@ def test_a_wrong_command_line_is_found(line: str) -> None:
 
 NOT_RUN = {
     "python -m twin.camera my_camera.yaml": "a file of the reader's; tests/twin/test_camera_command.py refocuses one",
+    "python -m twin.camera camera.yaml": "a file that the lines before it make; tests/scenes/lens makes some",
     "python -m twin.compare RUN1": "run folders of the reader's own; tests/twin/test_compare.py compares some",
     "python -m tests.mutation": "hours, a campaign of its own",
     "python -m tests.golden": "a test of its own runs it (tests/golden/test_golden.py)",
@@ -395,7 +396,7 @@ def reason_not_run(line: str) -> str:
         return "needs a cluster of the user's"
     # what stands in capitals is for the reader to fill in; without anything there is nothing to do
     words = [word for before, word in itertools.pairwise(bare.split()) if before != "--out"]
-    if any(re.fullmatch(r"[A-Z][A-Z,]+(\.yaml)?", word) for word in words) or len(words) == 2:
+    if any(re.fullmatch(r"[A-Z][A-Z,]+(\.\w+)?", word) for word in words) or len(words) == 2:
         return "a form, or a name"
     return ""
 
@@ -413,15 +414,19 @@ def test_every_command_line_is_run_or_has_a_reason_not_to_be() -> None:
 def test_a_command_line_does_what_it_says(line: Piece, tmp_path: Path) -> None:
     """As it stands, but into a folder of the test's."""
     words = [sys.executable, *shlex.split(line.text)[1:]]
+    out = tmp_path / "run"
     if "--out" in words:
-        words[words.index("--out") + 1] = str(tmp_path / "run")
+        # a file keeps its ending, by which a command knows its kind
+        place = words.index("--out") + 1
+        out = out.with_suffix(Path(words[place]).suffix)
+        words[place] = str(out)
     elif "--help" not in words:
-        words += ["--out", str(tmp_path / "run")]
+        words += ["--out", str(out)]
     done = subprocess.run(
         words, cwd=ROOT, env=os.environ | {"COLUMNS": "120"}, capture_output=True, text=True, timeout=3600, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert "--help" in words or any((tmp_path / "run").iterdir())
+    assert "--help" in words or out.is_file() or any(out.iterdir())
 
 
 @pytest.mark.parametrize("block", blocks("python"), ids=str)

@@ -13,7 +13,14 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from optics.geometry.zernike import triangle_index, triangle_polynomial, triangle_size
+from optics.geometry.zernike import (
+    cartesian_terms,
+    order_of,
+    triangle_index,
+    triangle_polynomial,
+    triangle_size,
+    zernike,
+)
 from optics.numerics.frozen_map import FrozenMap
 
 
@@ -106,7 +113,91 @@ class XYPolynomial:
         return triangle_polynomial(x, y, coefficients, 4)
 
 
-SAG_TERMS: dict[str, type[SagTerm]] = {"polynomial": XYPolynomial}
+LAST_NOLL = 36
+"""Of the Zernike terms of a sag: all to radial order 7."""
+
+
+@dataclass(frozen=True)
+class ZernikeSag:
+    """Sum of a_j Z_j((x - x0)/radius, (y - y0)/radius), Noll's order, a_j = rms over the disk: a freeform as designed.
+
+    A mirror's figure error is none of it: that is a state's.
+    """
+
+    POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
+        dict.fromkeys(("radius", "x0", "y0", *(f"Z{j}" for j in range(1, LAST_NOLL + 1))), 1)
+    )
+    radius: Any = 0.0
+    x0: Any = 0.0
+    y0: Any = 0.0
+    Z1: Any = 0.0
+    Z2: Any = 0.0
+    Z3: Any = 0.0
+    Z4: Any = 0.0
+    Z5: Any = 0.0
+    Z6: Any = 0.0
+    Z7: Any = 0.0
+    Z8: Any = 0.0
+    Z9: Any = 0.0
+    Z10: Any = 0.0
+    Z11: Any = 0.0
+    Z12: Any = 0.0
+    Z13: Any = 0.0
+    Z14: Any = 0.0
+    Z15: Any = 0.0
+    Z16: Any = 0.0
+    Z17: Any = 0.0
+    Z18: Any = 0.0
+    Z19: Any = 0.0
+    Z20: Any = 0.0
+    Z21: Any = 0.0
+    Z22: Any = 0.0
+    Z23: Any = 0.0
+    Z24: Any = 0.0
+    Z25: Any = 0.0
+    Z26: Any = 0.0
+    Z27: Any = 0.0
+    Z28: Any = 0.0
+    Z29: Any = 0.0
+    Z30: Any = 0.0
+    Z31: Any = 0.0
+    Z32: Any = 0.0
+    Z33: Any = 0.0
+    Z34: Any = 0.0
+    Z35: Any = 0.0
+    Z36: Any = 0.0
+
+    @property
+    def amplitudes(self) -> dict[int, Any]:
+        """Noll index -> a_j, metres."""
+        return {j: getattr(self, f"Z{j}") for j in range(1, LAST_NOLL + 1)}
+
+    def sag(self, x: Any, y: Any) -> Any:
+        """Height, metres."""
+        if not self.radius:
+            return np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+        u, v = (np.asarray(x) - self.x0) / self.radius, (np.asarray(y) - self.y0) / self.radius
+        return np.asarray(sum(a * zernike(j, u, v) for j, a in self.amplitudes.items()))
+
+    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Height and slopes."""
+        import drjit as dr
+
+        none = self.radius == 0.0
+        scale = dr.select(none, 0.0, 1.0 / dr.select(none, 1.0, self.radius))
+        order = order_of(range(1, LAST_NOLL + 1))
+        coefficients: list[Any] = [0.0] * triangle_size(order)
+        for j, amplitude in self.amplitudes.items():
+            for a, b, c in cartesian_terms(j):
+                place = triangle_index(a, b)
+                coefficients[place] = coefficients[place] + c * amplitude
+        height, slope_x, slope_y = triangle_polynomial(
+            (x - self.x0) * scale, (y - self.y0) * scale, coefficients, order
+        )
+        return height, slope_x * scale, slope_y * scale
+
+
+SAG_TERMS: dict[str, type[SagTerm]] = {"polynomial": XYPolynomial, "zernike": ZernikeSag}
 """Name that a mirror's file may write under ``sag`` -> kind, whose numbers stand there by name. A new one is added
 here: the traces, their derivatives, the path tracer, meshes and the reader of files know it from this entry.
 """

@@ -28,7 +28,8 @@ below 1e-3, so that each step gains at least six digits; three reach rounding. A
 invalid."""
 
 FURTHER_STEPS = 2
-"""As many more for a surface with further terms of its sag, which may depart by millimetres."""
+"""As many more for a surface with further terms of its sag, and for an aspheric face of a lens, which may depart by
+millimetres."""
 
 SECTION = 6
 """Elements that one kernel traces, and differentiates: the time to compile it grows faster than its length, and
@@ -158,13 +159,14 @@ def trace(
         element, table = lookup(uploaded.values[i]), uploaded.grids[i]
         surface = element.surface
         p, d = _into_frame(backend, p, d, element.frame)
-        t, ok = _distance(p, d, surface, table, differentiable)
+        steps = _steps(surface, structure.interaction)
+        t, ok = _distance(p, d, surface, table, differentiable, steps)
         if element.before.gradient is None:
             p = backend.Vector3(dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z))
             path = dr.fma(element.before.index, t, path)
         else:
             curve = GradedRay.start(p, d, element.before.index, element.before.gradient)
-            tau = _solve(curve, t / curve.index, surface, table, differentiable)
+            tau = _solve(curve, t / curve.index, surface, table, differentiable, steps)
             p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
             ok = _reached(p, surface, table)
         valid = valid & ok
@@ -244,7 +246,7 @@ def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[
     return backend.Vector3(*map(point, frame.coordinates)), backend.Vector3(*map(vector, frame.coordinates))
 
 
-def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiable: bool) -> tuple[Any, Any]:
+def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiable: bool, steps: int) -> tuple[Any, Any]:
     """Path from p along d to the surface (may be negative) and whether it exists."""
     import drjit as dr
 
@@ -272,19 +274,20 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
         # functions)
         numbers = map_leaves(dr.detach, surface)
         origin, direction, t = dr.detach(p), dr.detach(d), dr.detach(t)
-    for _ in range(_steps(surface)):
+    for _ in range(steps):
         t = newton_step(origin, direction, t, numbers, table)
     if differentiable:
         t = newton_step(p, d, t, surface, table)
     return t, ok & _on_sheet(level(*along(origin, direction, t), numbers, table))
 
 
-def _steps(surface: SurfaceNumbers) -> int:
+def _steps(surface: SurfaceNumbers, interaction: Interaction) -> int:
     """Newton steps from the conic to the surface."""
-    return NEWTON_STEPS + (FURTHER_STEPS if surface.terms else 0)
+    lens = bool(surface.even) and interaction is Interaction.REFRACT
+    return NEWTON_STEPS + (FURTHER_STEPS if surface.terms or lens else 0)
 
 
-def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool) -> Any:
+def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool, steps: int) -> Any:
     """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
     import drjit as dr
 
@@ -297,7 +300,7 @@ def _solve(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, atta
     if attached:
         numbers = map_leaves(dr.detach, surface)
         ray, tau = curve.detached(), dr.detach(tau)
-    for _ in range(_steps(surface)):
+    for _ in range(steps):
         tau = step(ray, tau, numbers)
     return step(curve, tau, surface) if attached else tau
 

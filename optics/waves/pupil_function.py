@@ -88,6 +88,10 @@ class PupilFunction:
         return float(power * abs(np.linalg.det(self.axes)))
 
 
+class RoughWavefrontError(ValueError):
+    """A wavefront that the polynomials of a pupil do not follow."""
+
+
 def fit_pupils(
     field: PupilField, nodes: PupilNodes, degree: int = DEGREE, shadows: np.ndarray | None = None
 ) -> tuple[PupilFunction, ...]:
@@ -120,7 +124,7 @@ def fit_pupils(
         )
     worst = int(np.argmax(stack.residual))
     if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
-        raise ValueError(
+        raise RoughWavefrontError(
             f"polynomials of degree {degree} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
             f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}); raise the degree, with nodes enough for it"
         )

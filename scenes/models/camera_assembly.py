@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from optics.geometry.pose import Pose
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.camera_model import LIGHT, CameraModel, derive_camera, glass_indices, lenses
 from scenes.specs.camera import CameraSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.course import noll
@@ -36,7 +34,7 @@ def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
     for mirror in model.mirrors:
         x, y = model.apertures[mirror].centre
         centre = (x, y, float(model.surfaces[mirror].sag(x, y)))
-        own = into_camera @ Pose(np.eye(3), model.vertex(mirror))
+        own = into_camera @ model.mirror_pose(mirror)
         bodies.append(Body(f"{root}/{mirror}", own, pivots={"centre": centre}))
     x, y, z = model.focal_plane.inverse().apply(model.rear_node)
     pivots = {"rear_node": (float(x), float(y), float(z)), "line_centre": (0.0, 0.0, 0.0)}
@@ -49,10 +47,13 @@ def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
 def camera_elements(name: str, root: str, model: CameraModel) -> dict[str, Element]:
     """Mirrors and line CCD, by ``NAME/M1`` ... and ``NAME/line``."""
     out = {}
+    glass = lenses(model.spec)
     for mirror in model.mirrors:
         key = f"{name}/{mirror}"
         surface, aperture = model.surfaces[mirror], model.apertures[mirror]
-        out[key] = Element(key, f"{root}/{mirror}", surface, Interaction.REFLECT, aperture)
+        how = LIGHT[model.spec.mirrors[mirror].light]
+        solid = f"{root}/{glass[mirror]}" if mirror in glass else None
+        out[key] = Element(key, f"{root}/{mirror}", surface, how, aperture, solid=solid)
     key = f"{name}/line"
     out[key] = Element(key, line_body(root), plane(), Interaction.PASS)
     return out
@@ -77,7 +78,8 @@ ROOT = "camera"
 def camera_alone(model: CameraModel) -> Assembly:
     """The camera by itself: bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ..."""
     tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
-    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model))
+    index = {f"{ROOT}/{lens}": n for lens, n in glass_indices(model.spec).items()}
+    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model), index)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +103,7 @@ def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backe
     Raises:
         InputError: ``as_built`` names what the camera does not have.
     """
+    camera.require_mirrors("a camera under test")
     model = derive_camera(camera, backend)
     assembly = camera_alone(model)
     shaped = {e.body for e in assembly.elements.values() if e.interaction is Interaction.REFLECT}

@@ -39,6 +39,7 @@ def resolve_design(path: str | Path) -> CameraDesignSetup:
     if setup is None:
         test = validate(CameraDesignSpec, read_yaml(path))
         setup = CameraDesignSetup(test=test, camera=load_camera(find_camera(test)))
+    setup.camera.require_mirrors("a camera that is optimised", on_axis=True)
     known = (*setup.camera.mirrors, IMAGE)
     for name in setup.test.vary:
         if name not in known:

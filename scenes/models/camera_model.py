@@ -1,9 +1,10 @@
 """From a camera's prescription to its frame, apertures, stop and pivots, all found by tracing.
 
 Frames. Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
-line. Camera frame: Z = line of sight toward the scene, Y = along the line CCD (= prescription x), X = Y x Z, the flight
-direction; its origin is the point where the centre's chief ray meets the first mirror. Focal-plane frame: origin at the
-line's centre, Y as the camera's, Z square to the image plane and toward the scene, X = Y x Z.
+line. A mirror's own frame stands at its vertex, turned as the file says. Camera frame: Z = line of sight toward the
+scene, Y = along the line CCD (= prescription x), X = Y x Z, the flight direction; its origin is the point where the
+centre's chief ray meets the first mirror. Focal-plane frame: origin at the line's centre, Y as the camera's, Z square
+to the image plane and toward the scene, X = Y x Z.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.geometry.aperture import Aperture, Circle, Rectangle
-from optics.geometry.pose import Pose, about_axis
+from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, RigidTree
 from optics.numerics.array_math import determinant, norm, turned
@@ -75,7 +76,11 @@ class CameraModel:
 
     def vertex(self, mirror: str) -> np.ndarray:
         """Vertex of a mirror's parent surface in the prescription frame, metres."""
-        return np.array([0.0, 0.0, self.spec.mirrors[mirror].z])
+        return self.mirror_pose(mirror).translation
+
+    def mirror_pose(self, mirror: str) -> Pose:
+        """Pose of a mirror's own frame in the prescription frame."""
+        return mirror_pose(self.spec.mirrors[mirror])
 
     @property
     def image_body(self) -> Pose:
@@ -99,6 +104,13 @@ def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
     """
     vector = np.array([np.tan(x), np.tan(spec.field_bias + y), 1.0])
     return np.asarray(vector / norm(vector))
+
+
+def mirror_pose(mirror: MirrorSpec) -> Pose:
+    """Pose of a mirror's own frame in the prescription frame: its vertex, and the axes of its shape."""
+    x, y = mirror.decentre or (0.0, 0.0)
+    rotation = rotation_matrix(mirror.rotate) if mirror.rotate and any(mirror.rotate) else np.eye(3)
+    return Pose(rotation, np.array([x, y, mirror.z]))
 
 
 def image_pose(spec: CameraSpec) -> Pose:
@@ -157,7 +169,7 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
 
     sight = -centre
     across = np.cross(LINE_AXIS, sight)
-    origin = traced.hit(0)[0, 0] + np.array([0.0, 0.0, spec.mirrors[names[0]].z])
+    origin = mirror_pose(spec.mirrors[names[0]]).apply(traced.hit(0)[0, 0])
     camera_frame = Pose(np.stack([across, LINE_AXIS, sight], axis=-1), origin)
     normal = np.sign(sight[2]) * image_pose(spec).rotation[:, 2]
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
@@ -186,15 +198,36 @@ def surface_of(mirror: MirrorSpec) -> Surface:
     return Surface(1.0 / mirror.radius, mirror.conic, even, terms=tuple((mirror.sag or {}).values()))
 
 
+LIGHT = {None: Interaction.REFLECT, "refracts": Interaction.REFRACT, "passes": Interaction.PASS}
+
+
+def lenses(spec: CameraSpec) -> dict[str, str]:
+    """Face -> the lens that it is a face of, called by its first face; so light may go either way."""
+    out, inside = {}, ""
+    for name, mirror in spec.mirrors.items():
+        if mirror.light == "refracts":
+            out[name] = inside or name
+            inside = "" if inside else name
+    return out
+
+
+def glass_indices(spec: CameraSpec) -> dict[str, float]:
+    """Lens -> its refractive index at the design wavelength."""
+    first = dict.fromkeys(lenses(spec).values())
+    return {name: index for name in first if (index := spec.mirrors[name].index) is not None}
+
+
 def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:
-    bodies = [Body(name, Pose(np.eye(3), np.array([0.0, 0.0, m.z]))) for name, m in spec.mirrors.items()]
+    bodies = [Body(name, mirror_pose(m)) for name, m in spec.mirrors.items()]
     bodies.append(Body(IMAGE, image_pose(spec)))
+    glass = lenses(spec)
     elements = {
-        name: Element(name, name, surface, Interaction.REFLECT, apertures.get(name))
+        name: Element(name, name, surface, LIGHT[spec.mirrors[name].light], apertures.get(name), solid=glass.get(name))
         for name, surface in surfaces.items()
     }
     elements[IMAGE] = Element(IMAGE, IMAGE, plane(), Interaction.PASS)
-    return Assembly(RigidTree(tuple(bodies)), elements, {"imaging": (*spec.mirrors, IMAGE)})
+    sequences = {"imaging": (*spec.mirrors, IMAGE)}
+    return Assembly(RigidTree(tuple(bodies)), elements, sequences, glass_indices(spec))
 
 
 def _apertures(

@@ -111,7 +111,7 @@ class FieldBeams:
         shape = launch.shape[:2]
         require_some(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
-        way = position[:, 0] - traced.hit(last).reshape(*shape, 3)[:, 0] - model.vertex(model.mirrors[last])
+        way = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])
         return cls(
             spec,
             np.array(fields),

@@ -79,6 +79,7 @@ def _build(
     derived: dict[str, CameraModel] = {}
     for site in spec.cameras.values():
         if site.camera not in derived:
+            camera_specs[site.camera].require_mirrors("a camera of an instrument")  # type: ignore[attr-defined]
             derived[site.camera] = derive_camera(camera_specs[site.camera], backend)  # type: ignore[arg-type]
     bodies = [Body(BASE), Body(CENTRAL_PRISM, Pose(np.eye(3), np.array(spec.central_prism.position)))]
     elements: dict[str, Element] = {}

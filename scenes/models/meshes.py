@@ -83,9 +83,10 @@ def behind(model: CameraModel, mirror: str) -> float:
 
     That is where the light would go on to.
     """
-    places = [*(model.spec.mirrors[m].z for m in model.mirrors), model.spec.image.z]
     k = model.mirrors.index(mirror)
-    return 1.0 if places[k] > places[k + 1] else -1.0
+    own = model.mirror_pose(mirror)
+    after = model.image_body.translation if k + 1 == len(model.mirrors) else model.vertex(model.mirrors[k + 1])
+    return 1.0 if float(own.rotation[:, 2] @ (own.translation - after)) > 0.0 else -1.0
 
 
 def board_size(model: CameraModel, pinholes: list[tuple[float, float]]) -> tuple[float, float]:

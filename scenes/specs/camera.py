@@ -2,15 +2,12 @@
 with time delay and integration; and what is to be designed: a camera's prescription, or the layout of a monitor.
 """
 
-from collections.abc import Mapping
-from math import isfinite
-from typing import Annotated, Any, Literal
+from math import isinf
+from typing import Annotated, Literal
 
-from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, core_schema
+from pydantic import Field, model_validator
 
-from optics.geometry.sag_terms import SAG_TERMS, SagTerm
+from optics.geometry.sag_terms import SagTerm
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs.detector import PixelPitch
@@ -23,10 +20,11 @@ from scenes.specs.instrument import (
     check_made,
     reflector_kinds,
 )
-from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Vector, Wavelength
+from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Radius, Vector, Vector2, Wavelength
+from scenes.yaml.sag_terms import SagTerms
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
-from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE, TIME, format_quantity, parse_quantity, power_of_length
+from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE, TIME, format_quantity
 
 Spectrum = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
 RateError = Annotated[float, Quantity(SCALE, largest="50 percent")]
@@ -329,94 +327,50 @@ class MonitorDesignSpec(Spec):
 FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]
 
 
-class SagTerms:
-    """Annotation of a mapping from names of ``SAG_TERMS`` to their numbers, those that are registered when the file is
-    read; in the model the terms themselves.
-    """
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Read by ``_read``, written as it was read."""
-        as_text = core_schema.plain_serializer_function_ser_schema(self._written, when_used="json-unless-none")
-        return core_schema.no_info_plain_validator_function(self._read, serialization=as_text)
-
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """The kinds at this moment with their numbers."""
-
-        def value(power: int) -> JsonSchemaValue:
-            if not power:
-                return {"type": "number"}
-            return Quantity(power_of_length(power)).__get_pydantic_json_schema__(schema, handler)
-
-        kinds = {name: {key: value(power) for key, power in kind.POWERS.items()} for name, kind in SAG_TERMS.items()}
-        terms = {
-            name: {"type": "object", "properties": keys, "additionalProperties": False} for name, keys in kinds.items()
-        }
-        return {"type": "object", "properties": terms, "additionalProperties": False}
-
-    def _read(self, value: object) -> FrozenMap[str, SagTerm]:
-        terms = {}
-        for name, given in _mapping(value, SAG_TERMS, "no such term of a sag").items():
-            kind = SAG_TERMS[name]
-            units = kind.POWERS
-            numbers = _mapping(given, units, "unknown key", (name,))
-            terms[name] = kind(**{key: _number(numbers[key], units[key], (name, key)) for key in numbers})
-        return FrozenMap(terms)
-
-    def _written(self, terms: Mapping[str, SagTerm]) -> dict[str, dict[str, object]]:
-        return {
-            name: {
-                key: format_quantity(number, power_of_length(power)) if power else number
-                for key, power in term.POWERS.items()
-                if (number := getattr(term, key)) != 0.0
-            }
-            for name, term in terms.items()
-        }
-
-
-def _mapping(value: object, names: Mapping[str, Any], problem: str, within: KeyPath = ()) -> dict[str, Any]:
-    """A mapping with no other keys than these."""
-    if not isinstance(value, Mapping):
-        raise Problem("not a mapping", shown(value), f"a mapping with keys {names_text(names)}", within=within)
-    for name in value:
-        if name not in names:
-            raise Problem(problem, shown(name), names_text(names), nearest(str(name), names), (*within, name))
-    return dict(value)
-
-
-def _number(value: object, power: int, within: KeyPath) -> float:
-    """A quantity in metres to a power, or a plain number."""
-    try:
-        if power:
-            return parse_quantity(value, power_of_length(power))
-    except Problem as problem:
-        problem.within = within
-        raise
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-        raise Problem("not a number", shown(value), "a plain number, without a unit", within=within)
-    return float(value)
+Turn = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="180 deg"), 3)]
+Light = Literal["refracts", "passes"]
 
 
 class MirrorSpec(Spec):
-    """A mirror about the parent axis; of revolution, unless ``sag`` has terms that are not.
+    """A mirror about the parent axis; of revolution, unless ``sag`` has terms that are not. A camera may have faces of
+    lenses and a stop of its own among its mirrors: ``light`` says what happens there.
 
     Attributes:
         z: vertex on the parent axis, metres; light enters toward +z.
-        radius: vertex radius of curvature, metres, positive if the centre of curvature lies toward +z.
+        decentre: of the vertex from the parent axis, along x and y, metres.
+        rotate: rotation vector by which the surface is turned about its vertex, radians.
+        radius: vertex radius of curvature, metres, positive if the centre of curvature lies toward +z; ``flat`` for a
+            plane.
         conic: conic constant k.
-        aspheric: terms A4, A6, A8 of the sag beyond the conic's, 1/m^3, 1/m^5, 1/m^7; empty for a pure conic.
+        aspheric: terms A4, A6, ... of the sag beyond the conic's, 1/m^3, 1/m^5, ...; empty for a pure conic.
         sag: further terms of the sag, by kind, each with its numbers.
+        light: what it does there, left out for a mirror; a plane that it passes is there to be the stop.
+        index: refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it
+            leaves the lens.
     """
 
     z: Length
-    radius: Length
+    decentre: Vector2 | None = None
+    rotate: Turn | None = None
+    radius: Radius
     conic: Number = 0.0
     aspheric: AsphereTerms = Field(default_factory=FrozenMap)
     sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
+    light: Light | None = None
+    index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
 
     @model_validator(mode="after")
     def _is_curved(self) -> "MirrorSpec":
         if self.radius == 0.0:
             raise Problem("a radius of curvature cannot be zero", "0 m", "a length other than zero", within=("radius",))
+        return self
+
+    @model_validator(mode="after")
+    def _index_where_light_refracts(self) -> "MirrorSpec":
+        if (self.light == "refracts") != (self.index is not None):
+            problem = "a face of a lens has an index behind it, and nothing else has"
+            found = "no index" if self.index is None else f"an index, light: {self.light or 'reflected'}"
+            raise Problem(problem, found, "light: refracts with an index", within=("light",))
         return self
 
 
@@ -457,8 +411,8 @@ class CameraSpec(Spec):
         field_bias: angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
         field: half angles about the field bias.
         wavelength: design wavelength, metres.
-        stop: name of the mirror that is the aperture stop.
-        mirrors: by name, in the order in which the light meets them.
+        stop: name of the mirror, or other surface, that is the aperture stop.
+        mirrors: by name, in the order in which the light meets them; faces of lenses and a stop among them.
         image: focal plane.
         line: line CCD.
         bands: line CCDs by spectral band, for images of targets; empty when none is described.
@@ -491,3 +445,46 @@ class CameraSpec(Spec):
                 ("stop",),
             )
         return self
+
+    @model_validator(mode="after")
+    def _lenses_stand_in_air(self) -> "CameraSpec":
+        inside = ""
+        for name, mirror in self.mirrors.items():
+            if mirror.index is None:
+                continue
+            if (mirror.index == 1.0) != bool(inside):
+                problem = "a lens has a face into glass and a face out of it, with nothing cemented to it"
+                allowed = "index: 1 where light leaves glass" if inside else "an index above 1 where light enters glass"
+                raise Problem(problem, f"{mirror.index:g}", allowed, within=("mirrors", name, "index"))
+            inside = "" if inside else name
+        if inside:
+            problem = "light enters glass and does not leave it"
+            raise Problem(problem, inside, "a face with index: 1 behind it", within=("mirrors", inside))
+        return self
+
+    @model_validator(mode="after")
+    def _one_colour_through_glass(self) -> "CameraSpec":
+        faces = [name for name, mirror in self.mirrors.items() if mirror.light == "refracts"]
+        if faces and self.bands:
+            problem = "a camera with lenses knows their index at its design wavelength alone, and has no bands"
+            raise Problem(problem, f"{faces[0]} refracts", "mirrors alone, or no bands", within=("bands",))
+        return self
+
+    def require_mirrors(self, where: str, on_axis: bool = False) -> None:
+        """Refuse a camera that is not made of mirrors alone.
+
+        Args:
+            where: such a camera cannot stand, for the message.
+            on_axis: refuse mirrors that are flat, turned or off the parent axis, too.
+
+        Raises:
+            InputError: it has a lens or a stop of its own; with the line.
+        """
+        for name, mirror in self.mirrors.items():
+            if mirror.light is not None:
+                problem = f"{where} is made of mirrors alone"
+                raise self.error(problem, ("mirrors", name, "light"), found=mirror.light, allowed="mirrors")
+            if on_axis and (mirror.decentre or mirror.rotate or isinf(mirror.radius)):
+                key = next(k for k in ("decentre", "rotate", "radius") if k == "radius" or getattr(mirror, k))
+                problem = f"{where} has curved mirrors about one axis"
+                raise self.error(problem, ("mirrors", name, key), allowed="mirrors without decentre and rotate")

@@ -19,9 +19,6 @@ from scenes.yaml.errors import Problem, shown
 from scenes.yaml.units import (
     ANGLE,
     LENGTH,
-    PER_LENGTH3,
-    PER_LENGTH5,
-    PER_LENGTH7,
     SCALE,
     TEMPERATURE,
     TIME,
@@ -29,6 +26,7 @@ from scenes.yaml.units import (
     format_quantity,
     parse_quantity,
     pattern,
+    power_of_length,
     split_row,
 )
 
@@ -185,12 +183,34 @@ Time = Annotated[float, Quantity(TIME)]
 """Seconds."""
 Temperature = Annotated[float, Quantity(TEMPERATURE, smallest="0 K")]
 """Kelvin, absolute."""
+
+
+@dataclass(frozen=True)
+class RadiusQuantity(Quantity):
+    """A radius of curvature: a length, or ``flat`` for a plane, whose radius is infinite."""
+
+    def parse(self, text: object) -> float:
+        """The SI value of the text, as ``Quantity``."""
+        return math.inf if text == FLAT else super().parse(text)
+
+    def format(self, value: float) -> str:
+        """Text that `parse` reads back to exactly this value."""
+        return FLAT if math.isinf(value) else super().format(value)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        length = super().__get_pydantic_json_schema__(schema, handler)
+        return {"anyOf": [length, {"const": FLAT}], "description": f"{length['description']}; or {FLAT}"}
+
+
+FLAT = "flat"
+Radius = Annotated[float, RadiusQuantity(LENGTH, largest="1000 km")]
+"""Of curvature, metres; infinite for a plane."""
 AsphereTerms = Annotated[
     Mapping[str, float],
-    Terms({"A4": Quantity(PER_LENGTH3), "A6": Quantity(PER_LENGTH5), "A8": Quantity(PER_LENGTH7)}),
+    Terms({f"A{n}": Quantity(power_of_length(1 - n)) for n in range(4, 22, 2)}),
 ]
-"""Terms of an even asphere's sag A4 r^4 + A6 r^6 + A8 r^8, 1/m^3, 1/m^5, 1/m^7; those that are not written are not
-there.
+"""Terms of an even asphere's sag A4 r^4 + A6 r^6 + ... + A20 r^20, 1/m^3, 1/m^5, ...; those that are not written are
+not there.
 """
 Vector2 = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]
 """Two lengths, metres."""

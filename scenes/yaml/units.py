@@ -17,7 +17,7 @@ from typing import Any
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 
 _NUMBER = r"[-+]?(?:[0-9]{1,30}(?:\.[0-9]{0,30})?|\.[0-9]{1,30})(?:[eE][-+]?[0-9]{1,3})?"
-_NAME = r"(?:[A-Za-zµμΩ°]{1,30}|%)(?:\^-?[1-9])?"
+_NAME = r"(?:[A-Za-zµμΩ°]{1,30}|%)(?:\^-?[1-9][0-9]?)?"
 _UNIT = rf"(?:1/)?{_NAME}(?:[*/]{_NAME}){{0,3}}"
 # A unit that begins with a letter may follow the number directly (2um); "1/m^3" may not, or "21/m^3" would read as 2
 # 1/m^3.

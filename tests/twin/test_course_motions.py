@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scenes.models.job_state import motions_of
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
-from twin.monitor.monitor_experiment import MonitorExperiment, motions_of
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth
 from twin.render import app

@@ -11,6 +11,7 @@ import xarray as xr
 
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
+from optics.waves.pupil_function import RoughWavefrontError
 from scenes.models.camera_file import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
@@ -169,7 +170,10 @@ def run_camera(
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
     advance("MTF", 0, 1)
-    mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
+    try:
+        mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
+    except RoughWavefrontError:  # a telescope that is not made for diffraction's limit: no smooth pupil, no MTF
+        mtfs, sharp = (), False
     focus = through_focus(optics, backend, MTF_FIELDS, sharp)
     curves = field_curves(optics, sharp)
     advance("MTF", 1, 1)

@@ -94,7 +94,8 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             axes.plot(line[:, 2], line[:, axis], color=colour, lw=width, ls=style, alpha=0.9)
     edges = obstacles(model)
     for name in (*model.mirrors, IMAGE):
-        edge, pose = edges[name], model.image_body
+        edge, pose = edges.get(name, model.apertures.get(name)), model.image_body
+        assert edge is not None
         low, high = edge.bounds[2 * axis], edge.bounds[2 * axis + 1]
         other = edge.centre[1 - axis]
         across = np.linspace(low, high, 80)
@@ -103,7 +104,7 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             z = np.zeros(80)
             drawn = pose.apply(np.stack([x, y, z], axis=-1))
         else:
-            drawn = model.vertex(name) + np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1)
+            drawn = model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
         axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
         _label(axes, model, name, drawn[:, [2, axis]], axis)
     axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)

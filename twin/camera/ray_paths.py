@@ -59,12 +59,14 @@ def ray_paths(
 
 
 def obstacles(model: CameraModel) -> dict[str, Aperture]:
-    """What of a camera may stand in its own light, in each body's own x and y: mirrors with their edges, and the line
-    CCDs with as much of an edge.
+    """What of a camera may stand in its own light, in each body's own x and y: mirrors and lenses with their edges, and
+    the line CCDs with as much of an edge.
     """
     spec, margin = model.spec, model.spec.edge_margin
     out: dict[str, Aperture] = {}
     for name, edge in model.apertures.items():
+        if spec.mirrors[name].light == "passes":
+            continue  # a stop's plate stands where its hole is not
         # the other mirrors' clear apertures have the margin already
         out[name] = Circle(edge.radius + margin) if isinstance(edge, Circle) else edge
     lines = [(spec.line.pixels * spec.line.pitch, 0.0)]

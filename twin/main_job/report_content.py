@@ -10,11 +10,11 @@ import numpy as np
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
+from scenes.models.job_state import motions_of
 from scenes.specs.channel import BASE
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import joined, systematics
-from twin.monitor.monitor_experiment import motions_of
 from twin.run.artefact import FAR, decimals_for, fixed, plain, residual, residual_text, shown_unit
 
 ZERO_CELSIUS = 273.15

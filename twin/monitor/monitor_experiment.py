@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -18,16 +17,15 @@ from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_template import SpotTemplate
-from optics.geometry.pose import triple
-from optics.geometry.tree import Motion, State
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.thermal_model import TemperatureError, ThermalModel
+from scenes.models.job_state import job_state
+from scenes.models.thermal_model import ThermalModel
 from scenes.specs.channel import SIDES
-from scenes.specs.course import noll
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
@@ -94,12 +92,7 @@ class MonitorExperiment:
         Raises:
             InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
         """
-        fields = job.fields()
-        try:
-            self.thermal.check(fields)
-            return self.thermal.state(fields, motions_of(job), progress)
-        except TemperatureError as error:
-            raise job.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
+        return job_state(job, self.thermal, progress)
 
     @property
     def nominal_photons(self) -> np.ndarray:
@@ -269,23 +262,3 @@ class MonitorExperiment:
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
         """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""
         return self.detector.expected_dn(photons, self.exposure)
-
-
-def motions_of(job: JobSpec, time: int | None = None) -> State:
-    """The rigid motions, scales and figures that a job asks for; its temperatures come on top of them.
-
-    Args:
-        job: its perturbation.
-        time: number of a time of its course, whose motions are added; None for none.
-    """
-    out = {
-        path: Motion(p.rotate, p.shift, p.pivot, p.scale, {noll(term): value for term, value in p.figure.items()})
-        for path, p in job.perturb.items()
-    }
-    if job.course is not None and time is not None:
-        for path, added in job.course.motions(time).items():
-            own = out.get(path, Motion())
-            rotate = triple(a + b for a, b in zip(own.rotate, added.rotate, strict=True))
-            shift = triple(a + b for a, b in zip(own.shift, added.shift, strict=True))
-            out[path] = replace(own, rotate=rotate, shift=shift, pivot=added.pivot, scale=own.scale + added.scale)
-    return out

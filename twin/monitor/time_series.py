@@ -21,12 +21,13 @@ from optics.numerics.threads import cores, one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.thermal.heat import Temperature
+from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import CourseSpec, moment
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
-from twin.monitor.monitor_experiment import MonitorExperiment, motions_of
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth, trace_truth
 
 CHUNK = 25

@@ -22,10 +22,10 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
+from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.job import JobSpec, perturbation_issues
 from scenes.yaml.errors import InputError
-from twin.monitor.monitor_experiment import motions_of
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import (

@@ -20,10 +20,11 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.thermal.heat import Temperature
+from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.channel import BASE
 from scenes.specs.course import moment
-from twin.monitor.monitor_experiment import MonitorExperiment, motions_of
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS

@@ -1,0 +1,275 @@
+"""``python -m scenes.lens``: prescriptions of other optical programs as cameras of the twin, and back."""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from scenes.yaml.errors import InputError, Issue, Problem, printable
+from scenes.yaml.standard_output import FAILURE, print_error, to_stdout
+from scenes.yaml.units import ANGLE, LENGTH, Kind, parse_quantity
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.lens.prescription import Prescription
+
+BAD_INPUT = 2
+READS = {".zmx": "Zemax", ".seq": "CODE V", ".yaml": "batoid", ".yml": "batoid"}
+WRITES = (".zmx", ".yaml", ".yml")
+
+app = typer.Typer(
+    add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
+)
+Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
+
+
+@contextmanager
+def _explained(errors: Console) -> Iterator[None]:
+    """Turn the errors that a user can cause into one sentence and an exit code."""
+    from optics.numerics.backend import BackendUnavailable
+    from optics.numerics.llvm import LibraryMissing
+
+    try:
+        yield
+    except InputError as error:
+        print_error(errors, str(error))
+        raise typer.Exit(BAD_INPUT) from None
+    except (BackendUnavailable, LibraryMissing) as error:
+        print_error(errors, str(error))
+        raise typer.Exit(FAILURE) from None
+
+
+def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
+    """The value of an option with a unit."""
+    if text is None:
+        return None
+    try:
+        value = parse_quantity(text, kind)
+    except Problem as problem:
+        raise InputError(Issue(f"{option}: {problem.problem}", "", None, (), problem.found, problem.allowed)) from None
+    if not value > 0.0:
+        raise InputError(Issue(f"{option} is not greater than zero", "", None, (), text))
+    return value
+
+
+def _check_out(out: Path, suffixes: Sequence[str], force: bool) -> None:
+    if out.suffix.lower() not in suffixes:
+        raise InputError(Issue("what kind of file is this to be?", str(out), allowed=", ".join(suffixes)))
+    if out.exists() and not force:
+        raise InputError(Issue("exists", str(out), allowed="another name, or --force to replace it"))
+
+
+def _write(out: Path, content: bytes) -> None:
+    """A file, whole or not at all."""
+    handle, name = -1, ""
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, out)
+    except OSError as error:
+        if name:
+            Path(name).unlink(missing_ok=True)
+        raise InputError(Issue(f"cannot be written: {error.strerror or error}", str(out))) from None
+
+
+def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: float | None = None) -> Prescription:
+    """A foreign file by its ending.
+
+    Args:
+        path: of a .zmx, .seq or .yaml file.
+        glasses: AGF catalogues.
+        wavelength: for a file of batoid, which names none, metres.
+
+    Raises:
+        InputError: the file cannot be read as what it is.
+    """
+    from scenes.lens.glass_catalogue import read_catalogues
+
+    kind = READS.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(Issue("what kind of file is this?", str(path), allowed=", ".join(READS)))
+    if kind == "batoid":
+        from scenes.lens.batoid_reader import read_batoid
+
+        if wavelength is None:
+            raise InputError(Issue("a file of batoid names no wavelength", str(path), allowed='--wavelength "620 nm"'))
+        return read_batoid(path, wavelength)
+    if wavelength is not None:
+        problem = "--wavelength is for files of batoid; this one names its own"
+        raise InputError(Issue(problem, str(path)))
+    known = read_catalogues(glasses)
+    if kind == "Zemax":
+        from scenes.lens.zemax_reader import read_zemax
+
+        return read_zemax(path, known)
+    from scenes.lens.codev_reader import read_codev
+
+    return read_codev(path, known)
+
+
+@app.command()
+def read(
+    file: Annotated[
+        Path, typer.Argument(readable=False, help="Zemax .zmx, CODE V .seq, or a telescope of batoid, .yaml.")
+    ],
+    out: Annotated[Path, typer.Option(readable=False, help="The camera's file to write, .yaml.")],
+    glasses: Annotated[
+        list[Path] | None, typer.Option(readable=False, help="AGF catalogue of glasses; may be given several times.")
+    ] = None,
+    pupil: Annotated[
+        str | None, typer.Option(help='Diameter of the entrance pupil, "0.6 m", in place of the file\'s.')
+    ] = None,
+    field: Annotated[
+        str | None, typer.Option(help='Half field about the axis, "1.5 deg", in place of the file\'s.')
+    ] = None,
+    wavelength: Annotated[str | None, typer.Option(help='"620 nm", for files of batoid, which name none.')] = None,
+    pitch: Annotated[str, typer.Option(help="Of the line CCD's pixels, which no such file has.")] = "7 um",
+    force: Force = False,
+) -> None:
+    """Make a camera's file of another program's prescription, and say what of it did not come along.
+
+        python -m scenes.lens read threemir.seq --out threemir.yaml
+
+        python -m scenes.lens read doublet.zmx --glasses schott.agf --out doublet.yaml
+
+        python -m scenes.lens read LSST_r.yaml --wavelength "620 nm" --field "1.75 deg" --pupil "8.36 m" --out lsst.yaml
+
+    Both are traced before the file is written, and the largest difference is said. What would be taken wrongly is
+    refused with its line, every statement that was not understood is listed with its own. Pupil and field are the
+    file's, unless they are given here. Exit code 2 for a file that cannot be read.
+    """
+    errors = Console(stderr=True)
+    with _explained(errors):
+        _check_out(out, (".yaml", ".yml"), force)
+        wide, half = _quantity("--pupil", pupil, LENGTH), _quantity("--field", field, ANGLE)
+        step, colour = _quantity("--pitch", pitch, LENGTH), _quantity("--wavelength", wavelength, LENGTH)
+        lens = read_prescription(file, glasses or (), colour)
+        from dataclasses import replace
+
+        from optics.numerics.backend import load_backend
+        from scenes.lens.camera_reader import Width, camera_of, camera_text
+
+        if half is not None:
+            lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), field_kind="angles")
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", out.stem)[:64]
+        name = name if re.match(r"[A-Za-z]", name) else f"camera_{name}"[:64]
+        assert step is not None
+        made = camera_of(lens, name, load_backend("llvm"), Width(wide, step))
+        _write(out, camera_text(made, lens).encode())
+    with to_stdout(errors, f"the camera is complete in {out}"):
+        for line in made.told(lens):
+            sys.stdout.write(f"{printable(line)}\n")
+        sys.stdout.write(f"{out}\n")
+
+
+@app.command()
+def write(
+    camera: Annotated[Path, typer.Argument(readable=False, help="A camera of the library (gf7), or a camera's file.")],
+    out: Annotated[Path, typer.Option(readable=False, help="Zemax .zmx, or .yaml for batoid.")],
+    perturbed: Annotated[
+        Path | None, typer.Option(readable=False, help="A job: the camera as it stands in the job's perturbed state.")
+    ] = None,
+    mounted: Annotated[
+        str | None,
+        typer.Option("--camera", help="With --perturbed: which of the instrument's cameras."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a camera as a prescription that other programs read, as designed or as a job has perturbed it.
+
+        python -m scenes.lens write gf7 --out gf7.zmx
+
+        python -m scenes.lens write gf7 --out gf7_batoid.yaml
+
+        python -m scenes.lens write gf7 --perturbed perturb.yaml --camera forward --out forward.zmx
+
+    Motions of mirrors, of the camera and of the focal plane are coordinate breaks, growth is in the shapes, figures are
+    Zernike terms (Noll, rms). What a format cannot hold exactly is refused by name.
+    """
+    errors = Console(stderr=True)
+    with _explained(errors):
+        _check_out(out, WRITES, force)
+        if mounted is not None and perturbed is None:
+            raise InputError(Issue("--camera is for --perturbed", "", None, (), mounted))
+        from optics.numerics.backend import load_backend
+
+        backend = load_backend("llvm")
+        lens = _perturbed(camera, perturbed, mounted, backend) if perturbed else _designed(camera, backend)
+        notes = list(lens.notes)
+        if out.suffix.lower() == ".zmx":
+            from scenes.lens.zemax_writer import zemax_text
+
+            content = zemax_text(lens).replace("\n", "\r\n").encode("utf-16")
+        else:
+            from scenes.lens.batoid_writer import batoid_text
+
+            text, more = batoid_text(lens)
+            notes += more
+            content = text.encode()
+        _write(out, content)
+    with to_stdout(errors, f"the prescription is complete in {out}"):
+        for note in notes:
+            sys.stdout.write(f"not carried: {printable(str(note))}\n")
+        sys.stdout.write(f"{out}\n")
+
+
+def _designed(camera: Path, backend: Backend) -> Prescription:
+    from scenes.lens.camera_writer import prescription_of
+    from scenes.models.camera_model import derive_camera
+    from scenes.specs.load import load_camera
+
+    return prescription_of(derive_camera(load_camera(str(camera)), backend))
+
+
+def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backend) -> Prescription:
+    """A camera of a job's instrument in the job's state."""
+    from scenes.lens.camera_writer import perturbed_prescription
+    from scenes.models.instrument_builder import build_instrument
+    from scenes.models.job_state import job_state
+    from scenes.models.thermal_model import ThermalModel
+    from scenes.specs.job import check_nodes
+    from scenes.specs.load import load_camera
+    from scenes.specs.resolved import resolve
+    from scenes.yaml.errors import names_text, nearest
+
+    resolved = resolve(job_file)
+    wanted = load_camera(str(camera)).name
+    cameras = {name: resolved.cameras[site.camera].name for name, site in resolved.instrument.cameras.items()}
+    places = [name for name, known in cameras.items() if known == wanted]
+    if not places:
+        allowed = names_text(f"{known} ({name})" for name, known in cameras.items())
+        raise InputError(Issue("the job's instrument has no such camera", str(job_file), None, (), wanted, allowed))
+    if mounted is None and len(places) > 1:
+        raise InputError(Issue("which of them?", str(job_file), None, (), None, f"--camera {' or '.join(places)}"))
+    if mounted is not None and mounted not in places:
+        meant = nearest(mounted, places)
+        raise InputError(Issue("no such camera", str(job_file), None, (), mounted, names_text(places), meant))
+    instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
+    check_nodes(resolved.job, instrument.nodes)
+    state = job_state(resolved.job, ThermalModel(instrument))
+    try:
+        return perturbed_prescription(instrument, mounted or places[0], state)
+    except ValueError as error:
+        raise InputError(Issue(str(error), str(job_file))) from None
+
+
+if __name__ == "__main__":
+    app()

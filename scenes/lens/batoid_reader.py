@@ -1,0 +1,358 @@
+"""batoid's YAML files as prescriptions.
+
+There light comes down from +z; here it enters toward +z. Everything is turned about x by half a turn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.zernike import MAX_NOLL
+from optics.raytrace.assembly import Interaction
+from scenes.lens.prescription import LensSurface, Note, Prescription
+from scenes.lens.shapes import clear, even_asphere, turned_over
+from scenes.lens.statements import Source, decoded, read_bytes
+from scenes.yaml.errors import InputError, Issue, KeyPath, shown
+
+_OVER = Pose(np.diag([1.0, -1.0, -1.0]))
+_TURNS = {"rotX": 0, "rotY": 1, "rotZ": 2}
+_SHIFTS = {"x": 0, "y": 1, "z": 2}
+DEEPEST = 20
+LARGEST_FILE = 100_000
+"""Bytes: four times the largest of batoid's own; to read them takes a second or two."""
+MOST_SURFACES = 2000
+
+
+_OF_OPTICS = frozenset(
+    "type name surface coordSys inMedium outMedium medium items obscuration backDist sphereRadius pupilSize "
+    "pupilObscuration R_outer R_inner parent stopSurface".split()
+)
+"""Keys of an optic that say where it is and what it does, or where a calculation of wavefronts begins."""
+
+
+class _Reader:
+    """A file while it is read."""
+
+    def __init__(self, file: str, data: object, wavelength: float) -> None:
+        self.file, self.data, self.wavelength = file, data, wavelength
+        self.surfaces: list[LensSurface] = []
+        self.notes: list[Note] = []
+        self.ambient = 1.0
+
+    def error(self, key: KeyPath, problem: str, found: object = None, allowed: str | None = None) -> InputError:
+        """What is wrong at a key."""
+        text = None if found is None else shown(found)
+        return InputError(Issue(problem, self.file, self.line(key), key, text, allowed))
+
+    def line(self, key: KeyPath) -> int:
+        """Of a key, or of the innermost thing around it that has one, counted from 1."""
+        here, line = self.data, 1
+        for part in key:
+            marks = getattr(here, "lc", None)
+            try:
+                place = marks.key(part) if isinstance(part, str) else marks.item(part)  # type: ignore[union-attr]
+                here, line = here[part], int(place[0]) + 1  # type: ignore[index]
+            except (KeyError, IndexError, TypeError, AttributeError):
+                break
+        return line
+
+    def number(self, given: Mapping[str, Any], name: str, key: KeyPath, default: float | None = None) -> float:
+        """A finite number of a mapping."""
+        if name not in given and default is not None:
+            return default
+        value = given.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e20:
+            raise self.error((*key, name), f"{name} is not a number", value, "a number")
+        return float(value)
+
+    def mapping(self, value: object, key: KeyPath) -> Mapping[str, Any]:
+        """A mapping."""
+        if not isinstance(value, Mapping):
+            raise self.error(key, "not a mapping", value, "a mapping with a type")
+        return value
+
+    def listed(self, value: object, key: KeyPath) -> list[Any]:
+        """A list."""
+        if not isinstance(value, list):
+            raise self.error(key, "not a list", value, "a list")
+        return value
+
+    def _only(self, given: Mapping[str, Any], key: KeyPath, known: Mapping[str, tuple[str, ...]]) -> None:
+        """Refuse a number that would be left out: keys beyond those of a kind; R where a kind has no list."""
+        for name in given:
+            names = known.get(str(given.get("type")), ("R", "items"))
+            if name != "type" and name not in names:
+                raise self.error((*key, name), "a key that is not known here", given[name], ", ".join(names))
+
+    # ----------------------------------------------------------------------------------------------------- parts
+
+    def optic(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, before: float, after: float) -> None:
+        """One optic with all below it, in its parent's frame and media."""
+        if len(key) > 2 * DEEPEST:
+            raise self.error(key, "optics within optics without end", allowed=f"at most {DEEPEST} levels")
+        kind = given.get("type")
+        for name in given:
+            if name not in _OF_OPTICS:
+                self.notes.append(Note(self.line((*key, name)), str(name), "not understood"))
+        pose = self._placed(given, key, pose)
+        before = self.medium(given["inMedium"], (*key, "inMedium")) if "inMedium" in given else before
+        after = self.medium(given["outMedium"], (*key, "outMedium")) if "outMedium" in given else after
+        match kind:
+            case "CompoundOptic":
+                for k, item in enumerate(self.listed(given.get("items"), (*key, "items"))):
+                    below = (*key, "items", k)
+                    self.optic(self.mapping(item, below), below, pose, before, after)
+            case "Lens":
+                glass = self.medium(given.get("medium"), (*key, "medium"))
+                items = self.listed(given.get("items"), (*key, "items"))
+                if len(items) != 2:
+                    raise self.error((*key, "items"), "a lens has two faces", f"{len(items)}")
+                for k, (inside, outside) in enumerate(((before, glass), (glass, after))):
+                    below = (*key, "items", k)
+                    self.optic(self.mapping(items[k], below), below, pose, inside, outside)
+            case "Mirror":
+                self._add(given, key, pose, Interaction.REFLECT, before)
+            case "RefractiveInterface":
+                how = Interaction.PASS if before == after else Interaction.REFRACT
+                self._add(given, key, pose, how, after)
+            case "Detector":
+                self._add(given, key, pose, Interaction.PASS, before)
+            case "Baffle" | "Interface":
+                text = f"{given.get('name', kind)}: does nothing to rays but stop some: not carried"
+                self.notes.append(Note(self.line(key), kind, text))
+            case _:
+                known = "CompoundOptic, Lens, Mirror, RefractiveInterface, Detector, Baffle, Interface"
+                raise self.error((*key, "type"), "an optic that is not known here", kind, known)
+
+    def _add(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, how: Interaction, index: float) -> None:
+        if len(self.surfaces) >= MOST_SURFACES:
+            raise self.error(key, "too many surfaces", allowed=f"at most {MOST_SURFACES}")
+        name = str(given.get("name", "")) or f"S{len(self.surfaces) + 1}"
+        taken = {s.name for s in self.surfaces}
+        name = next(n for n in (name, *(f"{name}_{k}" for k in range(2, MOST_SURFACES + 2))) if n not in taken)
+        below = (*key, "surface")
+        shape = self.shape(self.mapping(given.get("surface"), below), below)
+        edge = None
+        if "obscuration" in given:
+            below = (*key, "obscuration")
+            edge = self.aperture(self.mapping(given["obscuration"], below), below, name)
+        surface = LensSurface(name, pose, shape, how, index / self.ambient, edge, self.line(key))
+        # the world turns over, and each surface's own frame with it
+        self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": _OVER @ pose})))
+
+    def _placed(self, given: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
+        """Shifts and turns of a coordinate system, in the order in which they stand, each in the axes so far."""
+        if "coordSys" not in given:
+            return pose
+        key = (*key, "coordSys")
+        for name, value in self.mapping(given["coordSys"], key).items():
+            step = np.zeros(3)
+            if name in _TURNS:
+                turn = self.number({name: value}, name, key)
+                pose = pose @ Pose(about_axis(_TURNS[name], turn), step)
+                continue
+            if name in _SHIFTS:
+                step[_SHIFTS[name]] = self.number({name: value}, name, key)
+            elif name == "shift" and isinstance(value, list) and len(value) == 3:
+                step = np.array([self.number({"shift": v}, "shift", key) for v in value])
+            else:
+                raise self.error(
+                    (*key, name), "a place that is not known here", value, "x, y, z, shift, rotX, rotY, rotZ"
+                )
+            pose = pose @ Pose(np.eye(3), step)
+        return pose
+
+    def shape(self, given: Mapping[str, Any], key: KeyPath, depth: int = 0) -> Surface:
+        """A surface."""
+        kind = given.get("type")
+        self._only(given, key, {"Quadric": ("R", "conic"), "Asphere": ("R", "conic", "coefs", "imin"), "Plane": ()})
+        match kind:
+            case "Plane":
+                return Surface()
+            case "Sphere" | "Paraboloid" | "Quadric" | "Asphere":
+                radius = self.number(given, "R", key)
+                if radius == 0.0:
+                    raise self.error((*key, "R"), "a radius of curvature cannot be zero", 0.0)
+                conic = {"Sphere": 0.0, "Paraboloid": -1.0}.get(str(kind))
+                conic = self.number(given, "conic", key) if conic is None else conic
+                powers = {}
+                if kind == "Asphere":
+                    below = (*key, "coefs")
+                    listed = self.listed(given.get("coefs"), below)
+                    first = self.number(given, "imin", key, 2.0)
+                    if first != int(first) or not 1 <= first <= 10 or len(listed) > 12:
+                        raise self.error(below, "even powers that are not known here", shown(first), "r^2 to r^40")
+                    powers = {
+                        2 * (int(first) + n): self.number({"coefs": a}, "coefs", key) for n, a in enumerate(listed)
+                    }
+                return even_asphere(1.0 / radius, conic, powers)
+            case "Sum" if depth == 0:
+                return self._sum(given, key)
+            case _:
+                known = "Plane, Sphere, Paraboloid, Quadric, Asphere, Sum of one of them and a Zernike"
+                raise self.error((*key, "type"), "a surface that is not known here", kind, known)
+
+    def _sum(self, given: Mapping[str, Any], key: KeyPath) -> Surface:
+        items = self.listed(given.get("items"), (*key, "items"))
+        shape, radius, centre = None, 0.0, (0.0, 0.0)
+        terms: dict[int, float] = {}
+        for k, item in enumerate(items):
+            below = (*key, "items", k)
+            part = self.mapping(item, below)
+            if part.get("type") != "Zernike" and shape is None:
+                shape = self.shape(part, below, 1)
+                continue
+            if part.get("type") != "Zernike" or terms or self.number(part, "R_inner", below, 0.0) != 0.0:
+                raise self.error(
+                    below, "a part of a sum that is not known here", part.get("type"), "one Zernike, R_inner 0"
+                )
+            self._only(part, below, {"Zernike": ("coef", "R_outer", "R_inner", "x_origin", "y_origin")})
+            radius = self.number(part, "R_outer", below, 1.0)
+            centre = self.number(part, "x_origin", below, 0.0), self.number(part, "y_origin", below, 0.0)
+            coefficients = self.listed(part.get("coef"), (*below, "coef"))
+            numbers = [self.number({"coef": v}, "coef", below) for v in coefficients]
+            terms = {j: a for j, a in enumerate(numbers) if j and a}
+            if max(terms, default=0) > MAX_NOLL or not radius > 0.0:
+                raise self.error(
+                    below, "Zernike terms that are not known here", max(terms, default=0), f"Z1 to Z{MAX_NOLL}"
+                )
+        if shape is None:
+            raise self.error(key, "a sum without a conic", allowed="a conic and a Zernike")
+        return shape.with_figure(ZernikeFigure(radius, centre, terms)) if terms else shape
+
+    def medium(self, given: object, key: KeyPath) -> float:
+        """Refractive index at the wavelength."""
+        if isinstance(given, int | float) and not isinstance(given, bool) and 0.1 < given < 10.0:
+            return float(given)
+        medium = self.mapping(given, key)
+        kind, w = medium.get("type"), self.wavelength
+        try:
+            index = self._index(medium, key, kind, w)
+        except (ValueError, ZeroDivisionError, OverflowError):
+            index = math.nan
+        if not 0.1 < index < 10.0:
+            raise self.error(key, "no index at this wavelength", kind, f"a medium known at {w * 1e9:.6g} nm")
+        return index
+
+    def _index(self, medium: Mapping[str, Any], key: KeyPath, kind: object, w: float) -> float:
+        um = 1e6 * w
+        numbers = {
+            "ConstMedium": ("n",),
+            "TableMedium": ("wavelengths", "ns"),
+            "SellmeierMedium": ("B1", "B2", "B3", "C1", "C2", "C3"),
+            "SumitaMedium": tuple(f"A{k}" for k in range(6)),
+            "Air": ("pressure", "temperature", "h2o_pressure"),
+        }
+        self._only(medium, key, numbers)
+        match kind:
+            case "ConstMedium":
+                return self.number(medium, "n", key)
+            case "TableMedium":
+                x, y = (
+                    np.array([self.number({name: v}, name, key) for v in self.listed(medium.get(name), (*key, name))])
+                    for name in ("wavelengths", "ns")
+                )
+                if len(x) != len(y) or len(x) < 2 or np.any(np.diff(x) <= 0.0) or not x[0] <= w <= x[-1]:
+                    return math.nan
+                return float(np.interp(w, x, y))
+            case "SellmeierMedium":
+                b, c = ([self.number(medium, f"{n}{k}", key) for k in (1, 2, 3)] for n in "BC")
+                return math.sqrt(1.0 + sum(p * um * um / (um * um - q) for p, q in zip(b, c, strict=True)))
+            case "SumitaMedium":
+                a = [self.number(medium, f"A{k}", key) for k in range(6)]
+                return math.sqrt(a[0] + a[1] * um**2 + sum(a[k] * um ** (-2 * (k - 1)) for k in range(2, 6)))
+            case "Air":
+                return _air(
+                    um,
+                    self.number(medium, "pressure", key, 69.328),
+                    self.number(medium, "temperature", key, 293.15),
+                    self.number(medium, "h2o_pressure", key, 1.067),
+                )
+            case _:
+                known = "ConstMedium, TableMedium, SellmeierMedium, SumitaMedium, Air"
+                raise self.error((*key, "type"), "a medium that is not known here", kind, known)
+
+    def aperture(self, given: Mapping[str, Any], key: KeyPath, name: str) -> Aperture | None:
+        """A clear aperture; obscurations and outlines that are none are noted."""
+        kind = given.get("type")
+        x, y = self.number(given, "x", key, 0.0), self.number(given, "y", key, 0.0)
+        if str(kind).startswith("Clear"):
+            sizes = {"ClearCircle": ("radius",), "ClearAnnulus": ("outer", "inner")}
+            plain = {name: (*of, "x", "y") for name, of in sizes.items()}
+            self._only(given, key, {**plain, "ClearRectangle": ("width", "height", "x", "y", "theta")})
+        try:
+            if kind == "ClearCircle":
+                return clear(self.number(given, "radius", key), centre=(x, y))
+            if kind == "ClearAnnulus":
+                return clear(self.number(given, "outer", key), self.number(given, "inner", key), centre=(x, y))
+            if kind == "ClearRectangle" and not self.number(given, "theta", key, 0.0):
+                half = 0.5 * self.number(given, "width", key), 0.5 * self.number(given, "height", key)
+                return clear(rectangle=half, centre=(x, y))
+        except ValueError as error:
+            raise self.error(key, str(error)) from None
+        self.notes.append(Note(self.line(key), str(kind), f"the obscuration of {name} is not carried"))
+        return None
+
+
+def _air(um: float, pressure: float, temperature: float, water: float) -> float:
+    """Index of air by wavelength in um, kPa, K and the water vapour's kPa (Filippenko, PASP 94, 715 (1982))."""
+    mm, celsius, vapour = pressure * 7.50061683, temperature - 273.15, water * 7.50061683
+    s2 = 1.0 / um**2
+    n = (64.328 + 29498.1 / (146.0 - s2) + 255.4 / (41.0 - s2)) * 1e-6
+    n *= mm * (1.0 + (1.049 - 0.0157 * celsius) * 1e-6 * mm) / (720.883 * (1.0 + 0.003661 * celsius))
+    n -= (0.0624 - 0.000680 * s2) / (1.0 + 0.003661 * celsius) * vapour * 1e-6
+    return 1.0 + n
+
+
+def read_batoid(path: str | Path, wavelength: float) -> Prescription:
+    """Read a telescope of batoid.
+
+    Args:
+        path: of its YAML file.
+        wavelength: at which light goes through its glasses, metres; its files name none.
+
+    Raises:
+        InputError: the file is damaged, or has what is not known here; with the line.
+    """
+    reader = _Reader(str(path), _loaded(path), wavelength)
+    system = reader.mapping(reader.mapping(reader.data, ()).get("opticalSystem"), ("opticalSystem",))
+    if "inMedium" in system:
+        reader.ambient = reader.medium(system["inMedium"], ("opticalSystem", "inMedium"))
+    reader.optic(system, ("opticalSystem",), Pose(), reader.ambient, reader.ambient)
+    if len(reader.surfaces) < 2:
+        raise reader.error(("opticalSystem",), "too few surfaces", len(reader.surfaces), "optics and a detector")
+    # batoid aims at a surface before the telescope; here the stop is the first surface
+    notes = [*reader.notes, Note(0, "", "no stop in the light's way: taken to be the first surface")]
+    if reader.ambient != 1.0:
+        notes.append(Note(0, "inMedium", f"indices are relative to it, {reader.ambient:.9f}, and so are paths"))
+    name = str(system.get("name", "")) or Path(path).stem
+    return Prescription(
+        name, str(path), tuple(reader.surfaces), 0, wavelength, (wavelength,), (), "none", None, math.inf, tuple(notes)
+    )
+
+
+def _loaded(path: str | Path) -> object:
+    """The contents of a YAML file that may name parts of itself again, with the places of its keys."""
+    source = Source(str(path))
+    content = read_bytes(path)
+    if len(content) > LARGEST_FILE:
+        raise source.error("too large for a telescope", 1, f"{len(content)} bytes", f"at most {LARGEST_FILE}")
+    text = "\n".join(decoded(content, source))
+    try:
+        return YAML(typ="rt", pure=True).load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        problem = f"not YAML: {error.problem}"
+        raise source.error(problem, None if mark is None else mark.line + 1) from None
+    except (YAMLError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
+        raise source.error(f"not YAML that can be read: {type(error).__name__}", 1) from None

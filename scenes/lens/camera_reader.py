@@ -1,0 +1,359 @@
+"""From a foreign prescription to a camera's file, and whether both trace the same."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optics.geometry.pose import rotation_vector
+from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
+from optics.geometry.surface import Surface, ZernikeFigure
+from optics.numerics.backend import Backend
+from optics.raytrace.aim import AimError, transverse_axes
+from optics.raytrace.assembly import Interaction
+from optics.raytrace.first_order import ray_matrix
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
+from scenes.lens.shapes import facing
+from scenes.models.camera_design import camera_file
+from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
+from scenes.specs.camera import CameraSpec
+from scenes.yaml.errors import InputError, Problem, printable
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
+
+PITCH = 7e-6
+"""Of a line CCD's pixels where none is asked for, metres."""
+LARGEST_TILT = math.radians(45.0)
+SAME = 1e-9
+"""Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
+the same code: what is left is the rounding of poses and numbers."""
+_SINGLE_FIELD = math.radians(0.05)
+_RIM = 12
+_LIGHT = {Interaction.REFRACT: "refracts", Interaction.PASS: "passes"}
+_LETTER = {Interaction.REFLECT: "M", Interaction.REFRACT: "L", Interaction.PASS: "P"}
+
+
+class Width(NamedTuple):
+    """What a user says in place of the file.
+
+    Attributes:
+        pupil: diameter of the entrance pupil, metres.
+        pitch: of the line CCD's pixels, metres.
+    """
+
+    pupil: float | None = None
+    pitch: float = PITCH
+
+
+AS_IN_FILE = Width()
+
+
+@dataclass(frozen=True, eq=False)
+class ReadCamera:
+    """A camera made of a prescription.
+
+    Attributes:
+        camera: what its file says.
+        names: surface of the camera -> surface of the prescription.
+        notes: what did not come along, and what was put in.
+        difference: farthest distance at the image between rays of both, metres.
+        rays: that were compared.
+    """
+
+    camera: CameraSpec
+    names: dict[str, str]
+    notes: tuple[Note, ...]
+    difference: float
+    rays: int
+
+    def told(self, lens: Prescription) -> list[str]:
+        """What there is to say of it."""
+        spec = self.camera
+        mirrors = sum(m.light is None for m in spec.mirrors.values())
+        faces = sum(m.light == "refracts" for m in spec.mirrors.values())
+        parts = [f"{mirrors} mirrors"] + ([f"{faces} faces of lenses"] if faces else [])
+        angles = [f"{math.degrees(a):.4g}" for a in (spec.field.x, spec.field.y, spec.field_bias)]
+        return [
+            f"{lens.name}: {', '.join(parts)}, stop {spec.stop}, f {spec.focal_length:.6g} m, entrance pupil "
+            f"{spec.entrance_pupil:.6g} m, field {angles[0]} x {angles[1]} deg about {angles[2]} deg",
+            f"{self.rays} rays through both meet the image within {self.difference:.1e} m",
+            *(f"note: {note}" for note in self.notes),
+        ]
+
+
+def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS_IN_FILE) -> ReadCamera:
+    """Make a camera of a prescription.
+
+    Args:
+        lens: the prescription.
+        name: of the camera.
+        backend: where to trace.
+        width: what the user says of the beam and the pixels.
+
+    Raises:
+        InputError: the prescription has what a camera's file cannot hold, or light does not come through.
+    """
+    _check(lens)
+    notes = list(lens.notes)
+    surfaces, stop, origin, taken = _surfaces(lens, notes)
+    bias, half_x, half_y = _field(lens, surfaces, notes)
+    where = {"z": format_quantity(_image(lens)[0], LENGTH)}
+    if _image(lens)[1]:
+        where["tilt"] = format_quantity(_image(lens)[1], ANGLE)
+    plain: dict[str, Any] = {
+        "name": name,
+        "description": f"Read from {re.sub(r'[^ -~]', '?', lens.name)[:200]}.",
+        "focal_length": "1 m",
+        "entrance_pupil": "0.1 mm",
+        "field_bias": format_quantity(bias, ANGLE),
+        "field": {"x": format_quantity(half_x, ANGLE), "y": format_quantity(half_y, ANGLE)},
+        "wavelength": format_quantity(lens.wavelength, LENGTH),
+        "stop": stop,
+        "mirrors": surfaces,
+        "image": where,
+        "line": {"pixels": 2, "pitch": format_quantity(width.pitch, LENGTH)},
+    }
+    narrow = _derived(lens, plain, backend)
+    pupil = _pupil(lens, narrow, plain, backend, width)
+    focal = float(abs(narrow.first_order.scale[0, 0, 0]))
+    pixels = 2.0 * focal * math.tan(half_x) / width.pitch
+    if not 2.0 <= pixels <= 1e6:
+        problem = "a line CCD over the whole field would have too few or too many pixels"
+        raise lens.error(
+            problem, None, f"{pixels:.4g} of {format_quantity(width.pitch, LENGTH)}", "2 to 1000000: --pitch"
+        )
+    plain["focal_length"] = format_quantity(float(f"{focal:.6g}"), LENGTH)
+    plain["entrance_pupil"] = format_quantity(pupil, LENGTH)
+    plain["line"]["pixels"] = math.ceil(pixels)
+    plain["edge_margin"] = format_quantity(float(f"{min(0.005, 0.05 * pupil):.3g}"), LENGTH)
+    text = f"{plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)} put in, which cover the field"
+    notes.append(Note(0, "line CCD", text))
+    model = _derived(lens, plain, backend)
+    difference, rays = _compared(lens, origin, model, backend)
+    if not difference < SAME:
+        raise lens.error(
+            "the camera would not trace as this prescription does", None, f"{difference:.2g} m apart", "1 nm"
+        )
+    return ReadCamera(model.spec, taken, tuple(notes), difference, rays)
+
+
+def _check(lens: Prescription) -> None:
+    """Refuse what a camera's file cannot hold."""
+    if math.isfinite(lens.object_distance):
+        found = f"{lens.object_distance:.6g} m"
+        raise lens.error("the object is at a finite distance", lens.surfaces[0].line, found, "a scene at infinity")
+    if not lens.fields:
+        raise lens.error("no directions of the field in this file", None, lens.field_kind, "field angles")
+    image = lens.image
+    if not image.surface.is_plane or image.surface.figure is not None:
+        raise lens.error("a curved image", image.line, allowed="a plane")
+    if image.index != 1.0 or image.interaction is not Interaction.PASS:
+        raise lens.error("an image in glass", image.line, allowed="an image in the object's medium")
+    normal = image.pose.rotation[:, 2]
+    if abs(normal[0]) > 1e-12:
+        raise lens.error("an image that is turned out of the plane of symmetry", image.line, allowed="a turn about x")
+    if abs(_image(lens)[1]) > LARGEST_TILT:
+        found = f"{math.degrees(_image(lens)[1]):.4g} deg"
+        problem = "an image turned too far from square to the axis that light enters along"
+        raise lens.error(problem, image.line, found, "45 deg at most")
+
+
+def _image(lens: Prescription) -> tuple[float, float]:
+    """Where the image plane crosses the parent axis, metres, and its turn about x, radians."""
+    pose = lens.image.pose
+    normal = pose.rotation[:, 2] * math.copysign(1.0, pose.rotation[2, 2])
+    z = float(normal @ pose.translation / normal[2]) if abs(normal[2]) > 1e-3 else math.inf
+    tilt = math.atan2(-float(normal[1]), float(normal[2]))
+    return z, (tilt if abs(tilt) > 1e-15 else 0.0)
+
+
+def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], str, Prescription, dict[str, str]]:
+    """Surfaces as a camera's file has them, the stop among them, the prescription of those that came along, names."""
+    out: dict[str, Any] = {}
+    taken: dict[str, str] = {}
+    stop, kept, count = "", [], dict.fromkeys(_LETTER.values(), 0)
+    for k, surface in enumerate(lens.surfaces[:-1]):
+        idle = surface.interaction is Interaction.PASS
+        if idle and k != lens.stop:
+            notes.append(Note(surface.line, surface.name, "a plane with an edge alone: not carried"))
+            continue
+        kept.append(surface)
+        letter = _LETTER[surface.interaction]
+        count[letter] += 1
+        name = "STOP" if idle else f"{letter}{count[letter]}"
+        if k == lens.stop:
+            stop = name
+        if surface.aperture is not None and k != lens.stop:
+            text = "its aperture is not carried: a camera's clear apertures follow from its beams"
+            notes.append(Note(surface.line, surface.name, text))
+        elif surface.aperture is not None:
+            text = "the stop's aperture is not carried: it is the disk that the entrance pupil asks for"
+            notes.append(Note(surface.line, surface.name, text))
+        taken[name] = surface.name
+        out[name] = _written(lens, facing(surface))
+    if not any(s.interaction is not Interaction.PASS for s in kept):
+        raise lens.error("nothing in this file reflects or refracts light", lens.surfaces[0].line)
+    bare = replace(lens, surfaces=(*kept, lens.image), stop=list(taken).index(stop))
+    return out, stop, bare, taken
+
+
+def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
+    """A surface as a camera's file has it."""
+    shape = surface.surface
+    x, y, z = (float(v) for v in surface.pose.translation)
+    out: dict[str, Any] = {"z": format_quantity(z, LENGTH)}
+    if x or y:
+        out["decentre"] = [format_quantity(v, LENGTH) for v in (x, y)]
+    turn = rotation_vector(surface.pose.rotation)
+    if np.any(np.abs(turn) > 0.0):
+        out["rotate"] = [format_quantity(float(v), ANGLE) for v in turn]
+    out["radius"] = format_quantity(1.0 / shape.curvature, LENGTH) if shape.curvature else "flat"
+    if shape.conic:
+        out["conic"] = shape.conic
+    powers = {f"A{4 + 2 * n}": format_quantity(a, power_of_length(-3 - 2 * n)) for n, a in enumerate(shape.even) if a}
+    if powers:
+        out["aspheric"] = powers
+    terms = _terms(lens, surface, shape)
+    if terms:
+        out["sag"] = terms
+    if surface.interaction in _LIGHT:
+        out["light"] = _LIGHT[surface.interaction]
+    if surface.interaction is Interaction.REFRACT:
+        out["index"] = surface.index
+    return out
+
+
+def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str, Any]:
+    """Further terms of a sag as a camera's file has them."""
+    terms = list(shape.terms)
+    if isinstance(shape.figure, ZernikeFigure):
+        last = max(shape.figure.terms, default=0)
+        if last > LAST_NOLL:
+            problem = "Zernike terms, or a polynomial, beyond what a camera's file has a place for"
+            raise lens.error(problem, surface.line, f"Z{last}", f"Z1 to Z{LAST_NOLL}, polynomials to order 7")
+        given = {f"Z{j}": a for j, a in shape.figure.terms.items()}
+        x0, y0 = shape.figure.centre
+        terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **given))
+    elif shape.figure is not None:
+        raise lens.error("a figure on a grid, which a camera's file has no place for", surface.line, surface.name)
+    kinds = {kind: name for name, kind in SAG_TERMS.items()}
+    return {
+        kinds[type(term)]: {
+            key: format_quantity(float(value), power_of_length(power)) if power else float(value)
+            for key, power in term.POWERS.items()
+            if (value := getattr(term, key)) != 0.0
+        }
+        for term in terms
+    }
+
+
+def _field(lens: Prescription, surfaces: dict[str, Any], notes: list[Note]) -> tuple[float, float, float]:
+    """Field bias and half angles along x and y, radians."""
+    x, y = np.array(lens.fields).T
+    upright = not any({"decentre", "rotate", "sag"} & set(s) for s in surfaces.values()) and not _image(lens)[1]
+    largest = float(np.max(np.hypot(x, y)))
+    if upright and largest > 0.0 and (np.all(x == 0.0) or np.all(y == 0.0)) and 0.0 in (*np.hypot(x, y),):
+        text = f"a circle of {math.degrees(largest):.6g} deg about the axis; the square in it is taken"
+        notes.append(Note(0, "field", text))
+        return 0.0, largest / math.sqrt(2.0), largest / math.sqrt(2.0)
+    bias = 0.5 * float(y.max() + y.min())
+    half_x, half_y = float(np.max(np.abs(x))), 0.5 * float(y.max() - y.min())
+    if half_x == 0.0 and half_y == 0.0:
+        half_x = half_y = _SINGLE_FIELD
+        notes.append(Note(0, "field", f"one direction alone; half angles of {math.degrees(half_x):g} deg put in"))
+    elif half_x == 0.0 or half_y == 0.0:
+        half_x = half_y = max(half_x, half_y)
+        notes.append(Note(0, "field", "angles along one axis alone; as much put in along the other"))
+    return bias, half_x, half_y
+
+
+def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> CameraModel:
+    """The camera of a plain mapping, traced."""
+    try:
+        spec = CameraSpec.model_validate(plain)
+    except ValueError as error:
+        reason = next((str(e["ctx"]["error"]) for e in getattr(error, "errors", list)() if "ctx" in e), str(error))
+        problem = error.problem if isinstance(error, Problem) else reason.splitlines()[0]
+        raise lens.error(f"a camera's file cannot hold this: {problem}") from error
+    try:
+        return derive_camera(spec, backend)
+    except InputError as error:
+        raise lens.error(error.issues[0].problem, allowed="a system that light comes through") from error
+    except (np.linalg.LinAlgError, FloatingPointError) as error:
+        raise lens.error("no light of the field comes through the stop to the image") from error
+
+
+def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backend: Backend, width: Width) -> float:
+    """Diameter of the entrance pupil, metres."""
+    if width.pupil is not None:
+        return width.pupil
+    allowed = "the entrance pupil's diameter: --pupil"
+    if lens.pupil is None:
+        raise lens.error("the file does not say how wide the beam is", allowed=allowed)
+    if lens.pupil.kind == "diameter":
+        return lens.pupil.value
+    if lens.pupil.kind == "stop":
+        edge = narrow.apertures[narrow.spec.stop]
+        return lens.pupil.value / float(edge.bounds[1]) * narrow.spec.entrance_pupil
+    if lens.pupil.kind == "f_number":
+        if any({"decentre", "rotate"} & set(surface) for surface in plain["mirrors"].values()):
+            problem = "an F-number of a system with surfaces that are turned or off the axis"
+            raise lens.error(problem, lens.pupil.line, allowed=allowed)
+        axial = _derived(lens, {**plain, "field_bias": "0 deg"}, backend)
+        return _axial_focal_length(axial, backend) / lens.pupil.value
+    raise lens.error("a numerical aperture in object space", lens.pupil.line, allowed=allowed)
+
+
+def _axial_focal_length(model: CameraModel, backend: Backend) -> float:
+    """Of rays beside the axis, wherever the image stands, metres."""
+    bare, names = model.bare_assembly(apertures=False), model.mirrors
+    stop = names.index(model.spec.stop)
+    centre = field_direction(model.spec, 0.0, 0.0)
+    launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
+    axes = transverse_axes(centre[None], LINE_AXIS[None])
+    matrix = ray_matrix(backend, assemble(bare, ["imaging"]), stop, launch, centre[None], axes)
+    return float(1.0 / np.sqrt(np.abs(np.linalg.det(matrix.direction_by_position[0]))))
+
+
+def _compared(lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend) -> tuple[float, int]:
+    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays."""
+    spec = model.spec
+    bare = model.bare_assembly(apertures=False)
+    names = model.mirrors
+    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
+    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    rim = float(model.apertures[spec.stop].bounds[1]) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    fields = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
+    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
+    try:
+        launch = collimated(backend, to_stop, directions, np.concatenate([np.zeros((1, 2)), rim]))
+    except (AimError, BeamMissedError) as error:
+        raise lens.error(f"no light of the whole field comes through: {str(error).partition(';')[0]}") from error
+    heading = np.broadcast_to(directions[:, None], launch.shape)
+    rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
+    places = []
+    for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
+        traced = trace(backend, assemble(assembly, [sequence]), rays, world=True)
+        position, _, path, valid = traced.numpy(traced.world)
+        if not valid.all():
+            raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
+        places.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
+    return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
+
+
+def camera_text(made: ReadCamera, lens: Prescription) -> str:
+    """Text of the camera's file, with what did not come along at its head."""
+    remark = [f"Read from {lens.file} by python -m scenes.lens read."]
+    remark += [f"{name}: {surface}" for name, surface in made.names.items() if name != surface]
+    remark += [str(note) for note in made.notes]
+    return camera_file(made.camera, printable_lines(remark))
+
+
+def printable_lines(lines: list[str]) -> str:
+    """Lines as one text without what a reader of YAML would refuse in a remark."""
+    return "\n".join(printable(line) for line in lines)

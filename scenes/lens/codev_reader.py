@@ -1,0 +1,232 @@
+"""CODE V sequential files (.seq) as prescriptions.
+
+Decentres shift along x, y and z and then turn about x, y and z in this order, each about the axes that the turn before
+has made. Turns about x and y are left-handed, those about z right-handed: ADE > 0 turns +z toward +y.
+
+| kind | what it does |
+|---|---|
+| DEC (no keyword) | the surface and all that follow stand in the new frame |
+| DAR | the surface alone; what follows stands as if it were not decentred |
+| BEN | the turn before the surface and once more behind it: what follows stands about the reflected axis |
+| REV | the reverse of the same decentre, behind the surface: it undoes one |
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.surface import Surface
+from optics.raytrace.assembly import Interaction
+from scenes.lens.codev_statements import CodevSurface, CodevSystem, statements, take
+from scenes.lens.prescription import (
+    FARTHEST,
+    NO_GLASSES,
+    Chain,
+    Glasses,
+    LensSurface,
+    Note,
+    Prescription,
+    Pupil,
+    glass_key,
+)
+from scenes.lens.shapes import LARGEST_ORDER, clear, even_asphere, polynomial
+from scenes.lens.statements import Source, Statement, decoded, read_bytes
+
+_D_LINE, _D_WIDTH = 587.5618e-9, 0.1e-9
+
+
+def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
+    """Read a .seq file.
+
+    Args:
+        path: of the file, UTF-8, UTF-16 or ISO 8859-1.
+        glasses: that its surfaces may name.
+
+    Raises:
+        InputError: the file is damaged, or says something that would be taken wrongly; with the line.
+    """
+    source = Source(str(path))
+    lines = decoded(read_bytes(path), source)
+    system = CodevSystem(source)
+    for statement in statements(lines):
+        if system.private:
+            system.private = statement.command != "END"
+            continue
+        take(system, statement)
+    if not system.surfaces:
+        raise source.error("no surface in this file", len(lines), allowed="SO, S, ... SI of a CODE V sequence")
+    if system.surfaces[-1].name != "SI":
+        raise source.error(
+            "the sequence has no image: it is cut off", system.surfaces[-1].line, allowed="SI at its end"
+        )
+    if len(system.surfaces) < 3:
+        raise source.error("too few surfaces", system.surfaces[-1].line, allowed="object, optics and image")
+    return _prescription(system, glasses)
+
+
+def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
+    source, scale, read = system.source, system.scale, system.surfaces
+    if not system.waves:
+        raise source.error("no wavelength in this file", read[0].line, allowed="WL")
+    reference = system.reference or (len(system.waves) + 1) // 2
+    if reference > len(system.waves):
+        raise source.error("the reference wavelength is none of those given", read[0].line, reference)
+    wavelength = system.waves[reference - 1]
+    chain, index, glass, stop = Chain(), 1.0, "", -1
+    if read[0].medium:
+        raise source.error("an object in glass", read[0].line, read[0].medium)
+    for k, surface in enumerate(read[1:], start=1):
+        last = k == len(read) - 1
+        given = surface.decentre
+        if not math.isfinite(surface.thickness):
+            raise source.error("an infinite distance behind an optical surface", surface.line)
+        shift = [given.get(name, 0.0) * scale for name in ("XDE", "YDE", "ZDE")]
+        # left-handed about x and y
+        angles = [math.radians(sign * given.get(name, 0.0)) for name, sign in (("ADE", -1), ("BDE", -1), ("CDE", 1))]
+        turns = [about_axis(axis, angle) for axis, angle in enumerate(angles)]
+        rotation = turns[0] @ turns[1] @ turns[2]
+        before = chain.pose
+        if last:
+            # the image's "thickness" is a defocus: it stands so much farther along the axis that light came along
+            chain.move((0.0, 0.0, surface.thickness * scale))
+        if surface.kind != "REV":
+            chain.move(shift, rotation)
+        made, index, glass = _made(system, surface, chain.pose, index, glass, wavelength, glasses)
+        if surface.stop:
+            if stop >= 0:
+                raise source.error("a second stop", surface.line)
+            stop = len(chain.surfaces)
+        idle = made.interaction is Interaction.PASS and made.aperture is None and made.surface.is_plane
+        if not idle or surface.stop or last:
+            chain.add(made)
+        if surface.kind == "DAR":
+            chain.pose = before
+        elif surface.kind == "BEN":
+            if sum(a != 0.0 for a in angles) > 1:
+                raise source.error("BEN with turns about several axes", surface.line, allowed="a turn about one axis")
+            chain.move((0.0, 0.0, 0.0), rotation)
+        elif surface.kind == "REV":
+            back = Pose(rotation, np.array(shift)).inverse()
+            chain.pose = chain.pose @ back
+        if not last:
+            chain.move((0.0, 0.0, surface.thickness * scale))
+    if stop < 0:
+        stop = 0
+        source.notes.append(Note(0, "", f"no STO: taken to be {chain.surfaces[0].name}"))
+    if stop == len(chain.surfaces) - 1:
+        raise source.error("the image is the stop", chain.surfaces[stop].line)
+    pupil = system.pupil
+    if pupil is not None and pupil.kind == "diameter":
+        pupil = Pupil("diameter", pupil.value * scale, pupil.line)
+    distance = read[0].thickness * scale
+    return Prescription(
+        system.name or Path(source.file).stem,
+        source.file,
+        tuple(chain.surfaces),
+        stop,
+        wavelength,
+        tuple(dict.fromkeys(system.waves)),
+        _fields(system),
+        system.field_kind,
+        pupil,
+        distance if abs(distance) < FARTHEST else math.inf,
+        tuple(source.notes),
+    )
+
+
+def _fields(system: CodevSystem) -> tuple[tuple[float, float], ...]:
+    if system.field_kind != "angles":
+        return ()
+    count = max(len(system.x), len(system.y))
+    x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
+    return tuple(zip(x, y, strict=True))
+
+
+def _made(
+    system: CodevSystem,
+    surface: CodevSurface,
+    pose: Pose,
+    index: float,
+    glass: str,
+    wavelength: float,
+    glasses: Glasses,
+) -> tuple[LensSurface, float, str]:
+    """A surface with what lies behind it."""
+    source, medium = system.source, surface.medium.strip("'\"")
+    shape = _shape(system, surface)
+    try:
+        aperture = _aperture(system, surface)
+    except ValueError as error:
+        raise source.error(str(error), surface.line) from None
+    if medium.upper() in ("REFL", "REFR_TIR", "TIRO"):
+        if medium.upper() != "REFL":
+            raise source.error("total reflection is not known here", surface.line, medium)
+        made = LensSurface(surface.name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, glass)
+        return made, index, glass
+    behind = 1.0 if medium.upper() in ("", "AIR") else _index(source, surface, medium, wavelength, glasses)
+    how = Interaction.PASS if behind == index else Interaction.REFRACT
+    glass = "" if behind == 1.0 else medium
+    return LensSurface(surface.name, pose, shape, how, behind, aperture, surface.line, glass), behind, glass
+
+
+def _index(source: Source, surface: CodevSurface, medium: str, wavelength: float, glasses: Glasses) -> float:
+    """Of the glass behind a surface; six digits and a point are a fictitious glass, index and dispersion."""
+    whole, point, rest = medium.partition(".")
+    if (point and whole.isdigit() and rest.isdigit()) or ":" in medium:
+        if abs(wavelength - _D_LINE) > _D_WIDTH:
+            problem = "a fictitious glass, whose index is stated at 587.56 nm alone"
+            raise source.error(problem, surface.line, f"{medium} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
+        if ":" in medium:
+            word = medium.partition(":")[0]
+            statement = Statement(surface.line, "S", (word,), medium)
+            return source.finite(statement, 0, "the index")
+        return 1.0 + float(f"0.{whole}")
+    found = glasses.get(glass_key(medium))
+    if found is None:
+        problem, allowed = "unknown glass", "glasses of the twin, and of a catalogue given with --glasses FILE.agf"
+        raise source.error(problem, surface.line, medium, allowed)
+    try:
+        return found(wavelength)
+    except ValueError as error:
+        raise source.error(str(error), surface.line) from None
+
+
+def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
+    scale = system.scale
+    powers = {n: a * scale ** (1 - n) for n, a in surface.powers.items()}
+    if not surface.special:
+        return even_asphere(surface.curvature / scale, surface.conic, powers)
+    if powers:
+        raise system.source.error("even powers on a special surface", surface.line, allowed="SCO coefficients")
+    conic = surface.polynomial.get(1, surface.conic)
+    given = {}
+    for m in range(LARGEST_ORDER + 1):
+        for n in range(LARGEST_ORDER + 1 - m):
+            j = ((m + n) ** 2 + m + 3 * n) // 2 + 1
+            if m + n and j in surface.polynomial:
+                given[(m, n)] = surface.polynomial[j] * scale ** (1 - m - n)
+    sizes = [s for s in surface.sizes.values() if s > 0.0]
+    radius = max(sizes, default=1.0)
+    scaled = {(m, n): c * radius ** (m + n) for (m, n), c in given.items()}
+    return polynomial(even_asphere(surface.curvature / scale, conic, {}), scaled, radius)
+
+
+def _aperture(system: CodevSystem, surface: CodevSurface) -> Aperture | None:
+    sizes = surface.sizes
+    centre = (surface.centre.get("ADX", 0.0), surface.centre.get("ADY", 0.0))
+    if "REX" in sizes or "REY" in sizes:
+        wide = sizes.get("REX", sizes.get("REY", 0.0)), sizes.get("REY", sizes.get("REX", 0.0))
+        return clear(rectangle=wide, centre=centre)
+    if "ELX" in sizes or "ELY" in sizes:
+        wide = sizes.get("ELX", sizes.get("ELY", 0.0)), sizes.get("ELY", sizes.get("ELX", 0.0))
+        return clear(ellipse=wide, centre=centre)
+    if "CIR" in sizes:
+        return clear(sizes["CIR"], surface.hole, centre=centre)
+    if surface.hole:
+        system.source.notes.append(Note(surface.line, surface.name, "a hole without an outer edge is not carried"))
+    return None

@@ -1,0 +1,456 @@
+"""Zemax sequential files (.zmx) as prescriptions.
+
+A coordinate break shifts and then turns about x, y and z in this order, each about the axes that the turn before has
+made; with its order flag set it does the reverse: turns about z, y and x, then shifts. Turns are right-handed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose, about_axis
+from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.zernike import MAX_NOLL
+from optics.raytrace.assembly import Interaction
+from scenes.lens.prescription import (
+    FARTHEST,
+    NO_GLASSES,
+    Chain,
+    Glasses,
+    LensSurface,
+    Note,
+    Prescription,
+    Pupil,
+    glass_key,
+)
+from scenes.lens.shapes import clear, even_asphere, polynomial
+from scenes.lens.statements import MOST_SURFACES, Source, Statement, decoded, joined, read_bytes, split_words
+
+UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}
+D_LINE = 587.5618e-9
+"""Wavelength at which a model glass's index is stated, metres."""
+_D_WIDTH = 0.1e-9
+
+SHAPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XPOLYNOM", "SZERNSAG", "COORDBRK")
+"""Kinds of surfaces that are read."""
+
+OF_NO_EFFECT = frozenset(
+    # the program's version and windows, drawings, solves whose values stand in the file, optimisation, tolerances,
+    # coatings and polarisation, weights of fields and wavelengths, physical optics, hammer settings
+    "VERS AUTH IWDP STUD PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN VANN POLS GLRS GSTD NSCD "
+    "COFN LUID EERA SSID FIMP HIDE MIRR SLAB POPS MEMA PPAR VPAR PZUP MAZH OPDX EFFL EFLY WFNO BLNK TOL TOLE MOFF "
+    "TRAC DMFS ACOS GLCB REAX REAY REAZ COAT PKUP VCON VDSZ EDGE ZVDX ZVDY ZVCX ZVCY ZVAN WWGN WWGT NOTE TCMM "
+    "TCED CONF GLCZ GLCA GLCC MNCA MXCA MNEA MNCG MXCG MNEG RGLA PMAG TOTR OPTH PRIM COMM ENVD".split()
+)
+
+_SYSTEM = frozenset("MODE NAME UNIT ENPD FNUM OBNA FLOA FTYP XFLN YFLN WAVM WAVL WAVN PWAV VDXN VDYN VCXN VCYN".split())
+_ON_SURFACES = frozenset(
+    "TYPE STOP CURV CONI PARM XDAT DISZ GLAS DIAM FLAP CLAP SQAP ELAP OBSC SQOB ELOB OBDC USAP SCBD".split()
+)
+
+_EDGES = {
+    "CLAP": "clear",
+    "FLAP": "clear",
+    "SQAP": "rectangle",
+    "ELAP": "ellipse",
+    "OBSC": "hole",
+    "SQOB": "",
+    "ELOB": "",
+}
+"""Statement -> the aperture that it gives; other obscurations are not carried."""
+
+
+@dataclass
+class _Surface:
+    """A surface while its statements are read."""
+
+    number: int
+    line: int
+    kind: str = "STANDARD"
+    kind_line: int = 0
+    stop: bool = False
+    curvature: float = 0.0
+    conic: float = 0.0
+    thickness: float = 0.0
+    name: str = ""
+    glass: tuple[str, ...] = ()
+    glass_line: int = 0
+    radius: float = 0.0
+    parameters: dict[int, float] = field(default_factory=dict)
+    extra: dict[int, float] = field(default_factory=dict)
+    edges: dict[str, tuple[Statement, float, float]] = field(default_factory=dict)
+    centre: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass
+class _System:
+    """A file while it is read."""
+
+    source: Source
+    scale: float = 1e-3
+    name: str = ""
+    pupil: Pupil | None = None
+    field_type: int = 0
+    field_count: int = 0
+    field_line: int = 1
+    wave_count: int = 0
+    x: tuple[float, ...] = ()
+    y: tuple[float, ...] = ()
+    waves: dict[int, float] = field(default_factory=dict)
+    primary: int = 1
+    surfaces: list[_Surface] = field(default_factory=list)
+
+
+def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
+    """Read a .zmx file.
+
+    Args:
+        path: of the file, UTF-16 of either order, UTF-8 or ISO 8859-1.
+        glasses: that its surfaces may name.
+
+    Raises:
+        InputError: the file is damaged, or says something that would be taken wrongly; with the line.
+    """
+    source = Source(str(path))
+    lines = decoded(read_bytes(path), source)
+    system = _System(source)
+    for number, text in enumerate(lines, start=1):
+        words = split_words(text.rstrip("\x1a"))
+        if not words:
+            continue
+        statement = Statement(number, words[0].upper(), words[1:], text.strip())
+        _take(system, statement)
+    if not system.surfaces:
+        raise source.error("no surface in this file", len(lines), allowed="SURF 0, SURF 1, ... of a Zemax file")
+    if len(system.surfaces) < 3:
+        problem = "too few surfaces: the file is cut off or no system"
+        raise source.error(
+            problem, system.surfaces[-1].line, f"{len(system.surfaces)} surfaces", "object, optics and image"
+        )
+    return _prescription(system, glasses)
+
+
+def _take(system: _System, s: Statement) -> None:
+    """What one statement says."""
+    source = system.source
+    if s.command == "SURF":
+        number = source.whole(s, 0, "the surface's number", 0, MOST_SURFACES)
+        if number != len(system.surfaces):
+            raise source.error("surfaces are not in their order", s.line, number, f"SURF {len(system.surfaces)}")
+        system.surfaces.append(_Surface(number, s.line))
+    elif s.command in _SYSTEM:
+        _take_system(system, s)
+    elif s.command in _ON_SURFACES or (s.command == "COMM" and system.surfaces):
+        if not system.surfaces:
+            raise source.error(f"{s.command} stands before any surface", s.line, s.text, "SURF 0 first")
+        _take_surface(system, system.surfaces[-1], s)
+    elif s.command == "MNUM":
+        if source.whole(s, 0, "the number of configurations", 0, 10_000, 1) > 1:
+            source.note(s, "of several configurations that one comes along whose values stand in the surfaces")
+    elif s.command == "IGNR":
+        if s.words[:1] not in ((), ("0",)):
+            raise source.error("a surface that is to be ignored", s.line, s.text, "a file without it")
+    elif s.command not in OF_NO_EFFECT:
+        source.note(s, "not understood")
+
+
+def _take_system(system: _System, s: Statement) -> None:
+    source = system.source
+
+    def numbers(what: str) -> tuple[float, ...]:
+        return tuple(source.finite(s, k, what) for k in range(len(s.words)))
+
+    match s.command:
+        case "MODE":
+            if s.words[:1] != ("SEQ",):
+                raise source.error("not a sequential system", s.line, s.text, "MODE SEQ")
+        case "NAME":
+            system.name = joined(s.words)
+        case "UNIT":
+            unit = s.words[0].upper() if s.words else ""
+            if unit not in UNITS:
+                raise source.error("unknown unit of lengths", s.line, unit, ", ".join(UNITS))
+            system.scale = UNITS[unit]
+        case "ENPD":
+            system.pupil = Pupil("diameter", _positive(source, s, "the pupil's diameter"), s.line)
+        case "FNUM":
+            system.pupil = Pupil("f_number", _positive(source, s, "the F-number"), s.line)
+            if len(s.words) > 1 and source.finite(s, 1, "the kind of F-number") != 0.0:
+                source.note(s, "a paraxial working F-number: the pupil's diameter is not carried")
+                system.pupil = None
+        case "OBNA":
+            system.pupil = Pupil("object_na", _positive(source, s, "the aperture"), s.line)
+        case "FLOA":
+            system.pupil = Pupil("stop", 0.0, s.line)
+        case "FTYP":
+            system.field_type = source.whole(s, 0, "the kind of fields", 0, 9)
+            system.field_count = source.whole(s, 2, "the number of fields", 0, 10_000, 1)
+            system.wave_count = source.whole(s, 3, "the number of wavelengths", 0, 10_000, 1)
+        case "XFLN":
+            system.x, system.field_line = numbers("a field"), s.line
+        case "YFLN":
+            system.y, system.field_line = numbers("a field"), s.line
+        case "WAVM":
+            number = source.whole(s, 0, "the wavelength's number", 1, 10_000)
+            system.waves[number] = _wave(source, s, source.finite(s, 1, "the wavelength"))
+        case "WAVL" | "WAVN":
+            for k, value in enumerate(numbers("a wavelength"), start=1):
+                system.waves[k] = _wave(source, s, value)
+            system.wave_count = system.wave_count or len(s.words)
+        case "PWAV":
+            system.primary = source.whole(s, 0, "the primary wavelength's number", 1, 10_000)
+        case _:  # vignetting factors: shares by which a field's pupil is compressed
+            if any(v != 0.0 for v in numbers("a vignetting factor")):
+                source.note(s, "vignetting factors are not carried; beams are as wide as the stop lets them")
+
+
+def _positive(source: Source, s: Statement, what: str) -> float:
+    value = source.finite(s, 0, what)
+    if not value > 0.0:
+        raise source.error(f"{what} is not greater than zero", s.line, s.text)
+    return value
+
+
+def _wave(source: Source, s: Statement, micrometres: float) -> float:
+    if not 0.1 <= micrometres <= 100.0:
+        raise source.error("no wavelength of light", s.line, s.text, "0.1 to 100 um")
+    return micrometres / 1e6
+
+
+def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
+    source = system.source
+    match s.command:
+        case "TYPE":
+            surface.kind, surface.kind_line = (s.words[0].upper() if s.words else ""), s.line
+        case "STOP":
+            surface.stop = True
+        case "COMM":
+            surface.name = joined(s.words)
+        case "CURV":
+            surface.curvature = source.finite(s, 0, "the curvature")
+        case "CONI":
+            surface.conic = source.finite(s, 0, "the conic constant")
+        case "PARM":
+            surface.parameters[source.whole(s, 0, "the parameter's number", 0, 250)] = source.finite(
+                s, 1, "the parameter"
+            )
+        case "XDAT":
+            surface.extra[source.whole(s, 0, "the number of the datum", 1, 1000)] = source.finite(s, 1, "the datum")
+        case "DISZ":
+            surface.thickness = source.number(s, 0, "the thickness")
+        case "GLAS":
+            surface.glass, surface.glass_line = s.words, s.line
+        case "DIAM":
+            surface.radius = source.finite(s, 0, "the semi-diameter")
+        case "OBDC":
+            surface.centre = (source.finite(s, 0, "the decentre"), source.finite(s, 1, "the decentre"))
+        case "USAP":
+            source.note(s, "an aperture of any outline is not carried")
+        case "SCBD":
+            if any(v not in ("0",) and float(source.value(s, v, "a tilt")) != 0.0 for v in s.words[2:]):
+                problem = "a surface with a tilt or decentre of its own"
+                raise source.error(problem, s.line, s.text, "coordinate breaks (COORDBRK) in its place")
+        case _:
+            what = _EDGES.get(s.command)
+            if what is None:
+                source.note(s, "this obscuration is not carried")
+                return
+            surface.edges[what] = (s, source.finite(s, 0, "its size"), source.finite(s, 1, "its size"))
+
+
+def _prescription(system: _System, glasses: Glasses) -> Prescription:
+    source, scale = system.source, system.scale
+    waves = [system.waves[k] for k in sorted(system.waves) if not system.wave_count or k <= system.wave_count]
+    if not waves:
+        raise source.error("no wavelength in this file", 1, allowed="WAVM or WAVL")
+    primary = system.waves.get(system.primary, waves[0])
+    chain, index, stop = Chain(), 1.0, -1
+    read, medium = system.surfaces, ""
+    distance = read[0].thickness * scale
+    if read[0].kind == "COORDBRK" or read[0].glass:
+        raise source.error("the object is a coordinate break or stands in glass", read[0].line)
+    for k, surface in enumerate(read[1:], start=1):
+        last = k == len(read) - 1
+        if surface.kind == "COORDBRK":
+            if surface.glass:
+                raise source.error("a coordinate break with a glass of its own", surface.glass_line)
+            _break(source, chain, surface, scale)
+        else:
+            made, index, medium = _made(system, surface, chain.pose, index, medium, primary, glasses, k)
+            idle = made.interaction is Interaction.PASS and made.aperture is None and made.surface.is_plane
+            if surface.stop:
+                if stop >= 0:
+                    raise source.error("a second stop", surface.line)
+                stop = len(chain.surfaces)
+            if not idle or surface.stop or last:
+                chain.add(made)
+        if not last:
+            if not math.isfinite(surface.thickness):
+                raise source.error("an infinite distance behind an optical surface", surface.line)
+            chain.move((0.0, 0.0, surface.thickness * scale))
+    if stop < 0:
+        stop = 0
+        source.notes.append(Note(0, "", f"no STOP: taken to be {chain.surfaces[0].name}"))
+    if stop == len(chain.surfaces) - 1:
+        raise source.error("the image is the stop", chain.surfaces[stop].line)
+    fields = _fields(system)
+    pupil = system.pupil
+    if pupil is not None and pupil.kind == "diameter":
+        pupil = Pupil("diameter", pupil.value * scale, pupil.line)
+    elif pupil is not None and pupil.kind == "stop":
+        radius = next((s.radius for s in read if s.stop), 0.0) * scale
+        pupil = Pupil("stop", radius, pupil.line) if radius > 0.0 else None
+    return Prescription(
+        system.name or Path(source.file).stem,
+        source.file,
+        tuple(chain.surfaces),
+        stop,
+        primary,
+        tuple(dict.fromkeys(waves)),
+        fields,
+        ("angles", "object heights", "paraxial image heights", "real image heights", "theodolite angles")[
+            min(system.field_type, 4)
+        ],
+        pupil,
+        distance if abs(distance) < FARTHEST else math.inf,
+        tuple(source.notes),
+    )
+
+
+def _fields(system: _System) -> tuple[tuple[float, float], ...]:
+    if system.field_type != 0:
+        return ()
+    count = system.field_count or max(len(system.x), len(system.y))
+    x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
+    for value in (*x, *y):
+        if not abs(value) < 89.0:
+            raise system.source.error("a field beyond 89 deg", system.field_line, value)
+    return tuple((math.radians(a), math.radians(b)) for a, b in zip(x, y, strict=True))
+
+
+def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> None:
+    """A coordinate break."""
+    p = surface.parameters
+    shift = (p.get(1, 0.0) * scale, p.get(2, 0.0) * scale, 0.0)
+    turns = [about_axis(axis, math.radians(p.get(3 + axis, 0.0))) for axis in range(3)]
+    if p.get(6, 0.0) == 0.0:
+        chain.move(shift, turns[0] @ turns[1] @ turns[2])
+    else:
+        chain.move((0.0, 0.0, 0.0), turns[2] @ turns[1] @ turns[0])
+        chain.move(shift)
+
+
+def _made(
+    system: _System,
+    surface: _Surface,
+    pose: Pose,
+    index: float,
+    medium: str,
+    wavelength: float,
+    glasses: Glasses,
+    k: int,
+) -> tuple[LensSurface, float, str]:
+    """A surface with what lies behind it."""
+    source = system.source
+    shape = _shape(source, surface, system.scale)
+    name = surface.name if surface.name.isidentifier() else f"S{k}"
+    try:
+        aperture = _aperture(source, surface, system.scale)
+    except ValueError as error:
+        line = max(s.line for s, _, _ in surface.edges.values())
+        raise source.error(str(error), line) from None
+    kind = surface.glass[0].upper() if surface.glass else ""
+    if kind == "MIRROR":
+        made = LensSurface(name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, medium)
+        return made, index, medium
+    behind, glass = 1.0, ""
+    if kind:
+        behind, glass = _index(source, surface, wavelength, glasses), surface.glass[0]
+    how = Interaction.PASS if behind == index else Interaction.REFRACT
+    return LensSurface(name, pose, shape, how, behind, aperture, surface.line, glass), behind, glass
+
+
+def _index(source: Source, surface: _Surface, wavelength: float, glasses: Glasses) -> float:
+    """Of the glass behind a surface at the primary wavelength."""
+    words = surface.glass
+    statement = Statement(surface.glass_line, "GLAS", words, " ".join(words))
+    if words[0] == "___BLANK" or (len(words) > 1 and words[1] == "1"):
+        stated = source.finite(statement, 3, "the index")
+        if abs(wavelength - D_LINE) > _D_WIDTH:
+            problem = "a model glass, whose index is stated at 587.56 nm alone"
+            raise source.error(
+                problem, surface.glass_line, f"{words[0]} at {wavelength * 1e9:.6g} nm", "a catalogue's glass"
+            )
+        return stated
+    found = glasses.get(glass_key(words[0]))
+    if found is None:
+        problem, allowed = "unknown glass", "glasses of the twin, and of a catalogue given with --glasses FILE.agf"
+        raise source.error(problem, surface.glass_line, words[0], allowed)
+    return _at(source, found, wavelength, surface.glass_line)
+
+
+def _at(source: Source, glass: Callable[[float], float], wavelength: float, line: int) -> float:
+    try:
+        return glass(wavelength)
+    except ValueError as error:
+        raise source.error(str(error), line) from None
+
+
+def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
+    """The surface's shape, metres."""
+    line = surface.kind_line or surface.line
+    if surface.kind not in SHAPES:
+        raise source.error("a kind of surface that is not known here", line, surface.kind, ", ".join(SHAPES))
+    c, k, p, x = surface.curvature / scale, surface.conic, surface.parameters, surface.extra
+    powers: dict[int, float] = {}
+    if surface.kind in ("EVENASPH", "SZERNSAG"):
+        powers = {2 * n: p.get(n, 0.0) * scale ** (1 - 2 * n) for n in range(1, 9)}
+    elif surface.kind == "ODDASPHE":
+        powers = {n: p.get(n, 0.0) * scale ** (1 - n) for n in range(1, 9)}
+        odd = [n for n, a in powers.items() if n % 2 and a != 0.0]
+        if odd:
+            raise source.error("odd powers of the radius", line, f"r^{odd[0]}", "even powers")
+    shape = even_asphere(c, k, powers)
+    if surface.kind == "XPOLYNOM":
+        count, radius = int(x.get(1, 0.0)), x.get(2, 0.0) * scale
+        if count and not radius > 0.0:
+            raise source.error("a polynomial without a normalisation radius", line)
+        pairs = [(order - b, b) for order in range(1, 23) for b in range(order + 1)]
+        given = {pair: x.get(3 + n, 0.0) * scale for n, pair in enumerate(pairs[:count])}
+        try:
+            return polynomial(shape, given, radius)
+        except ValueError as error:
+            raise source.error(str(error), line) from None
+    if surface.kind == "SZERNSAG":
+        count, radius = int(x.get(1, 0.0)), x.get(2, 0.0) * scale
+        terms = {j: x.get(2 + j, 0.0) * scale for j in range(1, count + 1) if x.get(2 + j, 0.0) != 0.0}
+        if terms and not radius > 0.0:
+            raise source.error("Zernike terms without a normalisation radius", line)
+        if max(terms, default=0) > MAX_NOLL:
+            raise source.error("more Zernike terms than are known", line, max(terms), f"Z1 to Z{MAX_NOLL}")
+        if terms:
+            centre = (p.get(9, 0.0) * scale, p.get(10, 0.0) * scale)
+            shape = shape.with_figure(ZernikeFigure(radius, centre, terms))
+    return shape
+
+
+def _aperture(source: Source, surface: _Surface, scale: float) -> Aperture | None:
+    """Clear aperture that the file states; a semi-diameter alone is a drawing's."""
+    edges, (cx, cy) = surface.edges, surface.centre
+    centre = (cx * scale, cy * scale)
+    sizes = {what: (first * scale, second * scale) for what, (_, first, second) in edges.items()}
+    if "rectangle" in sizes or "ellipse" in sizes:
+        if "hole" in sizes:
+            source.note(edges["hole"][0], "an obscuration in an aperture that is not round is not carried")
+        return clear(rectangle=sizes.get("rectangle"), ellipse=sizes.get("ellipse"), centre=centre)
+    if "clear" in sizes:
+        inner, outer = sizes["clear"]
+        hole = sizes["hole"][1] if "hole" in sizes else inner
+        return clear(outer, hole, centre=centre)
+    if "hole" in sizes:
+        source.note(edges["hole"][0], "an obscuration without an outer edge is not carried")
+    return None

@@ -1,0 +1,203 @@
+"""Foreign prescriptions as the twin reads and traces them, against what other programs make of the same files.
+
+ray-optics turns the frames of Zemax' coordinate breaks the other way about x and y than Zemax and optiland do: its
+sample files with coordinate breaks are held against optiland. It reads CODE V's as CODE V means them.
+"""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.batoid_writer import batoid_text
+from scenes.lens.camera_writer import prescription_of
+from scenes.lens.codev_reader import read_codev
+from scenes.lens.prescription import SEQUENCE
+from scenes.lens.zemax_reader import read_zemax
+from scenes.lens.zemax_writer import zemax_text
+from scenes.yaml.errors import InputError
+from tests.oracles.prescription_peers import (
+    AnyGlass,
+    Optiland,
+    Rayoptics,
+    batoid_beam,
+    beams,
+    differences,
+    ours,
+    read_alike,
+)
+
+pytestmark = pytest.mark.oracle
+
+HERE = Path(__file__).resolve().parent / "prescriptions"
+TOLERANCE = {"position": 1e-12, "direction": 1e-12, "spot": 1e-12, "path": 1e-11}
+"""Metres and direction cosines: rounding of some ten metres of path with a lever arm of mirrors, of paths ten times as
+much. What was asked for is 1e-9 m, and 10 pm of path."""
+
+RAYOPTICS = """
+codev/tests/threemir.seq codev/tests/rc_f16.seq codev/tests/paraboloid.seq codev/tests/paraboloid_f8.seq
+codev/tests/dec_test.seq codev/tests/dec_tilt_test.seq codev/tests/folded_lenses.seq codev/tests/mangin.seq
+codev/tests/lens_reflection_test.seq codev/tests/questar35.seq codev/tests/schmidt.seq codev/tests/schmidt_sph.seq
+codev/tests/unfolded_lenses_w_ape.seq codev/tests/asp46.seq codev/tests/ag_dblgauss.seq codev/tests/CODV_65988_noDOE.seq
+codev/tests/achroMangin_ok.seq zemax/tests/HoO-V2C18Ex03.zmx zemax/tests/US08011793-1.zmx zemax/tests/US08427765-1.ZMX
+zemax/tests/US00583336-2-scaled.zmx
+""".split()
+"""Files of ray-optics against ray-optics."""
+OPTILAND = """
+zemax/tests/HoO-V2C18Ex03.zmx zemax/tests/HoO-V2C18Ex66.zmx zemax/tests/HoO-V2C18Ex66NEW.zmx
+zemax/tests/US08011793-1.zmx zemax/tests/US08427765-1.ZMX zemax/tests/zmax_55278.zmx
+""".split()
+"""Files of ray-optics against optiland."""
+SHIPPED = ("one_mirror_up_45deg", "simple_fold_mirror_up", "complicated_fold_mirrors_setup_v2", "lens1", "lens2")
+"""Files of optiland, which stand beside this one, against optiland."""
+REFUSED = {
+    "codev/tests/CODV_65988.seq": (32, "a diffractive surface is not known here"),
+    "codev/tests/singlet.seq": (3, "does this file give radii or curvatures"),
+    "codev/tests/test.seq": (4, "does this file give radii or curvatures"),
+    "codev/tests/landscape_lens.seq": (3, "does this file give radii or curvatures"),
+    "codev/tests/tilt_test.seq": (15, "the image is the stop"),
+    "codev/tests/dar_test.seq": (16, "the image is the stop"),
+    "codev/tests/dec_rev_tilt_test.seq": (21, "the image is the stop"),
+    "zemax/tests/zmax_37992.zmx": (127, "a surface with a tilt or decentre of its own"),
+    "zemax/tests/HoO-V2C18Ex46.zmx": (156, "TOROIDAL"),
+    "zemax/tests/HoO-V2C18Ex27.zmx": (88, "a model glass"),
+    "zemax/tests/ASL5040-UV-Zemax(ZMX).zmx": (76, "QED_TYPE"),
+}
+"""Files of ray-optics that are refused -> line and reason."""
+
+
+def package(name: str) -> Path:
+    """Where a package's files stand; the test is skipped by name where there is none."""
+    found = find_spec(name)
+    if found is None or found.origin is None:
+        pytest.skip(f"{name} not installed")
+    return Path(found.origin).parent
+
+
+def held(backend, path: Path, kind: type[Rayoptics] | type[Optiland]) -> None:
+    read = read_zemax if path.suffix.lower() == ".zmx" else read_codev
+    peer = kind(path)
+    lens = read_alike(read, path, peer)
+    if path.name != "achroMangin_ok.seq":  # names no reference; ray-optics takes the first wavelength, here the middle
+        assert peer.wave == pytest.approx(lens.wavelength * (1e9 if kind is Rayoptics else 1e6), rel=1e-12)
+    fields = beams(backend, lens, 0.5)
+    assert fields
+    for launch, direction in fields:
+        found = differences(ours(backend, lens, launch, direction), peer.trace(launch, direction, lens.image.pose))
+        for what, value in found.items():
+            assert value < TOLERANCE[what], (what, value)
+
+
+@pytest.mark.parametrize("name", RAYOPTICS)
+def test_as_ray_optics_traces_its_samples(backend, name: str) -> None:
+    held(backend, package("rayoptics") / name, Rayoptics)
+
+
+@pytest.mark.parametrize("name", OPTILAND)
+def test_as_optiland_traces_samples_of_ray_optics(backend, name: str) -> None:
+    package("optiland")
+    held(backend, package("rayoptics") / name, Optiland)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_as_optiland_traces_its_samples(backend, name: str) -> None:
+    package("optiland")
+    held(backend, HERE / f"{name}.zmx", Optiland)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_files_that_would_be_taken_wrongly(name: str) -> None:
+    path = package("rayoptics") / name
+    line, problem = REFUSED[name]
+    with pytest.raises(InputError, match=problem) as caught:
+        (read_zemax if path.suffix.lower() == ".zmx" else read_codev)(path, AnyGlass())
+    assert caught.value.line == line
+
+
+BATOID = """
+HSC/HSC.yaml HSC/HSC_old.yaml HSC/HSC_no_obsc.yaml DECam/DECam.yaml DESI/DESI.yaml SDSS/SDSS.yaml AuxTel/Calypso.yaml
+LSST/LSST_u.yaml LSST/LSST_g.yaml LSST/LSST_r.yaml LSST/LSST_i.yaml LSST/LSST_z.yaml LSST/LSST_y.yaml
+LSST/LSST_r_baffles.yaml LSST/ComCam_r.yaml LSST/ComCamSpiders_g.yaml LSST/Rubin_v1000_i.yaml LSST/Rubin_v3.12_r.yaml
+LSST/Rubin_v3.14_y.yaml
+""".split()
+
+
+@pytest.mark.parametrize("name", BATOID)
+def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
+    """Places, directions and paths of rays over the whole pupil at the detector; a wavefront is their paths."""
+    batoid = pytest.importorskip("batoid")
+    path, wavelength = Path(batoid.__file__).parent / "data" / name, 620e-9
+    lens = read_batoid(path, wavelength)
+    peer = batoid.Optic.fromYaml(str(path))
+    system = assemble(lens.assembly(apertures=False), [SEQUENCE])
+    for x, y in ((0.0, 0.0), (0.008, 0.0), (-0.004, 0.007)):
+        launch, direction, theirs, failed = batoid_beam(peer, wavelength, x, y)
+        position, leaving, way, valid = (
+            a[0] for a in trace(backend, system, make_rays(backend, launch, direction)).numpy()
+        )
+        np.testing.assert_array_equal(valid, ~failed)
+        index = float(peer.inMedium.getN(wavelength))
+        mine = (position[valid], leaving[valid], index * way[valid])
+        found = differences(mine, tuple(part[valid] for part in theirs))
+        for what, value in found.items():
+            assert value < TOLERANCE[what], (what, value)
+
+
+ZEMAX_FIELDS = ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))
+"""Shares of 1.75 deg along x and y, of the rays that Zemax has traced."""
+
+
+def test_as_zemax_traces_lsst(backend) -> None:
+    """Every surface of three rays, by Zemax' own listing; it prints eleven digits, 1e-10 m at six metres."""
+    batoid = pytest.importorskip("batoid")
+    lens = read_batoid(Path(batoid.__file__).parent / "data/LSST/LSST_g_500.yaml", 500e-9)
+    system = assemble(lens.assembly(apertures=False), [SEQUENCE])
+    listed = np.loadtxt(HERE / "lsst_zemax_rays.csv", delimiter=",", skiprows=3)
+    for ray, shares in enumerate(ZEMAX_FIELDS):
+        start, *points = 1e-3 * listed[listed[:, 0] == ray][:, 2:]
+        direction = np.array([*np.tan(np.radians(1.75) * np.array(shares)), 1.0])
+        direction /= np.linalg.norm(direction)
+        traced = trace(backend, system, make_rays(backend, start[None], direction), keep=range(len(lens.surfaces)))
+        assert len(points) == len(lens.surfaces) == 12
+        for k, (surface, point) in enumerate(zip(lens.surfaces, points, strict=True)):
+            place = surface.pose.apply(traced.hit(k)[0, 0])
+            np.testing.assert_allclose(place, point, rtol=0, atol=1e-10, err_msg=surface.name)
+
+
+def test_a_tilted_surface_of_batoid_is_refused() -> None:
+    path = package("batoid") / "data/AuxTel/AuxTel.yaml"
+    with pytest.raises(InputError, match="not known here"):
+        read_batoid(path, 620e-9)
+
+
+@pytest.mark.parametrize("kind", ["rayoptics", "optiland"])
+@pytest.mark.parametrize("name", ["gf7", "gf7_conic", "monitor"])
+def test_our_cameras_as_other_programs_read_them(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
+    package(kind)
+    lens, path = prescription_of(camera(name)), tmp_path / f"{name}.zmx"
+    path.write_text(zemax_text(lens), "utf-16")
+    peer = {"rayoptics": Rayoptics, "optiland": Optiland}[kind](path)
+    fields = beams(backend, lens, 1.0)
+    assert len(fields) == 9
+    for launch, direction in fields:
+        found = differences(ours(backend, lens, launch, direction), peer.trace(launch, direction, lens.image.pose))
+        for what, value in found.items():
+            assert value < TOLERANCE[what], (what, value)
+
+
+@pytest.mark.parametrize("name", ["gf7", "monitor"])
+def test_our_cameras_as_batoid_reads_them(tmp_path: Path, backend, camera, name: str) -> None:
+    batoid = pytest.importorskip("batoid")
+    lens, path = prescription_of(camera(name)), tmp_path / f"{name}.yaml"
+    path.write_text(batoid_text(lens)[0], "utf-8")
+    peer = batoid.Optic.fromYaml(str(path))
+    for launch, direction in beams(backend, lens, 1.0):
+        theirs, failed = batoid_beam(peer, lens.wavelength, rays=(launch, direction))[2:]
+        assert not failed.any()
+        found = differences(ours(backend, lens, launch, direction), theirs)
+        for what, value in found.items():
+            assert value < TOLERANCE[what], (what, value)

@@ -1,0 +1,130 @@
+"""Truncated, mis-encoded and hostile prescriptions: they are read, or refused with file and line; nothing else."""
+
+import random
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.camera_reader import camera_of
+from scenes.lens.codev_reader import read_codev
+from scenes.lens.glass_catalogue import own_glasses, read_catalogue
+from scenes.lens.prescription import Prescription
+from scenes.lens.zemax_reader import read_zemax
+from scenes.yaml.errors import InputError, Issue
+from tests.robustness.mutate import BYTES, TOKENS
+from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
+
+GLASSES = own_glasses()
+KINDS: dict[str, tuple[tuple[bytes, ...], Callable[[Path], object]]] = {
+    ".zmx": ((TMA.encode("utf-16"), TMA.encode(), SINGLET.encode()), lambda path: read_zemax(path, GLASSES)),
+    ".seq": ((CODEV.encode(), CODEV.encode("utf-16-le")), lambda path: read_codev(path, GLASSES)),
+    ".yaml": ((BATOID.encode(),), lambda path: read_batoid(path, 650e-9)),
+    ".agf": ((AGF.encode(), AGF.encode("utf-16")), read_catalogue),
+}
+LONGEST = 30.0
+"""Seconds for one file, on a machine that has other work, too: the largest YAML takes two, a pattern that goes astray
+minutes."""
+NASTY = (
+    "1e400",
+    "-1e308",
+    "nan",
+    "0",
+    "1e-320",
+    "S" * 300,
+    "\u202e",
+    "&",
+    "!",
+    ";",
+    "'",
+    '"',
+    "INFINITY",
+    "SURF 1",
+    "SI 0 0",
+)
+
+
+def spoilt(content: bytes, chance: random.Random) -> bytes:
+    """A file that is cut off, has other bytes or words, lines in another order, or another encoding."""
+    kind = chance.randrange(6)
+    if kind == 0:
+        return content[: chance.randrange(len(content))]
+    if kind == 1:
+        for _ in range(chance.choice((1, 2, 4))):
+            content = chance.choice(BYTES)(content, chance)
+        return content
+    wide = "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le" if b"\0" in content else "utf-8"
+    text = content.decode(wide)
+    if kind == 2:
+        lines = text.split("\n")
+        for _ in range(chance.randint(1, 4)):
+            at = chance.randrange(len(lines))
+            lines[at : at + 1] = chance.choice(([], [lines[at]] * 2, [chance.choice(lines)], [chance.choice(NASTY)]))
+            lines = lines or [""]
+        return "\n".join(lines).encode(wide, "surrogatepass")
+    if kind == 3:
+        words = text.split(" ")
+        for _ in range(chance.randint(1, 4)):
+            words[chance.randrange(len(words))] = chance.choice(NASTY)
+        return " ".join(words).encode(wide, "surrogatepass")
+    if kind == 4:
+        return text.encode(chance.choice(("utf-16-be", "utf-16-le", "utf-32", "utf-7", "cp500")))
+    for _ in range(chance.choice((1, 2, 3))):
+        try:
+            text = chance.choice(TOKENS)(text, chance)
+        except (IndexError, ValueError):
+            continue
+    return text.encode(wide, "surrogatepass")
+
+
+def issues_of(work: Callable[[], object]) -> tuple[Issue, ...]:
+    try:
+        work()
+    except InputError as error:
+        return error.issues
+    return ()
+
+
+def check(folder: Path, suffix: str, count: int, seed: int) -> tuple[int, int]:
+    """How many spoilt files were read and refused."""
+    contents, read = KINDS[suffix]
+    chance, path, done = random.Random(seed), folder / f"spoilt{suffix}", [0, 0]
+    for k in range(count):
+        path.write_bytes(spoilt(chance.choice(contents), chance))
+        begun = time.monotonic()
+        issues = issues_of(lambda: read(path))
+        done[bool(issues)] += 1
+        assert all(issue.file == str(path) and issue.line and "\n" not in str(issue) for issue in issues), (k, issues)
+        assert time.monotonic() - begun < LONGEST, k
+    return done[0], done[1]
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_spoilt_files_are_read_or_refused(tmp_path: Path, suffix: str) -> None:
+    read, refused = check(tmp_path, suffix, 150, 1)
+    assert read >= 10
+    assert refused >= 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", KINDS)
+def test_two_thousand_spoilt_files_are_read_or_refused(tmp_path: Path, suffix: str) -> None:
+    read, refused = check(tmp_path, suffix, 2000, 2)
+    assert read >= 200
+    assert refused >= 500
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".zmx", ".seq", ".yaml"])
+def test_cameras_of_spoilt_files_trace_as_they_do_or_are_refused(tmp_path: Path, backend, suffix: str) -> None:
+    contents, read = KINDS[suffix]
+    chance, path, made = random.Random(3), tmp_path / f"spoilt{suffix}", 0
+    for _ in range(150):
+        path.write_bytes(spoilt(chance.choice(contents), chance))
+        issues = issues_of(lambda: camera_of(cast(Prescription, read(path)), "c", backend))
+        made += not issues
+        assert all(issue.file == str(path) for issue in issues)
+    assert made >= 10 or suffix == ".yaml"

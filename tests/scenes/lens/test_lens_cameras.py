@@ -1,0 +1,303 @@
+"""Cameras made of foreign prescriptions and prescriptions made of cameras: both trace the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from optics.geometry.surface import ZernikeFigure
+from optics.geometry.tree import Motion
+from optics.materials.glass import N_BK7
+from optics.raytrace.system import assemble
+from optics.raytrace.trace import make_rays, trace
+from scenes.lens.__main__ import app
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.batoid_writer import batoid_text
+from scenes.lens.camera_reader import Width, camera_of, camera_text
+from scenes.lens.camera_writer import perturbed_prescription, prescription_of
+from scenes.lens.codev_reader import read_codev
+from scenes.lens.glass_catalogue import own_glasses
+from scenes.lens.prescription import SEQUENCE, Prescription
+from scenes.lens.shapes import joined
+from scenes.lens.zemax_reader import read_zemax
+from scenes.lens.zemax_writer import zemax_text
+from scenes.models.camera_model import collimated, derive_camera, field_direction
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.camera import CameraSpec
+from scenes.specs.load import load_camera, load_instrument
+from scenes.yaml.errors import InputError
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import parse_yaml
+from tests.scenes.lens.files import BATOID, CODEV, SINGLET, TMA
+
+ROUNDING = 1e-12
+"""Metres: some ten metres of path in float64, with a lever arm of mirrors."""
+
+
+def rays_of(model, backend) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of nine fields through the stop of a camera: launch points and directions (N, 3)."""
+    spec, bare = model.spec, model.bare_assembly(apertures=False)
+    to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]])
+    fields = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
+    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
+    rng = np.random.default_rng(4)
+    radius, angle = (
+        model.apertures[spec.stop].bounds[1] * np.sqrt(rng.uniform(size=20)),
+        rng.uniform(0.0, 2 * np.pi, 20),
+    )
+    launch = collimated(
+        backend, to_stop, directions, np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    )
+    return launch.reshape(-1, 3), np.repeat(directions, 20, axis=0)
+
+
+def at_image(backend, assembly, sequence, launch, direction, state=None) -> np.ndarray:
+    """Place, direction and path of rays at a sequence's end, (N, 7)."""
+    traced = trace(backend, assemble(assembly, [sequence], [state or {}]), make_rays(backend, launch, direction))
+    position, leaving, path, valid = (a[0] for a in traced.numpy())
+    assert valid.all()
+    return np.concatenate([position, leaving, path[:, None]], axis=-1)
+
+
+@pytest.mark.parametrize("kind", [".zmx", ".yaml"])
+@pytest.mark.parametrize("name", ["gf7", "gf7_conic", "monitor"])
+def test_out_and_in_again(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
+    model = camera(name)
+    lens, path = prescription_of(model), tmp_path / f"{name}{kind}"
+    path.write_text(zemax_text(lens) if kind == ".zmx" else batoid_text(lens)[0], "utf-8")
+    back = read_zemax(path) if kind == ".zmx" else read_batoid(path, 650e-9)
+    launch, direction = rays_of(model, backend)
+    first = at_image(backend, model.bare_assembly(apertures=False), "imaging", launch, direction)
+    # what a file says of the edges of mirrors stops the same rays: none of these
+    second = at_image(backend, back.assembly(apertures=True), SEQUENCE, launch, direction)
+    np.testing.assert_allclose(second, first, rtol=0, atol=ROUNDING)
+    if kind == ".zmx":
+        made = camera_of(back, name, backend)
+        spec = made.camera
+        third = at_image(backend, derive_camera(spec, backend).bare_assembly(False), "imaging", launch, direction)
+        np.testing.assert_allclose(third, first, rtol=0, atol=ROUNDING)
+        for ours, theirs in ((spec.entrance_pupil, model.spec.entrance_pupil), (spec.field.x, model.spec.field.x)):
+            assert ours == pytest.approx(theirs, rel=1e-12)
+        assert (spec.stop, spec.field_bias) == (model.spec.stop, pytest.approx(model.spec.field_bias, rel=1e-12))
+
+
+def test_the_camera_file_is_read_and_traces_the_same(tmp_path: Path, backend) -> None:
+    path = tmp_path / "tma.zmx"
+    path.write_text(TMA, "utf-16")
+    lens = read_zemax(path)
+    made = camera_of(lens, "tma", backend)
+    text = camera_text(made, lens)
+    spec = validate(CameraSpec, parse_yaml(text))
+    assert spec == made.camera
+    model = derive_camera(spec, backend)
+    launch, direction = rays_of(model, backend)
+    first = at_image(backend, lens.assembly(False), SEQUENCE, launch, direction)
+    second = at_image(backend, model.bare_assembly(False), "imaging", launch, direction)
+    np.testing.assert_allclose(second, first, rtol=0, atol=ROUNDING)
+    assert "# line" in text
+    assert "XYZZY 1 2 3: not understood" in text
+
+
+def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
+    """Focal length by the lensmaker's formula; backward rays come out along those that went in."""
+    path = tmp_path / "singlet.zmx"
+    n, c, t = N_BK7.index(587.5618e-9), 1.0 / 0.05, 0.004
+    power = (n - 1.0) * (2.0 * c - (n - 1.0) * t * c * c / n)
+    focus = (1.0 - (n - 1.0) * t * c / n) / power
+    f_number = SINGLET.replace("ENPD 10", "FNUM 20 0")
+    path.write_text(f_number, "utf-8")
+    # the pupil of an F-number is that of the focal length, wherever the image stands
+    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
+    assert made.camera.entrance_pupil == pytest.approx(1.0 / power / 20.0, rel=1e-8)
+    path.write_text(f_number.replace("DISZ 47.5", f"DISZ {1e3 * focus!r}"), "utf-8")
+    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend)
+    model = derive_camera(made.camera, backend)
+    assert float(model.first_order.focal_length[0]) == pytest.approx(1.0 / power, rel=1e-9)
+    bare = model.bare_assembly(False)
+    launch, direction = rays_of(model, backend)
+    there = trace(backend, assemble(bare, ["imaging"]), make_rays(backend, launch, direction), world=True)
+    place, leaving, _, _ = (a[0] for a in there.numpy(there.world))
+    back = trace(backend, assemble(bare, [model.mirrors[::-1]]), make_rays(backend, place, -leaving), world=True)
+    _, again, _, valid = (a[0] for a in back.numpy(back.world))
+    assert valid.all()
+    np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
+
+
+FACE = "{z: 1 mm, radius: 30 mm, light: refracts, index: %s}"
+
+
+@pytest.mark.parametrize(
+    ("mirrors", "problem"),
+    [
+        (f"A: {FACE % 1.5}, B: {FACE % 1.6}", "nothing cemented to it"),
+        (f"A: {FACE % 1.5}, M: {{z: 0 m, radius: -1 m}}", "light enters glass and does not leave it"),
+        (f"A: {FACE % 1.0}", "a lens has a face into glass"),
+        ("A: {z: 0 m, radius: 1 m, light: refracts}", "a face of a lens has an index behind it"),
+        ("A: {z: 0 m, radius: 1 m, index: 1.5}", "a face of a lens has an index behind it"),
+        ("A: {z: 0 m, radius: round}", "radius"),
+    ],
+)
+def test_lenses_that_a_camera_cannot_have(mirrors: str, problem: str) -> None:
+    text = f"""
+name: c
+focal_length: 1 m
+entrance_pupil: 10 mm
+field_bias: 0 deg
+field: {{x: 1 deg, y: 1 deg}}
+wavelength: 650 nm
+stop: A
+mirrors: {{{mirrors}}}
+image: {{z: 1 m}}
+line: {{pixels: 10, pitch: 7 um}}
+"""
+    with pytest.raises(InputError, match=problem):
+        validate(CameraSpec, parse_yaml(text))
+
+
+def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
+    path = tmp_path / "singlet.zmx"
+    path.write_text(SINGLET, "utf-8")
+    made = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4))
+    with pytest.raises(InputError, match="a camera of an instrument is made of mirrors alone"):
+        build_instrument(load_instrument("gf7_pair"), {"gf7": made.camera}, backend)
+
+
+ZERNIKE = (
+    "TYPE SZERNSAG\n  PARM 9 2\n  PARM 10 -50\n  XDAT 1 7\n  XDAT 2 80\n  XDAT 6 1e-4\n  XDAT 8 2e-4\n  XDAT 9 -1e-4"
+)
+
+
+def test_a_freeform_of_zernike_terms_goes_in_and_out(tmp_path: Path, backend) -> None:
+    """As a camera's own sag, and out again with a figure error about another middle on top of it."""
+    path = tmp_path / "freeform.zmx"
+    path.write_text(TMA.replace("TYPE EVENASPH", ZERNIKE), "utf-8")
+    lens = read_zemax(path)
+    made = camera_of(lens, "freeform", backend)
+    spec = validate(CameraSpec, parse_yaml(camera_text(made, lens)))
+    model = derive_camera(spec, backend)
+    launch, direction = rays_of(model, backend)
+    first = at_image(backend, lens.assembly(False), SEQUENCE, launch, direction)
+    np.testing.assert_allclose(
+        at_image(backend, model.bare_assembly(False), "imaging", launch, direction), first, rtol=0, atol=ROUNDING
+    )
+    path.write_text(TMA, "utf-8")
+    plain = read_zemax(path)
+    assert np.max(np.abs(at_image(backend, plain.assembly(False), SEQUENCE, launch, direction) - first)) > 1e-6
+    for kind in (".zmx", ".yaml"):
+        again = prescription_of(model)
+        mirror = again.surfaces[0]
+        error = ZernikeFigure(0.1, (0.01, -0.05), {5: 1e-7, 7: 2e-7})
+        shape = joined(replace(model.surfaces["M1"], figure=error))
+        bent = replace(again, surfaces=(replace(mirror, surface=shape), *again.surfaces[1:]))
+        out = tmp_path / f"bent{kind}"
+        out.write_text(zemax_text(bent) if kind == ".zmx" else batoid_text(bent)[0], "utf-8")
+        back = read_zemax(out) if kind == ".zmx" else read_batoid(out, 650e-9)
+        x, y = np.array([0.01, -0.02]), np.array([-0.03, -0.06])
+        wanted = model.surfaces["M1"].sag(x, y) + error.sag(x, y)
+        np.testing.assert_allclose(back.surfaces[0].surface.sag(x, y), wanted, rtol=0, atol=1e-16)
+
+
+STATE = {
+    "base/forward": Motion(rotate=(1e-4, -2e-4, 3e-4), shift=(1e-4, 0.0, -2e-4)),
+    "base/forward/M1": Motion(rotate=(1e-4, 2e-4, -1e-4), shift=(2e-5, -3e-5, 4e-5), pivot="centre"),
+    "base/forward/M2": Motion(shift=(1e-5, 0.0, 2e-5), scale=3e-5),
+    "base/forward/M3": Motion(figure={5: 2e-8, 8: -1e-8, 11: 1e-8}),
+    "base/forward/focal_plane": Motion(rotate=(5e-5, 1e-5, 2e-4), shift=(0.0, 1e-5, 2e-5)),
+}
+
+
+@pytest.mark.parametrize("kind", [".zmx", ".yaml"])
+def test_a_perturbed_camera_traces_as_the_instrument_does(tmp_path: Path, backend, instrument, kind: str) -> None:
+    """Rays of the scene through the instrument in that state, and through the file that was written of it."""
+    model, pair = instrument("gf7_pair").cameras["forward"], instrument("gf7_pair")
+    lens = perturbed_prescription(pair, "forward", STATE)
+    path = tmp_path / f"perturbed{kind}"
+    path.write_text(zemax_text(lens) if kind == ".zmx" else batoid_text(lens)[0], "utf-8")
+    back = read_zemax(path) if kind == ".zmx" else read_batoid(path, 650e-9)
+    launch, direction = rays_of(model, backend)
+    design = pair.assembly.nominal_pose("base/forward") @ model.camera_frame.inverse()
+    first = at_image(
+        backend, pair.assembly, "forward/imaging", design.apply(launch), direction @ design.rotation.T, STATE
+    )
+    second = at_image(backend, back.assembly(False), SEQUENCE, launch, direction)
+    # the image's frame stands on the parent axis, the line CCD's in the line's middle, with its z toward the scene
+    own = model.focal_plane.inverse() @ model.image_body
+    np.testing.assert_allclose(own.apply(second[:, :3]), first[:, :3], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(second[:, 3:6] @ own.rotation.T, first[:, 3:6], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(second[:, 6], first[:, 6], rtol=0, atol=10.0 * ROUNDING)
+    nominal = at_image(backend, prescription_of(model).assembly(False), SEQUENCE, launch, direction)
+    assert np.min(np.linalg.norm(nominal[:, :2] - second[:, :2], axis=-1)) > 1e-3
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.output
+
+
+def test_the_command(tmp_path: Path, backend) -> None:
+    (tmp_path / "tma.zmx").write_text(TMA, "utf-16")
+    (tmp_path / "two.yaml").write_text(BATOID, "utf-8")
+    camera = tmp_path / "camera.yaml"
+    code, said = run("read", tmp_path / "tma.zmx", "--out", camera)
+    assert code == 0, said
+    assert "3 mirrors" in said
+    assert "XYZZY 1 2 3: not understood" in said
+    assert load_camera(camera).name == "camera"
+    assert run("read", tmp_path / "tma.zmx", "--out", camera)[0] == 2
+    assert "exists" in run("read", tmp_path / "tma.zmx", "--out", camera)[1]
+    code, said = run("read", tmp_path / "two.yaml", "--out", camera, "--force", "--wavelength", "650 nm", "--field",
+                     "0.1 deg", "--pupil", "2 m", "--pitch", "15 um")  # fmt: skip
+    assert code == 0, said
+    assert load_camera(camera).line.pitch == pytest.approx(15e-6)
+    for arguments, problem in (
+        (("read", tmp_path / "two.yaml", "--out", tmp_path / "a.yaml"), "names no wavelength"),
+        (("read", tmp_path / "none.zmx", "--out", tmp_path / "a.yaml"), "no such file"),
+        (("read", tmp_path / "tma.zmx", "--out", tmp_path / "a.txt"), "what kind of file"),
+        (("read", tmp_path / "tma.zmx", "--out", tmp_path / "a.yaml", "--pupil", "3 kg"), "--pupil"),
+        (("write", "gf8", "--out", tmp_path / "a.zmx"), "did you mean 'gf7'"),
+        (("write", "gf7", "--out", tmp_path / "a.zmx", "--camera", "forward"), "--camera is for --perturbed"),
+    ):
+        code, said = run(*arguments)
+        assert code == 2
+        assert problem in said
+        assert not (tmp_path / "a.yaml").exists()
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: 0 0 30 um, figure: {Z5: 20 nm}}}\n", "utf-8"
+    )
+    for name in ("a.zmx", "a.yaml"):
+        code, said = run("write", "gf7", "--perturbed", job, "--camera", "forward", "--out", tmp_path / name)
+        assert code == 0, said
+    moved = read_zemax(tmp_path / "a.zmx")
+    assert moved.surfaces[1].pose.translation[2] == pytest.approx(-2.01593047747168 + 30e-6, abs=1e-14)
+    assert run("write", "gf7", "--perturbed", job, "--out", tmp_path / "b.zmx")[0] == 2  # which of the two?
+
+
+def test_what_a_camera_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
+    flat = "SURF 7\n  TYPE STANDARD\n  CURV 0.0"
+    cases: dict[str, tuple[str, str]] = {
+        "finite.zmx": (TMA.replace("DISZ INFINITY", "DISZ 500"), "the object is at a finite distance"),
+        "heights.zmx": (TMA.replace("FTYP 0", "FTYP 3"), "no directions of the field"),
+        "curved.zmx": (TMA.replace(flat, flat.replace("0.0", "0.01")), "a curved image"),
+        "turned.seq": (CODEV.replace("SI 0.0 0.25\n  ADE 1.5", "SI 0.0 0.25\n  ADE 70"), "an image turned too far"),
+    }
+    for name, (text, problem) in cases.items():
+        (tmp_path / name).write_text(text, "utf-8")
+        lens = (read_zemax if name.endswith("zmx") else read_codev)(tmp_path / name)
+        with pytest.raises(InputError, match=problem):
+            camera_of(lens, "c", backend)
+
+
+def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> None:
+    (tmp_path / "singlet.zmx").write_text(SINGLET, "utf-8")
+    made = camera_of(read_zemax(tmp_path / "singlet.zmx", own_glasses()), "singlet", backend, Width(pupil=1e-4))
+    lens: Prescription = prescription_of(derive_camera(made.camera, backend))
+    with pytest.raises(InputError, match="a face of a lens"):
+        zemax_text(lens)
+    text, _ = batoid_text(lens)
+    (tmp_path / "singlet.yaml").write_text(text, "utf-8")
+    back = read_batoid(tmp_path / "singlet.yaml", 650e-9)
+    assert [s.index for s in back.surfaces] == [s.index for s in lens.surfaces]

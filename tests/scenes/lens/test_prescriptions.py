@@ -1,0 +1,313 @@
+"""Foreign prescriptions: where surfaces stand and what they are shaped like, in numbers worked out by hand here."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.surface import ZernikeFigure
+from optics.materials.glass import N_BK7
+from optics.raytrace.assembly import Interaction
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.codev_reader import read_codev
+from scenes.lens.glass_catalogue import own_glasses, read_catalogue, read_catalogues
+from scenes.lens.prescription import Prescription, glass_key
+from scenes.lens.zemax_reader import read_zemax
+from scenes.yaml.errors import InputError
+from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
+
+ENCODINGS = {
+    "UTF-16 with a mark": TMA.encode("utf-16"),
+    "UTF-16 LE": TMA.encode("utf-16-le"),
+    "UTF-16 BE": TMA.encode("utf-16-be"),
+    "UTF-16 BE with a mark": b"\xfe\xff" + TMA.encode("utf-16-be"),
+    "UTF-8 with a mark": TMA.encode("utf-8-sig"),
+    "DOS lines": TMA.replace("\n", "\r\n").encode(),
+    "ASCII": TMA.encode("ascii"),
+}
+
+
+def file(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def same(a: Prescription, b: Prescription) -> bool:
+    return a.fields == b.fields and all(
+        x.pose == y.pose and x.surface == y.surface and x.interaction is y.interaction and x.aperture == y.aperture
+        for x, y in zip(a.surfaces, b.surfaces, strict=True)
+    )
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_encoding_does_not_matter(tmp_path: Path, encoding: str) -> None:
+    plain = read_zemax(file(tmp_path, "plain.zmx", TMA))
+    assert same(read_zemax(file(tmp_path, "other.zmx", ENCODINGS[encoding])), plain)
+
+
+def test_a_zemax_file(tmp_path: Path) -> None:
+    lens = read_zemax(file(tmp_path, "tma.zmx", TMA))
+    m1, m2, m3, image = lens.surfaces
+    assert lens.name == "three mirrors"
+    assert lens.stop == 1
+    assert lens.wavelength == 650e-9
+    assert lens.fields[1] == pytest.approx((math.radians(1.0), math.radians(6.1)))
+    assert m1.surface.curvature == pytest.approx(-1.0 / 0.674535927468851, rel=1e-12)
+    assert m1.surface.even == pytest.approx((-4.917e-2,))
+    assert m1.aperture == Rectangle(0.070, 0.065, (0.0, -0.054))
+    assert m2.pose.translation == pytest.approx([0.0, 0.0, -0.201593])
+    # +0.25 deg about x turns +z toward -y
+    tilt = math.radians(0.25)
+    assert m3.pose.rotation[:, 2] == pytest.approx([0.0, -math.sin(tilt), math.cos(tilt)])
+    assert m3.pose.translation == pytest.approx([0.0, 0.0005, 0.2162998 - 0.201593])
+    # the second coordinate break undoes the first: order flag 1 turns first and shifts then
+    assert image.pose.translation == pytest.approx([0.0, 0.0, 0.2162998 - 0.201593 - 0.22608], abs=1e-15)
+    assert np.allclose(image.pose.rotation, np.eye(3), rtol=0, atol=1e-15)
+    assert [s.interaction for s in lens.surfaces] == [Interaction.REFLECT] * 3 + [Interaction.PASS]
+    assert [(n.line, n.statement) for n in lens.notes] == [(TMA.count("\n"), "XYZZY 1 2 3")]
+
+
+def test_turns_of_a_coordinate_break_follow_one_another(tmp_path: Path) -> None:
+    """A unit vector along z under turns of 10, 20 and 30 deg, by hand; and the reverse order is the reverse."""
+    turned = TMA.replace(
+        "PARM 2 0.5\n  PARM 3 0.25\n  PARM 4 0\n  PARM 5 0", "PARM 2 0\n  PARM 3 10\n  PARM 4 20\n  PARM 5 30"
+    )
+    rotation = read_zemax(file(tmp_path, "a.zmx", turned)).surfaces[2].pose.rotation
+    a, b, c = (math.radians(v) for v in (10.0, 20.0, 30.0))
+    along = [math.sin(b), -math.sin(a) * math.cos(b), math.cos(a) * math.cos(b)]
+    assert rotation[:, 2] == pytest.approx(along)
+    assert rotation[0, 0] == pytest.approx(math.cos(b) * math.cos(c))
+    backward = turned.replace(
+        "PARM 3 10\n  PARM 4 20\n  PARM 5 30\n  PARM 6 0", "PARM 3 10\n  PARM 4 20\n  PARM 5 30\n  PARM 6 1"
+    )
+    other = read_zemax(file(tmp_path, "b.zmx", backward)).surfaces[2].pose.rotation
+    assert other[2, 2] == pytest.approx(math.cos(a) * math.cos(b))
+    assert other[2, 0] == pytest.approx(-math.sin(b))
+
+
+def shaped(tmp_path: Path, kind: str, *lines: str) -> Prescription:
+    """The three mirrors, the second of which has another shape."""
+    old = '  TYPE STANDARD\n  CURV -3.7703604697192816E-03 0 0 0 0 ""\n  CONI -1.78965940473169\n'
+    assert old in TMA
+    new = "\n".join((f"  TYPE {kind}", "  CURV -0.004 0 0 0 0", *(f"  {line}" for line in lines))) + "\n"
+    return read_zemax(file(tmp_path, "shaped.zmx", TMA.replace(old, new)))
+
+
+def test_shapes_by_their_sag(tmp_path: Path) -> None:
+    """Sags of every kind of surface in millimetres, by the formulas of the program's manual."""
+    x, y = 13.0, -7.0
+    r2 = x * x + y * y
+    base = -0.004 * r2 / (1.0 + math.sqrt(1.0 - 0.004**2 * r2))
+    cases = {
+        "STANDARD": ((), 0.0),
+        "EVENASPH": (("PARM 1 1e-4", "PARM 2 2e-7", "PARM 3 3e-10"), 1e-4 * r2 + 2e-7 * r2**2 + 3e-10 * r2**3),
+        "ODDASPHE": (("PARM 2 1e-4", "PARM 4 2e-7"), 1e-4 * r2 + 2e-7 * r2**2),
+        "XPOLYNOM": (
+            ("XDAT 1 9 0 0 1", "XDAT 2 20 0 0 1", "XDAT 5 0.01 0 0 1", "XDAT 6 0.02 0 0 1", "XDAT 11 0.03 0 0 1"),
+            0.01 * x**2 / 20**2 + 0.02 * x * y / 20**2 + 0.03 * y**3 / 20**3,
+        ),
+        "SZERNSAG": (
+            (
+                "PARM 2 2e-7",
+                "PARM 9 1",
+                "PARM 10 -2",
+                "XDAT 1 5 0 0 1",
+                "XDAT 2 25 0 0 1",
+                "XDAT 6 0.01",
+                "XDAT 7 0.02",
+            ),
+            2e-7 * r2**2
+            + 0.01 * math.sqrt(3.0) * (2.0 * ((x - 1) ** 2 + (y + 2) ** 2) / 25**2 - 1.0)
+            + 0.02 * math.sqrt(6.0) * 2.0 * (x - 1) * (y + 2) / 25**2,
+        ),
+    }
+    for kind, (lines, more) in cases.items():
+        surface = shaped(tmp_path, kind, *lines).surfaces[1].surface
+        assert 1e3 * float(surface.sag(x * 1e-3, y * 1e-3)) == pytest.approx(base + more, rel=1e-12), kind
+
+
+def test_a_polynomial_of_high_order_keeps_its_sag(tmp_path: Path) -> None:
+    """x^5 y and a tilt along x, which the trace knows as Zernike terms alone."""
+    numbers = {1: 0.004, 24: 0.02}  # x, and x^5 y: the second of order 6
+    pairs = [(n - b, b) for n in range(1, 7) for b in range(n + 1)]
+    at = pairs.index((5, 1)) + 1
+    lines = ["XDAT 1 27 0 0 1", "XDAT 2 20 0 0 1", f"XDAT 3 {numbers[1]} 0 0 1", f"XDAT {at + 2} 0.02 0 0 1"]
+    surface = shaped(tmp_path, "XPOLYNOM", *lines).surfaces[1].surface
+    assert isinstance(surface.figure, ZernikeFigure)
+    x, y = 11.0, 9.0
+    base = -0.004 * (x * x + y * y) / (1.0 + math.sqrt(1.0 - 0.004**2 * (x * x + y * y)))
+    wanted = base + 0.004 * x / 20.0 + 0.02 * (x / 20.0) ** 5 * y / 20.0
+    assert 1e3 * float(surface.sag(x * 1e-3, y * 1e-3)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_a_codev_file(tmp_path: Path) -> None:
+    lens = read_codev(file(tmp_path, "folded.seq", CODEV))
+    stop, m1, m2, image = lens.surfaces
+    assert (lens.stop, lens.name, lens.wavelength) == (0, "folded", 650e-9)
+    assert stop.interaction is Interaction.PASS
+    assert math.isinf(lens.object_distance)
+    assert np.allclose(lens.fields, [(0.0, 0.0), (math.radians(1.0), math.radians(-1.0))], rtol=1e-15)
+    # ADE > 0 turns +z toward +y; DAR: what follows stands as if nothing had been turned
+    tilt = math.radians(2.0)
+    assert m1.pose.rotation[:, 2] == pytest.approx([0.0, math.sin(tilt), math.cos(tilt)])
+    assert m1.pose.translation == pytest.approx([0.0, 0.005, 0.1])
+    assert m2.pose.translation == pytest.approx([0.0, 0.0, 0.1 - 0.3])
+    assert m2.surface.even == pytest.approx((1.0, 2.0))
+    assert m2.aperture == Circle(0.06)
+    # BEN: the axis behind the mirror is the reflected one; the image's thickness lies along it, before its own turn
+    axis = np.array([0.0, math.sin(math.radians(6.0)), math.cos(math.radians(6.0))])
+    assert image.pose.translation == pytest.approx([0.0, 0.0, -0.2] + 0.40025 * axis)
+    assert image.pose.rotation[:, 2] == pytest.approx([0.0, math.sin(math.radians(7.5)), math.cos(math.radians(7.5))])
+    assert [(n.line, n.statement) for n in lens.notes] == [(CODEV[: CODEV.index("FROB")].count("\n") + 1, "FROB 7")]
+
+
+def test_a_reversed_decentre_undoes_one(tmp_path: Path) -> None:
+    there = "S 0.0 10.0\n  XDE 1.0; YDE 2.0; ADE 10.0; BDE 20.0; CDE 30.0\n"
+    back = "S 0.0 0.0\n  XDE 1.0; YDE 2.0; ADE 10.0; BDE 20.0; CDE 30.0\n  REV\n"
+    text = CODEV.replace("S -1000.0 -300.0 REFL", f"{there.replace('10.0', '0.0', 1)}{back}S -1000.0 -300.0 REFL", 1)
+    plain, moved = (read_codev(file(tmp_path, f"{k}.seq", t)) for k, t in enumerate((CODEV, text)))
+    for a, b in zip(plain.surfaces, moved.surfaces, strict=True):
+        assert np.allclose(a.pose.translation, b.pose.translation, rtol=0, atol=1e-15)
+        assert np.allclose(a.pose.rotation, b.pose.rotation, rtol=0, atol=1e-15)
+
+
+def test_radii_and_curvatures_and_units_are_the_same_camera(tmp_path: Path) -> None:
+    curved = CODEV.replace("RDM Y", "RDM N").replace("-1000.0", "-0.001")
+    inches = CODEV.replace("DIM M", "DIM C").replace("-1000.0", "-100.0").replace("EPD 50.0", "EPD 5.0")
+    first = read_codev(file(tmp_path, "a.seq", CODEV)).surfaces
+    assert [s.surface.curvature for s in first] == [
+        s.surface.curvature for s in read_codev(file(tmp_path, "b.seq", curved)).surfaces
+    ]
+    metres = [s.surface.curvature for s in read_codev(file(tmp_path, "c.seq", inches)).surfaces]
+    assert metres == pytest.approx([s.surface.curvature for s in first])
+
+
+def test_a_polynomial_of_codev(tmp_path: Path) -> None:
+    """C4 is x^2, C8 is x^2 y, C15 is y^4: j = ((m + n)^2 + m + 3 n) / 2 + 1."""
+    text = CODEV.replace(
+        "  CON\n  K -1.0\n", "  SPS XYP\n  SCO K -1.0\n  SCO C4 1.0E-5; SCO C8 2.0E-8; SCO C15 3.0E-10\n"
+    )
+    surface = read_codev(file(tmp_path, "xyp.seq", text)).surfaces[1].surface
+    x, y = 20.0, -15.0
+    wanted = -0.001 * (x * x + y * y) / 2.0 + 1e-5 * x * x + 2e-8 * x * x * y + 3e-10 * y**4
+    assert 1e3 * float(surface.sag(x * 1e-3, y * 1e-3)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_a_batoid_file(tmp_path: Path) -> None:
+    lens = read_batoid(file(tmp_path, "two.yaml", BATOID), 650e-9)
+    m1, m2, front, back, image = lens.surfaces
+    # light comes down there and enters toward +z here: z and y change their signs
+    assert m1.surface.curvature == pytest.approx(-1.0 / 20.0)
+    assert m1.aperture == Circle(1.2, (0.0, -0.0), 0.3)
+    assert m2.pose.translation == pytest.approx([0.0, 0.0, -7.5])
+    assert m2.surface.even == pytest.approx((-1e-5,))
+    assert (front.index, back.index) == (1.46, 1.0)
+    assert front.pose.rotation[:, 2] == pytest.approx([0.0, -math.sin(0.01), math.cos(0.01)])
+    assert back.pose.translation == pytest.approx([0.0, -0.02 * math.sin(0.01), 0.2 + 0.02 * math.cos(0.01)])
+    assert image.pose.translation == pytest.approx([0.0, 0.0, 1.5])
+
+
+def test_glasses(tmp_path: Path) -> None:
+    glassy, old = read_catalogue(file(tmp_path, "two.agf", AGF))
+    for wavelength in (0.4e-6, 0.5875618e-6, 1.0e-6):
+        assert glassy(wavelength) == pytest.approx(N_BK7.index(wavelength), rel=1e-14)
+    # BK7 of Schott's catalogue of 1967, index at the d line
+    assert old(0.5875618e-6) == pytest.approx(1.5168, abs=2e-5)
+    known = read_catalogues([tmp_path / "two.agf"])
+    assert known[glass_key("GLASSY_MAKER")](0.6e-6) == glassy(0.6e-6)
+    assert own_glasses()[glass_key("NBK7_SCHOTT")](0.6e-6) == N_BK7.index(0.6e-6)
+    with pytest.raises(ValueError, match="outside the range"):
+        old(2e-6)
+
+
+def test_the_same_lens_in_glass(tmp_path: Path) -> None:
+    lens = read_zemax(file(tmp_path, "singlet.zmx", SINGLET), own_glasses())
+    assert [s.interaction for s in lens.surfaces[:2]] == [Interaction.REFRACT] * 2
+    assert lens.surfaces[0].index == N_BK7.index(587.5618e-9)
+    assert lens.surfaces[1].index == 1.0
+
+
+WRONG = {
+    "TYPE TOROIDAL": ("TYPE EVENASPH", "TYPE TOROIDAL", "a kind of surface that is not known here", 0),
+    "GLAS SF99": ("GLAS MIRROR", "GLAS SF99", "unknown glass", 0),
+    "MODE NSC": ("MODE SEQ", "MODE NSC", "not a sequential system", 0),
+    "UNIT": ("UNIT MM", "UNIT FURLONG", "unknown unit of lengths", 0),
+    "number": ("DISZ -201.593", "DISZ 2O1", "the thickness of DISZ is not a number", 0),
+    "order": ("SURF 3", "SURF 4", "surfaces are not in their order", 0),
+    "tilt": ("SQAP 70 65 0", "SCBD 1 0 0 0 0 90 0 0", "a surface with a tilt or decentre of its own", 0),
+    "two stops": ("SURF 5", "SURF 5\n  STOP", "a second stop", 0),
+    "negative edge": ("SURF 5", "SURF 5\n  CLAP 0 -5 0", "a circular aperture needs", 1),
+    "ignored": ("  COMM frame", "  IGNR 1", "a surface that is to be ignored", 0),
+}
+"""Words of the file -> other words, what is said of them, and by how many lines the place lies behind them."""
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_would_be_taken_wrongly_is_refused(tmp_path: Path, case: str) -> None:
+    old, new, problem, behind = WRONG[case]
+    text = TMA.replace(old, new, 1)
+    with pytest.raises(InputError) as caught:
+        read_zemax(file(tmp_path, "wrong.zmx", text))
+    assert problem in str(caught.value)
+    assert caught.value.line == text[: text.index(new)].count("\n") + 1 + behind, str(caught.value)
+
+
+@pytest.mark.parametrize(("content", "problem"), [("\n\n", "an empty file"), (TMA[: TMA.index("SURF 2")], "cut off")])
+def test_what_is_no_whole_file_is_refused(tmp_path: Path, content: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem) as caught:
+        read_zemax(file(tmp_path, "wrong.zmx", content))
+    assert caught.value.line is not None
+
+
+WRONG_CODEV = {
+    "radii?": (CODEV.replace("RDM Y; ", ""), "radii or curvatures"),
+    "return": (CODEV.replace("  DAR", "  RET S1"), "a return to the frame of another surface"),
+    "global": (CODEV.replace("  DAR", "  GLB S1"), "a global decentre"),
+    "special": (CODEV.replace("  CON", "  SPS ODD"), "a special surface that is not known here"),
+    "diffractive": (CODEV.replace("  CON", "  DIF DOE"), "a diffractive surface"),
+    "bend about two axes": (CODEV.replace("  ADE 3.0", "  ADE 3.0; BDE 2.0"), "BEN with turns about several axes"),
+    "edited": (CODEV.replace("GO", "THI S3 5.0"), "a change of surfaces that have been given before"),
+    "no image": (CODEV[: CODEV.index("SI 0.0")], "it is cut off"),
+    "glass": (CODEV.replace("REFL", "NSK16_SCHOTT", 1), "unknown glass"),
+    "Fresnel base": (CODEV.replace("  CON", "  CUF 0.1"), "a curvature of a Fresnel base"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_CODEV)
+def test_what_would_be_taken_wrongly_of_codev_is_refused(tmp_path: Path, case: str) -> None:
+    text, problem = WRONG_CODEV[case]
+    with pytest.raises(InputError, match=problem) as caught:
+        read_codev(file(tmp_path, "wrong.seq", text))
+    assert caught.value.line is not None
+
+
+WRONG_BATOID = {
+    "unknown number": (BATOID.replace("coefs: [1.0e-5]", "coefs: [1.0e-5], spin: 1"), "spin: a key that is not known"),
+    "tilted": (BATOID.replace("type: Quadric", "type: Tilted"), "a key that is not known here"),
+    "table": (BATOID.replace("type: ConstMedium, n: 1.46", "type: Moonstone"), "a medium that is not known here"),
+    "YAML": (BATOID.replace("items:", "items: [", 1), "not YAML"),
+    "one face": (
+        BATOID.replace("        - {type: RefractiveInterface, name: front, surface: {type: Plane}}\n", ""),
+        "two faces",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_BATOID)
+def test_what_would_be_taken_wrongly_of_batoid_is_refused(tmp_path: Path, case: str) -> None:
+    text, problem = WRONG_BATOID[case]
+    with pytest.raises(InputError, match=problem) as caught:
+        read_batoid(file(tmp_path, "wrong.yaml", text), 650e-9)
+    assert caught.value.line is not None
+
+
+def test_the_power_of_batoids_first_coefficient(tmp_path: Path) -> None:
+    """``imin: 1`` makes it that of r^2."""
+    text = BATOID.replace("coefs: [1.0e-5]", "coefs: [1.0e-3, 1.0e-5], imin: 1")
+    plain, more = (
+        read_batoid(file(tmp_path, f"{k}.yaml", t), 650e-9).surfaces[1].surface for k, t in enumerate((BATOID, text))
+    )
+    assert float(more.sag(0.3, 0.4)) - float(plain.sag(0.3, 0.4)) == pytest.approx(-1e-3 * 0.25)
