@@ -12,8 +12,8 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.measured.orbit_data import MeasuredAngleSpec, MeasuredCalibrationSpec, OrbitDataSpec
-from scenes.specs.measurement import MeasurementSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec

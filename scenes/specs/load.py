@@ -15,7 +15,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
-from scenes.specs.measurement import MeasurementSpec
+from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_scene import LineImageSpec

@@ -10,7 +10,7 @@ import tifffile
 from astropy.io import fits
 from typer.testing import CliRunner
 
-from scenes.specs.measurement_setup import resolve_measurement
+from scenes.specs.measured.monitor_frames_setup import resolve_measurement
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import ROOT

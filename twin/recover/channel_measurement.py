@@ -16,7 +16,7 @@ from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, lone_pixels, refit
-from scenes.specs.measurement import MeasurementSpec
+from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 

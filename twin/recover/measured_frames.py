@@ -13,8 +13,8 @@ from analysis.images.image_file import ImageError, ImageFile
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
-from scenes.specs.measurement import MeasurementSpec, per_channel
-from scenes.specs.measurement_setup import AFTER, BEFORE, MeasurementSetup
+from scenes.specs.measured.monitor_frames import MeasurementSpec, per_channel
+from scenes.specs.measured.monitor_frames_setup import AFTER, BEFORE, MeasurementSetup
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
 

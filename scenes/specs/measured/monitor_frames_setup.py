@@ -14,7 +14,7 @@ from scenes.specs.course import moment
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import find_area_detector, load_detector
-from scenes.specs.measurement import (
+from scenes.specs.measured.monitor_frames import (
     ALL,
     MOST_TIMES,
     ChannelFramesSpec,
