@@ -131,7 +131,9 @@ def test_a_slope_against_layouts_that_are_built_anew(bench: LayoutBench) -> None
 @pytest.mark.parametrize("name", CONTINUOUS)
 @pytest.mark.parametrize("beam", [0, 1])
 def test_every_slope_against_layouts_that_are_built_anew(bench: LayoutBench, name: str, beam: int) -> None:
-    agrees_with_rebuilt_layouts(bench, LayoutNumber((FIRST, SECOND), beam, name))
+    # off the plane of symmetry, where prisms are exchanged for their mirror images and a layout jumps
+    beams = (replace(FIRST, pupil_y=0.01), replace(SECOND, pupil_y=0.015))
+    agrees_with_rebuilt_layouts(bench, LayoutNumber(beams, beam, name))
 
 
 def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBench) -> None:

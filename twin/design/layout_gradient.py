@@ -4,7 +4,9 @@ Where prisms and facets stand is itself found by tracing, so no chain of closed 
 sigma. Two parts do: the sigma's derivative by the traced derivatives A of the spots and by their noise R is exact
 matrix calculus (``Information.slopes``); A and R, which are smooth in every number of a layout, are differentiated by
 central differences of high order of layouts that are built anew. The next lower order comes from the same layouts; the
-difference of both is the stated error: that of the lower one, and of rounding.
+difference of both is the stated error: that of the lower one, and of rounding. It does not tell of a jump within the
+steps: where a 180-deg prism is exchanged for its mirror image (``monitor_chain``), as of beams near the plane of
+symmetry.
 """
 
 from __future__ import annotations
