@@ -138,8 +138,9 @@ def test_two_lenses_of_two_glasses(tmp_path: Path, backend) -> None:
     bare = model.bare_assembly(False)
     first = at_image(backend, lens.assembly(False), SEQUENCE, launch, direction)
     np.testing.assert_allclose(at_image(backend, bare, "imaging", launch, direction), first, rtol=0, atol=ROUNDING)
-    back = trace(backend, assemble(bare, [model.mirrors[::-1]]), make_rays(backend, first[:, :3] + [0, 0, model.spec.image.z],
-                 -first[:, 3:6]), world=True)  # fmt: skip
+    place = first[:, :3] + [0.0, 0.0, model.spec.image.z]
+    rays = make_rays(backend, place, -first[:, 3:6])
+    back = trace(backend, assemble(bare, [model.mirrors[::-1]]), rays, world=True)
     _, again, _, valid = (a[0] for a in back.numpy(back.world))
     assert valid.all()
     np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
