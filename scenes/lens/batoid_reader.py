@@ -6,6 +6,7 @@ There light comes down from +z; here it enters toward +z. Everything is turned a
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -349,7 +350,9 @@ def _loaded(path: str | Path) -> object:
         raise source.error("too large for a telescope", 1, f"{len(content)} bytes", f"at most {LARGEST_FILE}")
     text = "\n".join(decoded(content, source))
     try:
-        return YAML(typ="rt", pure=True).load(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of anchors that are given twice
+            return YAML(typ="rt", pure=True).load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark
         problem = f"not YAML: {error.problem}"

@@ -30,7 +30,8 @@ READ = (
 """Commands that read a YAML file; all tests of a program do it in the same way."""
 PROGRAMS = (
     *("twin.render", "twin.camera", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate"),
-    *("twin.compare", "twin.doctor", "twin.uncertainty", "twin.recover", "scenes.schema", "analysis.mtf"),
+    *("twin.compare", "twin.doctor", "twin.uncertainty", "twin.recover"),
+    *("scenes.lens", "scenes.schema", "analysis.mtf"),
 )
 BAD = "seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n"
 

@@ -125,6 +125,27 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
 
 
+def test_two_lenses_of_two_glasses(tmp_path: Path, backend) -> None:
+    """The second is its own, forward and backward."""
+    second = "SURF 3\n  CURV 0.01\n  DISZ 3\n  GLAS SILICA 0 0\nSURF 4\n  CURV -0.005\n  DISZ 20\nSURF 5\n  DISZ 0\n"
+    text = SINGLET.replace("DISZ 47.5\nSURF 3\n  DISZ 0\n", f"DISZ 10\n{second}")
+    assert "SILICA" in text
+    path = tmp_path / "two.zmx"
+    path.write_text(text, "utf-8")
+    lens = read_zemax(path, own_glasses())
+    model = derive_camera(camera_of(lens, "two", backend, Width(pupil=1e-3)).camera, backend)
+    launch, direction = rays_of(model, backend)
+    bare = model.bare_assembly(False)
+    first = at_image(backend, lens.assembly(False), SEQUENCE, launch, direction)
+    np.testing.assert_allclose(at_image(backend, bare, "imaging", launch, direction), first, rtol=0, atol=ROUNDING)
+    place = first[:, :3] + [0.0, 0.0, model.spec.image.z]
+    rays = make_rays(backend, place, -first[:, 3:6])
+    back = trace(backend, assemble(bare, [model.mirrors[::-1]]), rays, world=True)
+    _, again, _, valid = (a[0] for a in back.numpy(back.world))
+    assert valid.all()
+    np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
+
+
 FACE = "{z: 1 mm, radius: 30 mm, light: refracts, index: %s}"
 
 
