@@ -311,7 +311,7 @@ def _jitter(offset: Array, spread: Array, count: int) -> Array:
     if count < 3:
         return np.zeros((2, 2))
     away = offset - offset.mean(axis=0)
-    chi = float(np.einsum("ki,kij,kj->", away, np.linalg.inv(spread), away))
+    chi = float(np.einsum("ki,kij,kj->", away, np.linalg.pinv(spread, hermitian=True), away))
     if chi <= chi2.isf(FALSE_ALARM, 2 * (count - 1)):
         return np.zeros((2, 2))
     value, vector = np.linalg.eigh(away.T @ away / (count - 1) - spread.mean(axis=0))
