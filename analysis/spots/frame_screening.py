@@ -38,7 +38,7 @@ _UNLIKE = 0.01
 _FEWEST_UNLIKE = 40
 _BORDER_PX = 4
 _SATURATION_SIGMAS = 4.0
-_LEAST_SHARE, _UNKNOWN = 1e-3, 1e12
+_LEAST_SHARE, _UNKNOWN, _LEAST_DRIFT_DN = 1e-3, 1e12, 0.5
 _MOST_MOVES, _SMALL_PX, _LARGEST_PX = 4, 0.1, 5.0
 """A frame that has moved by more than the second is compared with the reference there, so often at most, up to the
 third."""
@@ -82,6 +82,7 @@ class ScreenedFrames:
         counts: (H, W) frames that each pixel is the mean of.
         good: (H, W) pixels that can be used.
         frames: number of frames that are used.
+        recorded: number of frames that there are.
         jitter: (2, 2) px^2, covariance of the spot's place over the frames beyond noise; zeros where none is seen.
         findings: what was found.
     """
@@ -90,6 +91,7 @@ class ScreenedFrames:
     counts: Array
     good: Mask
     frames: int
+    recorded: int
     jitter: Array
     findings: tuple[Finding, ...]
 
@@ -140,7 +142,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
         if len(kept) > 1:
             hits[kept] |= found.hits
             model[kept] = found.model
-            findings += found.findings(noise)
+            findings += found.findings()
             jitter = found.jitter
     saturated = _saturated(values[kept], noise) & ~known
     if np.any(saturated):
@@ -159,7 +161,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
         mean = mean_frames(frames)
     else:
         mean = np.where(lost, model[kept], used).mean(axis=0)
-    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), jitter, tuple(findings))
+    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(values), jitter, tuple(findings))
 
 
 def _numbers(frames: NDArray[np.intp]) -> str:
@@ -193,14 +195,15 @@ def _lit(values: Array, usable: Mask, findings: list[Finding]) -> NDArray[np.int
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """N frames against their reference: model and hits (N, H, W), light and level (N,), offsets (N, 2) px and their
-    covariance (N, 2, 2).
+    """N frames against their reference: model and hits (N, H, W), light and level (N,) with the largest sigma of a
+    level, offsets (N, 2) px and their covariance (N, 2, 2).
     """
 
     model: Array
     hits: Mask
     light: Array
     level: Array
+    level_sigma: float
     offset: Array
     spread: Array
     jitter: Array
@@ -210,7 +213,7 @@ class _Compared:
         count = np.count_nonzero(self.hits, axis=(1, 2))
         return np.asarray(count > max(_UNLIKE * self.hits[0].size, _FEWEST_UNLIKE))
 
-    def findings(self, noise: NoiseModel) -> list[Finding]:
+    def findings(self) -> list[Finding]:
         out = []
         if np.any(self.hits):
             struck = np.flatnonzero(self.hits.any(axis=(1, 2)))
@@ -220,8 +223,7 @@ class _Compared:
             rms = math.sqrt(float(np.trace(self.jitter)))
             out.append(Finding("movement between frames", f"{rms:.2g} px rms; its share in the mean is added to sigma"))
         drift = float(np.ptp(self.level))
-        sigma = math.sqrt(noise.dark_variance_dn2 / self.hits[0].size)
-        if drift > 12.0 * sigma:
+        if drift > max(12.0 * self.level_sigma, _LEAST_DRIFT_DN):
             out.append(Finding("drifting level", f"by {drift:.3g} DN over the frames; it is fitted", corrects=False))
         flicker = float(np.ptp(self.light))
         if flicker > 0.02:
@@ -242,7 +244,7 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     else:
         reference, excess = values[::-1], 2.0
     model, hits = np.empty_like(values), np.zeros(values.shape, dtype=bool)
-    light, level = np.empty(count), np.empty(count)
+    light, level, sigmas = np.empty((3, count))
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
     z = np.empty_like(values)
     for k, frame in enumerate(values):
@@ -261,7 +263,7 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
         model[k] = np.tensordot(solution, basis, 1)
         sigma = np.sqrt(excess * noise.temporal_variance_dn2(model[k], 1))
         z[k] = np.where(usable[k], (frame - model[k]) / sigma, 0.0)
-        light[k], level[k] = solution[0], solution[-1]
+        light[k], level[k], sigmas[k] = solution[0], solution[-1], math.sqrt(max(float(inverse[-1, -1]), 0.0))
         # a spot that has moved by d is its reference minus d times the slope
         offset[k] = place + further
         spread[k] = np.clip(inverse[1:3, 1:3], -_UNKNOWN, _UNKNOWN) / share**2
@@ -269,7 +271,7 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     struck = z > threshold if count == 2 else np.abs(z) > threshold
     for k in range(count):
         hits[k] = _grown(struck[k], np.abs(z[k]) > GROWTH_SIGMAS)
-    return _Compared(model, hits, light, level, offset, spread, _jitter(offset, spread, count))
+    return _Compared(model, hits, light, level, float(sigmas.max()), offset, spread, _jitter(offset, spread, count))
 
 
 def _basis(reference: Array) -> Array:
@@ -309,7 +311,7 @@ def _jitter(offset: Array, spread: Array, count: int) -> Array:
     if count < 3:
         return np.zeros((2, 2))
     away = offset - offset.mean(axis=0)
-    chi = float(np.einsum("ki,kij,kj->", away, np.linalg.inv(spread), away))
+    chi = float(np.einsum("ki,kij,kj->", away, np.linalg.pinv(spread, hermitian=True), away))
     if chi <= chi2.isf(FALSE_ALARM, 2 * (count - 1)):
         return np.zeros((2, 2))
     value, vector = np.linalg.eigh(away.T @ away / (count - 1) - spread.mean(axis=0))

@@ -135,6 +135,7 @@ def fit_screened(
     terms: FitTerms | None = None,
     near: ScreenedFit | None = None,
     jitter: Array | None = None,
+    recorded: int | None = None,
     edge_px: float = EDGE_PX,
 ) -> ScreenedFit:
     """Fit one spot.
@@ -148,6 +149,7 @@ def fit_screened(
         terms: what else is fitted; None for nothing.
         near: a fit to begin at; None to look for the brightest spot.
         jitter: (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
+        recorded: frames that there are, against which the cost is counted; None for the most that a pixel has.
         edge_px: least distance of a centre from the image's outermost pixel centres.
 
     Raises:
@@ -155,7 +157,7 @@ def fit_screened(
     """
     terms = FitTerms() if terms is None else terms
     try:
-        return _fit(mean, counts, good, noise, template, terms, near, jitter, edge_px)
+        return _fit(mean, counts, good, noise, template, terms, near, jitter, recorded, edge_px)
     except TemplateRangeError as error:
         raise SpotError({0: "the fit left the range of the template; calibrate it with a larger margin"}) from error
     except np.linalg.LinAlgError as error:
@@ -171,6 +173,7 @@ def _fit(
     terms: FitTerms,
     near: ScreenedFit | None,
     jitter: Array | None,
+    recorded: int | None,
     edge_px: float,
 ) -> ScreenedFit:
     model = _Model(template, terms, mean.shape[0], mean.shape[1])
@@ -198,6 +201,7 @@ def _fit(
     temporal = (influence * temporal_variance) @ influence.T
     fixed = (influence * noise.fixed_variance_dn2(level)) @ influence.T
     moved = np.zeros((2, 2)) if jitter is None else jitter / float(np.median(many))
+    frames = float(many.max()) if recorded is None else float(recorded)
     square = np.square(flat - level) * weight
     used = int(np.count_nonzero(use))
     shape = mean.shape
@@ -228,8 +232,8 @@ def _fit(
         variance=_variance(level, many, noise).reshape(shape),
         used=good,
         core=(float(square[core].mean()) if np.any(core) else 0.0, int(np.count_nonzero(core))),
-        cost=_cost(design[:4], level, many, noise, temporal + moved + fixed),
-        missing=_cost(design[:4], level, many, noise, temporal + fixed),
+        cost=_cost(design[:4], level, frames, noise, temporal + moved + fixed),
+        missing=_cost(design[:4], level, frames, noise, temporal + fixed),
     )
 
 
@@ -237,9 +241,9 @@ def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
     return np.asarray(noise.temporal_variance_dn2(level, 1) / counts + noise.fixed_variance_dn2(level))
 
 
-def _cost(design: Array, level: Array, counts: Array, noise: NoiseModel, covariance: Array) -> float:
+def _cost(design: Array, level: Array, frames: float, noise: NoiseModel, covariance: Array) -> float:
     """Sigma of the place over that of an image with nothing missing and nothing else in it, minus 1."""
-    weighted = design / _variance(level, np.full_like(counts, counts.max()), noise)
+    weighted = design / _variance(level, np.full_like(level, frames), noise)
     ideal = np.linalg.inv(weighted @ design.T)[:2, :2]
     return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
 

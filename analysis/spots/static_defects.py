@@ -196,7 +196,17 @@ def _fitted(
     terms: FitTerms,
     near: ScreenedFit | None = None,
 ) -> ScreenedFit:
-    return fit_screened(screened.mean, screened.counts, good, noise, template, terms, near=near, jitter=screened.jitter)
+    return fit_screened(
+        screened.mean,
+        screened.counts,
+        good,
+        noise,
+        template,
+        terms,
+        near=near,
+        jitter=screened.jitter,
+        recorded=screened.recorded,
+    )
 
 
 def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:

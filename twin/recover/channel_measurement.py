@@ -161,7 +161,7 @@ class ChannelMeasurement:
             values = state.frames
             mean = mean_frames(values) if np.issubdtype(values.dtype, np.integer) else np.mean(values, axis=0)
             counts, still = np.full(state.shape, float(len(values))), np.zeros((2, 2))
-            screened = ScreenedFrames(np.asarray(mean, np.float64), counts, ~bad, len(values), still, ())
+            screened = ScreenedFrames(np.asarray(mean, np.float64), counts, ~bad, len(values), len(values), still, ())
         else:
             screened = screen_frames(state.frames, channel.raw_noise, bad)
         if channel.correction is None:

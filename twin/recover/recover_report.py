@@ -155,10 +155,9 @@ def _verdict(run: RecoverRun) -> str:
     count, total, worst_spot, where = _corrected(run)
     cleaned = "the frames were taken as they are" if run.setup.test.corrections == "none" else "the frames are clean"
     if worst_spot is not None:
-        cost = plain(round(100.0 * worst_spot.cost, 1), 3)
-        cleaned = (
-            f"{count} of {total} sets of frames were corrected, which costs up to {cost} % of σ by noise ({where})"
-        )
+        most = round(100.0 * worst_spot.cost, 1)
+        cost = f"up to {plain(most, 3)} %" if most >= 0.1 else "less than 0.1 %"
+        cleaned = f"{count} of {total} sets of frames were corrected, which costs {cost} of σ by noise ({where})"
     return one_sentence(first, limit, cleaned)
 
 
