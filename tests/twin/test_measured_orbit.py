@@ -16,7 +16,7 @@ import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import body_axes_matrix
-from scenes.specs.measured.orbit_data_setup import resolve_measured_angle
+from scenes.specs.measured.orbit_data_setup import is_measured, resolve_any_angle, resolve_measured_angle
 from scenes.specs.orbit_angle import EffectsSpec
 from scenes.specs.orbit_setup import resolve_calibration
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
@@ -580,3 +580,13 @@ def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(c
     (files.parent / "data.yaml").write_text(dump_yaml(data))
     # the orbit's readings are now told as 8 a second: their noise is stated by an interval
     same(simultaneous(campaign), simultaneous(read_back(files)[1]), 0.01)
+
+
+def test_files_of_simulations_and_of_measurements_are_told_apart() -> None:
+    """All shipped ones; a simulation of angles has a key `passes`, too."""
+    folder = SCENES / ORBIT
+    assert not any(is_measured(file) for file in folder.glob("*.yaml"))
+    assert is_measured(folder / "measured/angle.yaml")
+    assert is_measured(folder / "measured/calibrate.yaml")
+    assert not is_measured("angle")
+    assert resolve_any_angle(folder / "angle.yaml").test.name == "angle"
