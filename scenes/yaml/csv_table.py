@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
+from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
 from scenes.yaml.units import Kind, parse_quantity, unit_ratio
 
 LARGEST_TABLE = 1 << 30
@@ -191,7 +191,9 @@ def _heads(
         name = "" if match is None else match["name"]
         if match is None or name not in known:
             meant = nearest(name, known)
-            issue = Issue("no such column", file, line, (text,), shown(text), allowed, meant and known[meant].head)
+            issue = Issue(
+                "no such column", file, line, (text[:LONGEST_SHOWN],), shown(text), allowed, meant and known[meant].head
+            )
             raise InputError(issue)
         column = known[name]
         if any(column is other for other, _, _ in found):
