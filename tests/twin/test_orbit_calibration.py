@@ -26,9 +26,10 @@ from twin.orbit.calibration.campaign import fly_fields
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
 from twin.orbit.calibration.influences import INNER, surprises
 from twin.orbit.calibration.latitude import fitted, latitude_fits, rate_priors
-from twin.orbit.calibration.observations import ImagePoints, PassData, image_sigma, light_shift
+from twin.orbit.calibration.observations import PassData, image_sigma, light_shift
 from twin.orbit.calibration.schemes import schemes_tested, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.measured.pass_measurements import ImagePoints
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate.yaml"

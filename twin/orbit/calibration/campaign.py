@@ -23,7 +23,7 @@ from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_spec import OrbitSpec, PassingSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.calibration.field_images import FieldImages, Imager
-from twin.orbit.calibration.observations import FieldPoints, ImagePoints, PassData, image_sigma, light_effects
+from twin.orbit.calibration.observations import FieldPoints, PassData, image_sigma, light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineCamera, line_cameras
@@ -31,6 +31,7 @@ from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.payload_changes import changed_payload, drifted_payload
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
+from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
@@ -24,6 +23,7 @@ from analysis.orbit.three_line_model import LineModel, Rays
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.sensor import Sensor
+from twin.orbit.measured.pass_measurements import ImagePoints
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_angle import EffectsSpec
@@ -86,46 +86,6 @@ def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
 
 _HEIGHTS = (-500.0, 9000.0)
 """Metres: of land. A control point outside of them is refused by the calibration, not here."""
-
-
-@dataclass(frozen=True, eq=False)
-class ImagePoints:
-    """Image points of one line camera.
-
-    Attributes:
-        point: (n,) which ground point each of them shows.
-        line, pixel: (n,) image coordinates; the centre of the first line's first pixel is (0, 0).
-        covariance: (n, 2, 2) of line and pixel, pixels squared.
-    """
-
-    point: np.ndarray
-    line: np.ndarray
-    pixel: np.ndarray
-    covariance: np.ndarray
-
-    @classmethod
-    def of(cls, point: ArrayLike, line: ArrayLike, pixel: ArrayLike, covariance: ArrayLike) -> ImagePoints:
-        """covariance: (n, 2, 2), or one (2, 2) for all.
-
-        Raises:
-            ValueError: shapes that do not match, values that are not finite.
-        """
-        which, at, along = np.array(point, np.intp), np.array(line, np.float64), np.array(pixel, np.float64)
-        if which.ndim != 1 or at.shape != which.shape or along.shape != which.shape:
-            raise ValueError("image points: point, line and pixel must be rows of one length")
-        spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (len(which), 2, 2)))
-        if not all(np.all(np.isfinite(v)) for v in (at, along, spread)):
-            raise ValueError("image points: a value is not finite; leave out what was not measured")
-        return cls(which, at, along, spread)
-
-    def taken(self, keep: ArrayLike) -> ImagePoints:
-        """Some of them, by mask or index."""
-        where = np.asarray(keep)
-        return ImagePoints(self.point[where], self.line[where], self.pixel[where], self.covariance[where])
-
-    def numbered(self, first: int) -> ImagePoints:
-        """The same, their ground points counted from ``first``."""
-        return replace(self, point=self.point - first)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,8 @@ from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages, Screening
-from twin.orbit.calibration.observations import ImagePoints
 from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.measured.pass_measurements import ImagePoints
 
 _ROUNDS = 3
 _SETTLED = 1.05

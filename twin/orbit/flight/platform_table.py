@@ -1,0 +1,263 @@
+"""An orbit and an attitude that are known as tables of readings, and what lies between the readings.
+
+This is what a satellite sends down, and what an analysis has: of a simulated pass as of a real one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, KroghInterpolator
+from scipy.spatial.transform import Rotation
+
+from twin.orbit.flight.light_effects import EARTH_RATE
+from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
+
+Array = NDArray[np.float64]
+Interpolation = Literal["spline", "lagrange"]
+
+_SPLINE_ERROR = 1e-3
+"""Metres: a cubic spline through the readings of a smooth orbit may be as wrong between them."""
+_FOURTH_DERIVATIVE = 1.1e-5
+"""m/s^4, of a coordinate of a low circular orbit: r n^4 at 300 km, with the Earth's turn."""
+_LAGRANGE_NODES = 10
+_GAP = 5.0
+"""Median intervals: readings that are farther apart leave a gap, in which nothing is known."""
+_UNIT_TOLERANCE = 1e-3
+"""Of the norm of a quaternion: four decimals are enough to have measured one, and not a rotation vector."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformTable:
+    """Readings of orbit and attitude of one pass.
+
+    Attributes:
+        epoch: UTC, ISO 8601 ending in Z; all times are SI seconds from it, leap seconds counted.
+        orbit_time: (N,) seconds, increasing.
+        position: (N, 3) of the body's origin in the ITRS, metres.
+        velocity: (N, 3) against the turning Earth in axes of the ITRS, m/s; None where it was not measured.
+        attitude_time: (M,) seconds, increasing.
+        quaternion: (M, 4) x, y, z, w (scalar last) of unit length, neighbours on one side; turns body axes into those
+            of the ITRS, v_itrs = R(q) v_body.
+    """
+
+    epoch: str
+    orbit_time: Array
+    position: Array
+    velocity: Array | None
+    attitude_time: Array
+    quaternion: Array
+
+    @classmethod
+    def of(
+        cls,
+        epoch: str,
+        orbit_time: ArrayLike,
+        position: ArrayLike,
+        velocity: ArrayLike | None,
+        attitude_time: ArrayLike,
+        quaternion: ArrayLike,
+    ) -> PlatformTable:
+        """The table, checked; quaternions are made unit and brought to one side.
+
+        Args:
+            epoch: UTC, ISO 8601.
+            orbit_time: (N,), seconds.
+            position: (N, 3), ITRS, metres.
+            velocity: (N, 3), of the Earth-fixed axes, m/s, or None.
+            attitude_time: (M,), seconds.
+            quaternion: (M, 4), x, y, z, w, body to ITRS, either sign.
+
+        Raises:
+            ValueError: shapes that do not match, values that are not finite, times that do not increase, fewer than two
+                readings, or four numbers that are no rotation.
+        """
+        times, looks = (np.array(v, np.float64) for v in (orbit_time, attitude_time))
+        place, turn = np.array(position, np.float64), np.array(quaternion, np.float64)
+        speed = None if velocity is None else np.array(velocity, np.float64)
+        rows = (("position", times, place, 3), ("velocity", times, speed, 3), ("quaternion", looks, turn, 4))
+        for what, time, values, width in rows:
+            if values is None:
+                continue
+            if time.ndim != 1 or len(time) < 2 or values.shape != (len(time), width):
+                raise ValueError(f"platform: {what} must be (n, {width}) for n >= 2 times, found {values.shape}")
+            if not (np.all(np.isfinite(time)) and np.all(np.isfinite(values))):
+                raise ValueError(f"platform: a {what} or its time is not finite")
+            if not np.all(np.diff(time) > 0.0):
+                raise ValueError(f"platform: times of {what} do not increase")
+        norm = np.linalg.norm(turn, axis=1)
+        if np.any(np.abs(norm - 1.0) > _UNIT_TOLERANCE):
+            raise ValueError("platform: a quaternion is not of unit length")
+        turn /= norm[:, None]
+        flip = np.cumprod(np.where(np.sum(turn[1:] * turn[:-1], axis=1) < 0.0, -1.0, 1.0))
+        turn[1:] *= flip[:, None]
+        return cls(epoch, times, place, speed, looks, turn)
+
+    @classmethod
+    def sampled(cls, trajectory: Trajectory, orbit_interval: float, attitude_interval: float) -> PlatformTable:
+        """Readings of a trajectory at whole multiples of the intervals, seconds, and at both ends of its span."""
+        fixes, looks = (_moments(trajectory, step) for step in (orbit_interval, attitude_interval))
+        turn = Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False)
+        place, speed = trajectory.position(fixes), trajectory.velocity(fixes)
+        return cls.of(str(trajectory.orbit.epoch), fixes, place, speed, looks, turn)
+
+
+def _moments(trajectory: Trajectory, step: float) -> Array:
+    """Times of readings inside a trajectory and its ends; a reading that all but coincides with an end gives way."""
+    first, last = trajectory.first, trajectory.last
+    every = readings(first, last, step)
+    inside = every[(every > first + 1e-3 * step) & (every < last - 1e-3 * step)]
+    return np.concatenate([[first], inside, [last]])
+
+
+@dataclass(frozen=True, eq=False)
+class TabulatedTrajectory:
+    """Position and attitude between the readings of a table, seconds from its epoch; times have shape (...).
+
+    Positions are joined by a cubic spline (not-a-knot) where that is good to 1 mm on a smooth orbit, which it is up to
+    14 s between readings, and by Lagrange's polynomial of ten readings around each time where they stand farther apart;
+    velocities likewise, or are the derivative of the positions. Components of quaternions are joined by a cubic
+    spline and made unit: good to 1e-9 rad for a satellite that turns by 0.1 deg between readings.
+
+    Every method raises ValueError for a time outside the readings or in a gap of them.
+
+    Attributes:
+        table: the readings.
+        law: orbital axes.
+    """
+
+    table: PlatformTable
+    law: Attitude = field(default_factory=Attitude)
+
+    @property
+    def first(self) -> float:
+        """Begin of the span that both orbit and attitude cover, seconds."""
+        return float(max(self.table.orbit_time[0], self.table.attitude_time[0]))
+
+    @property
+    def last(self) -> float:
+        """Its end, seconds."""
+        return float(min(self.table.orbit_time[-1], self.table.attitude_time[-1]))
+
+    @property
+    def orbit_interval(self) -> float:
+        """Median time between fixes, seconds."""
+        return float(np.median(np.diff(self.table.orbit_time)))
+
+    @property
+    def attitude_interval(self) -> float:
+        """Median time between readings of the attitude, seconds."""
+        return float(np.median(np.diff(self.table.attitude_time)))
+
+    @property
+    def interpolation(self) -> Interpolation:
+        """How positions are joined."""
+        widest = float(np.max(np.diff(self.table.orbit_time)[~self._gaps(self.table.orbit_time)], initial=0.0))
+        return "spline" if widest**4 * _FOURTH_DERIVATIVE / 384.0 <= _SPLINE_ERROR else "lagrange"
+
+    def known(self, seconds: ArrayLike) -> np.ndarray:
+        """Whether orbit and attitude are known at times (...), which is not before, after, or in a gap of readings."""
+        t = np.asarray(seconds, dtype=np.float64)
+        found = np.ones(t.shape, bool)
+        for time in (self.table.orbit_time, self.table.attitude_time):
+            after = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
+            # a reading at the end of a gap is known
+            in_gap = self._gaps(time)[after] & (t > time[after]) & (t < time[after + 1])
+            found &= (t >= time[0]) & (t <= time[-1]) & ~in_gap
+        return found
+
+    def position(self, seconds: Any) -> np.ndarray:
+        """Position in the ITRS, metres; (...) -> (..., 3)."""
+        return np.asarray(self._position(self._checked(seconds)))
+
+    def velocity(self, seconds: Any) -> np.ndarray:
+        """Velocity against the turning Earth in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        return np.asarray(self._velocity(self._checked(seconds)))
+
+    def inertial_velocity(self, seconds: Any) -> np.ndarray:
+        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3).
+
+        The Earth's axis is taken as Z: polar motion (1e-6 rad) changes it by 1 mm/s.
+        """
+        place = self.position(seconds)
+        carried = EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
+        return self.velocity(seconds) + carried
+
+    def body_to_itrs(self, seconds: Any) -> np.ndarray:
+        """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        t = self._checked(seconds)
+        turn = Rotation.from_quat(self._quaternion(np.ravel(t))).as_matrix()
+        return np.asarray(turn).reshape(*t.shape, 3, 3)
+
+    def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
+        """Axes of the orbital frame by the measured orbit as columns, (...) -> (..., 3, 3)."""
+        motion = self.position(seconds), self.velocity(seconds), self.inertial_velocity(seconds)
+        return self.law.orbital_to_itrs(*motion)
+
+    @cached_property
+    def _position(self) -> Any:
+        return self._joined(self.table.position)
+
+    @cached_property
+    def _velocity(self) -> Any:
+        if self.table.velocity is not None:
+            return self._joined(self.table.velocity)
+        found = self._position
+        return found.derivative() if isinstance(found, CubicSpline) else found.slope
+
+    @cached_property
+    def _quaternion(self) -> CubicSpline:
+        return CubicSpline(self.table.attitude_time, self.table.quaternion)
+
+    def _joined(self, values: Array) -> Any:
+        if self.interpolation == "spline":
+            return CubicSpline(self.table.orbit_time, values)
+        return _Lagrange(self.table.orbit_time, values)
+
+    def _checked(self, seconds: Any) -> np.ndarray:
+        t = np.asarray(seconds, dtype=np.float64)
+        good = self.known(t)
+        if not np.all(good):
+            wrong = float(np.ravel(t)[int(np.argmin(np.ravel(good)))])
+            where = f"which reach from {self.first:.9g} s to {self.last:.9g} s"
+            kind = "in a gap of" if self.first <= wrong <= self.last else "outside of"
+            raise ValueError(f"the time {wrong:.9g} s lies {kind} the readings of orbit and attitude, {where}")
+        return t
+
+    @staticmethod
+    def _gaps(time: Array) -> np.ndarray:
+        """(N - 1,) which intervals between readings are gaps."""
+        step = np.diff(time)
+        return np.asarray(step > _GAP * np.median(step))
+
+
+class _Lagrange:
+    """Values (N, K) at times (N,), joined by the polynomial through the readings around each time."""
+
+    def __init__(self, time: Array, values: Array) -> None:
+        self._time, self._values = time, values
+        self._count = min(_LAGRANGE_NODES, len(time))
+
+    def __call__(self, seconds: Any) -> np.ndarray:
+        return self._evaluated(seconds, 0)
+
+    def slope(self, seconds: Any) -> np.ndarray:
+        """Derivative, per second."""
+        return self._evaluated(seconds, 1)
+
+    def _evaluated(self, seconds: Any, order: int) -> np.ndarray:
+        t = np.ravel(np.asarray(seconds, dtype=np.float64))
+        at = np.searchsorted(self._time, t, side="right") - self._count // 2
+        at = np.clip(at, 0, len(self._time) - self._count)
+        found = np.empty((len(t), self._values.shape[1]))
+        for begin in np.unique(at):
+            part = slice(begin, begin + self._count)
+            middle = self._time[begin + self._count // 2]
+            joined = KroghInterpolator(self._time[part] - middle, self._values[part])
+            here = at == begin
+            found[here] = joined(t[here] - middle) if order == 0 else joined.derivative(t[here] - middle)
+        return found.reshape(*np.shape(seconds), self._values.shape[1])

@@ -1,0 +1,141 @@
+"""What was measured of a pass, in the project's own conventions: frames, signs and pixel coordinates.
+
+Whatever files it came from, and whether a satellite or the simulation made it, this is what an analysis takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.platform_table import PlatformTable
+
+Array = NDArray[np.float64]
+ROLES = ("control", "check", "tie")
+"""Of ground points: their coordinates are used; only test the result; are not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPoints:
+    """Points on the ground.
+
+    Attributes:
+        ids: (n,) names, each once.
+        itrs: (n, 3) metres; NaN where the role is tie and nothing is known.
+        covariance: (n, 3, 3) of the coordinates, ITRS axes, m^2; zero for exact ones, and for ties.
+        role: (n,) one of `ROLES`.
+    """
+
+    ids: NDArray[np.object_]
+    itrs: Array
+    covariance: Array
+    role: NDArray[np.object_]
+
+    @classmethod
+    def of(cls, ids: ArrayLike, itrs: ArrayLike, covariance: ArrayLike, role: ArrayLike) -> GroundPoints:
+        """The points, checked.
+
+        Args:
+            ids: (n,) names.
+            itrs: (n, 3), metres.
+            covariance: (n, 3, 3), or one (3, 3) for all, m^2.
+            role: (n,), or one for all.
+
+        Raises:
+            ValueError: shapes that do not match, a name twice, a role that is none, control or check points whose
+                coordinates are not finite, a covariance that is none.
+        """
+        names, places = np.array(ids, dtype=object), np.array(itrs, np.float64)
+        n = len(names)
+        if names.ndim != 1 or places.shape != (n, 3):
+            raise ValueError(f"ground points: {n} names and coordinates {places.shape}, not ({n}, 3)")
+        if len(set(names.tolist())) != n:
+            raise ValueError("ground points: a name stands twice")
+        spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (n, 3, 3)))
+        sorts = np.array(np.broadcast_to(np.asarray(role, dtype=object), (n,)))
+        if not set(sorts.tolist()) <= set(ROLES):
+            raise ValueError(f"ground points: roles are {', '.join(ROLES)}")
+        given = sorts != "tie"
+        if not (np.all(np.isfinite(places[given])) and np.all(np.isfinite(spread))):
+            raise ValueError("ground points: a coordinate or covariance is not finite")
+        scale = np.trace(spread, axis1=1, axis2=2)[:, None]
+        if np.any(np.linalg.eigvalsh(spread) < -1e-9 * scale) or not np.allclose(spread, spread.swapaxes(1, 2)):
+            raise ValueError("ground points: a covariance is not one")
+        return cls(names, places, spread, sorts)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def taken(self, keep: ArrayLike) -> GroundPoints:
+        """Some of them, by mask or index."""
+        where = np.asarray(keep)
+        return GroundPoints(self.ids[where], self.itrs[where], self.covariance[where], self.role[where])
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePoints:
+    """Image points of one line camera.
+
+    Attributes:
+        point: (n,) which ground point each of them shows.
+        line, pixel: (n,) image coordinates; the centre of the first line's first pixel is (0, 0).
+        covariance: (n, 2, 2) of line and pixel, pixels squared.
+    """
+
+    point: NDArray[np.intp]
+    line: Array
+    pixel: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, point: ArrayLike, line: ArrayLike, pixel: ArrayLike, covariance: ArrayLike) -> ImagePoints:
+        """The points, checked.
+
+        Args:
+            point: (n,) whole numbers.
+            line: (n,).
+            pixel: (n,).
+            covariance: (n, 2, 2), or one (2, 2) for all, pixels squared.
+
+        Raises:
+            ValueError: shapes that do not match, values that are not finite.
+        """
+        which, at, along = np.array(point, np.intp), np.array(line, np.float64), np.array(pixel, np.float64)
+        if which.ndim != 1 or at.shape != which.shape or along.shape != which.shape:
+            raise ValueError("image points: point, line and pixel must be rows of one length")
+        spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (len(which), 2, 2)))
+        if not all(np.all(np.isfinite(v)) for v in (at, along, spread)):
+            raise ValueError("image points: a value is not finite; leave out what was not measured")
+        return cls(which, at, along, spread)
+
+    def taken(self, keep: ArrayLike) -> ImagePoints:
+        """Some of them, by mask or index."""
+        where = np.asarray(keep)
+        return ImagePoints(self.point[where], self.line[where], self.pixel[where], self.covariance[where])
+
+    def numbered(self, first: int) -> ImagePoints:
+        """The same, their ground points counted from ``first``."""
+        return replace(self, point=self.point - first)
+
+
+@dataclass(frozen=True, eq=False)
+class PassMeasurements:
+    """One pass as it was measured.
+
+    Attributes:
+        name: of the pass, or of the field that it passes.
+        platform: readings of orbit and attitude.
+        line_times: line camera -> when its lines were exposed.
+        ground: control, check and tie points.
+        images: line camera -> image points; `point` counts the rows of `ground`.
+    """
+
+    name: str
+    platform: PlatformTable
+    line_times: Mapping[str, LineTimes]
+    ground: GroundPoints
+    images: Mapping[str, ImagePoints]
