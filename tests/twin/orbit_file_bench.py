@@ -1,0 +1,171 @@
+"""A pass in files of several formats, written here from the simulation's orbit, for the tests of their readers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scenes.specs.orbit_spec import OrbitSpec
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.trajectory import Attitude, Trajectory
+
+EPOCH = "2011-03-05T03:05:00Z"
+LEAP = 34.0
+"""TAI - UTC in 2011, seconds."""
+UTC_TO = {"UTC": 0.0, "GPS": LEAP - 19.0, "TAI": LEAP, "TT": LEAP + 32.184, "BDT": LEAP - 33.0}
+"""Scale -> what its clock shows more than a UTC clock on that day."""
+EARTH = Earth(-0.1523, (0.1 / 206264.8, 0.35 / 206264.8))
+
+
+@cache
+def trajectory() -> Trajectory:
+    spec = OrbitSpec.model_validate(
+        {
+            "epoch": EPOCH,
+            "before": "60 s",
+            "after": "60 s",
+            "passing": {"longitude": "116 deg", "latitude": "40 deg", "altitude": "500 km", "direction": "descending"},
+        }
+    )
+    return Trajectory(propagate(spec, EARTH), Attitude(yaw_steering=True, offset=(1e-4, -2e-4, 5e-5)))
+
+
+def calendar(seconds: float, scale: str = "UTC", digits: int = 6) -> str:
+    moment = datetime.fromisoformat(EPOCH[:-1]) + timedelta(seconds=round(float(seconds) + UTC_TO[scale], digits))
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Times and states of the pass in one frame."""
+
+    seconds: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+
+
+def sampled(frame: str = "ITRS", step: float = 1.0) -> Sampled:
+    path = trajectory()
+    t = np.arange(-60.0, 60.0 + 1e-9, step)
+    if frame == "GCRS":
+        return Sampled(t, *path.orbit.gcrs(t))
+    return Sampled(t, path.position(t), path.velocity(t))
+
+
+def quaternions(seconds: np.ndarray, frame: str = "ITRS", order: str = "xyzw", inverse: bool = False) -> np.ndarray:
+    path = trajectory()
+    matrix = path.body_to_itrs(seconds)
+    if frame == "GCRS":
+        matrix = np.swapaxes(path.orbit.rotation.matrix(seconds), -1, -2) @ matrix
+    q = Rotation.from_matrix(matrix).as_quat(canonical=True)
+    if inverse:
+        q[:, :3] *= -1.0
+    return q if order == "xyzw" else np.roll(q, 1, axis=1)
+
+
+def csv(path: Path, heads: Sequence[str], *columns: Sequence[object]) -> Path:
+    rows = [",".join(heads), *(",".join(map(str, row)) for row in zip(*columns, strict=True))]
+    path.write_text("\n".join(rows) + "\n", "utf-8")
+    return path
+
+
+def orbit_csv(path: Path, frame: str = "ITRS", scale: str = "UTC", step: float = 1.0) -> Path:
+    s = sampled(frame, step)
+    texts = [calendar(t, scale) for t in s.seconds]
+    heads = ("date_time", "x [m]", "y [m]", "z [m]", "vx [m/s]", "vy [m/s]", "vz [m/s]")
+    return csv(path, heads, texts, *(map(repr, c) for c in s.position.T.tolist()), *(map(repr, c) for c in s.velocity.T.tolist()))
+
+
+def attitude_csv(
+    path: Path, frame: str = "ITRS", scale: str = "UTC", order: str = "xyzw", inverse: bool = False, step: float = 0.25
+) -> Path:
+    t = np.arange(-60.0, 60.0 + 1e-9, step)
+    q = quaternions(t, frame, order, inverse)
+    return csv(path, ("date_time", "q1", "q2", "q3", "q4"), [calendar(s, scale) for s in t], *q.T.tolist())
+
+
+def oem(path: Path, frame: str = "GCRF", scale: str = "UTC", step: float = 1.0, satellite: str = "2010-040A") -> Path:
+    s = sampled("ITRS" if frame.startswith("ITRF") else "GCRS", step)
+    lines = [
+        "CCSDS_OEM_VERS = 2.0",
+        "CREATION_DATE = 2011-03-06T00:00:00",
+        "ORIGINATOR = HERE",
+        "META_START",
+        "OBJECT_NAME = PASS",
+        f"OBJECT_ID = {satellite}",
+        "CENTER_NAME = EARTH",
+        f"REF_FRAME = {frame}",
+        f"TIME_SYSTEM = {scale}",
+        f"START_TIME = {calendar(s.seconds[0], scale)}",
+        f"STOP_TIME = {calendar(s.seconds[-1], scale)}",
+        "META_STOP",
+        "COMMENT states",
+    ]
+    for t, r, v in zip(s.seconds, s.position / 1e3, s.velocity / 1e3, strict=True):
+        lines.append(f"{calendar(t, scale)} " + " ".join(repr(float(x)) for x in (*r, *v)))
+    path.write_text("\n".join(lines) + "\n", "utf-8")
+    return path
+
+
+def aem(path: Path, scale: str = "UTC", direction: str = "A2B", first: bool = False, step: float = 0.25) -> Path:
+    t = np.arange(-60.0, 60.0 + 1e-9, step)
+    inverse = direction == "B2A"
+    q = quaternions(t, "GCRS", "wxyz" if first else "xyzw", inverse)
+    lines = [
+        "CCSDS_AEM_VERS = 1.0",
+        "CREATION_DATE = 2011-03-06T00:00:00",
+        "ORIGINATOR = HERE",
+        "META_START",
+        "OBJECT_NAME = PASS",
+        "OBJECT_ID = 2010-040A",
+        "REF_FRAME_A = ICRF",
+        "REF_FRAME_B = SC_BODY_1",
+        f"ATTITUDE_DIR = {direction}",
+        f"TIME_SYSTEM = {scale}",
+        f"START_TIME = {calendar(t[0], scale)}",
+        f"STOP_TIME = {calendar(t[-1], scale)}",
+        "ATTITUDE_TYPE = QUATERNION",
+        f"QUATERNION_TYPE = {'FIRST' if first else 'LAST'}",
+        "META_STOP",
+        "DATA_START",
+        *(f"{calendar(s, scale)} " + " ".join(f"{float(x):.15f}" for x in row) for s, row in zip(t, q, strict=True)),
+        "DATA_STOP",
+    ]
+    path.write_text("\n".join(lines) + "\n", "utf-8")
+    return path
+
+
+def sp3(path: Path, scale: str = "GPS", step: float = 1.0, version: str = "d", speeds: bool = True) -> Path:
+    s = sampled("ITRS", step)
+    first = datetime.fromisoformat(calendar(s.seconds[0], scale))
+    mode = "V" if speeds else "P"
+    lines = [
+        f"#{version}{mode}{first:%Y} {first.month:2d} {first.day:2d} {first.hour:2d} {first.minute:2d} "
+        f"{first.second + first.microsecond * 1e-6:11.8f} {len(s.seconds):7d} ORBIT IGS20 HLM  IGS",
+        "## 1626 529500.00000000     1.00000000 55625 0.1284722222222",
+        "+    2   G01L51" + "  0" * 15,
+        "++         0  0" + "  0" * 15,
+        f"%c M  cc {scale:<3} ccc cccc cccc cccc cccc ccccc ccccc ccccc ccccc",
+        "%c cc cc ccc ccc cccc cccc cccc cccc ccccc ccccc ccccc ccccc",
+        "%f  1.2500000  1.025000000  0.00000000000  0.000000000000000",
+        "%i    0    0    0    0      0      0      0      0         0",
+        "/* a pass",
+    ]
+    for t, r, v in zip(s.seconds, s.position / 1e3, s.velocity * 10.0, strict=True):
+        now = datetime.fromisoformat(calendar(t, scale))
+        lines.append(
+            f"*  {now:%Y} {now.month:2d} {now.day:2d} {now.hour:2d} {now.minute:2d} {now.second + now.microsecond * 1e-6:11.8f}"
+        )
+        for name, scale_of in (("G01", 3.86), ("L51", 1.0)):
+            lines.append(f"P{name}" + "".join(f"{x * scale_of:14.6f}" for x in r) + f"{999999.999999:14.6f}")
+            if speeds:
+                lines.append(f"V{name}" + "".join(f"{x * scale_of:14.6f}" for x in v) + f"{999999.999999:14.6f}")
+    path.write_text("\n".join([*lines, "EOF"]) + "\n", "utf-8")
+    return path
