@@ -1,12 +1,14 @@
 """Files of other people's formats that tell of a pass in orbit, with what the files themselves do not say of their numbers."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit_scene import GroundError
 from scenes.specs.orbit_spec import EarthSpec
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Number, Reference, Spec, Text
 from scenes.yaml.units import ANGLE, LENGTH, TIME
@@ -19,6 +21,35 @@ Satellite = Annotated[str, Field(strict=True, min_length=1, max_length=100)]
 ClockOffset = Annotated[float, Quantity(TIME, largest="1000 s")]
 PointSigma = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="10 km")]
 AngleSigma = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="10 deg")]
+
+
+Toward = Literal["forward", "back", "right", "left", "up", "down"]
+_TOWARD: Mapping[str, tuple[int, int, int]] = FrozenMap(
+    {
+        "forward": (1, 0, 0),
+        "back": (-1, 0, 0),
+        "right": (0, 1, 0),
+        "left": (0, -1, 0),
+        "down": (0, 0, 1),
+        "up": (0, 0, -1),
+    }
+)
+
+
+def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], ...]:
+    """Rows: the file's body x, y and z in the project's body axes, so that v_file = matrix @ v_project."""
+    return tuple(_TOWARD[axis] for axis in axes)
+
+
+def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, Toward]:
+    (a, b, c), (d, e, f), (g, h, i) = body_axes_matrix(axes)
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
+        allowed = "three directions square to each other, z = x × y, as [forward, right, down]"
+        raise Problem("no right-handed axes", names_text(axes), allowed)
+    return axes
+
+
+BodyAxes = Annotated[tuple[Toward, Toward, Toward], AfterValidator(_right_handed)]
 
 
 def _reading(value: Any) -> str:
@@ -65,8 +96,9 @@ class AttitudeFileSpec(Spec):
         epoch: reading of that clock at 0 s, for tables with `time [s]`.
         leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; only asked for where there are some.
         offset: seconds to be added to the times.
-        order: of a quaternion's components, scalar last or first.
-        sense: what the quaternion's rotation takes components in the body to, or from.
+        scalar: where a quaternion's scalar part stands, the cosine of half the turn.
+        turns: what the quaternion does to the components of a vector, v' = q v q*.
+        body_axes: what x, y and z of the file's body point to in flight, as [forward, right, down].
         sequence: of roll about X, pitch about Y and yaw about Z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
         nadir, steering: of the orbital frame, as in `attitude` of a simulated pass.
     """
@@ -78,8 +110,9 @@ class AttitudeFileSpec(Spec):
     epoch: ClockReading | None = None
     leap_seconds: Literal["counted", "skipped"] | None = None
     offset: ClockOffset = 0.0
-    order: Literal["xyzw", "wxyz"] | None = None
-    sense: Literal["body_to_frame", "frame_to_body"] | None = None
+    scalar: Literal["last", "first"] | None = None
+    turns: Literal["body_to_frame", "frame_to_body"] | None = None
+    body_axes: BodyAxes
     sequence: Sequence | None = None
     nadir: Literal["geodetic", "geocentric"] | None = None
     steering: Literal["none", "yaw"] | None = None

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.files.clock import known_scale
-from twin.orbit.files.platform_readings import OrbitReadings, known_frame, require_orbit
-from twin.orbit.files.text_file import numbers, readings, require_rising, text_lines
+from twin.orbit.measured.clock import known_scale
+from twin.orbit.measured.platform_readings import OrbitReadings, known_frame, require_orbit
+from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
 
 WHAT = "an SP3-c or SP3-d file"
 

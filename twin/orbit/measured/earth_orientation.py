@@ -18,8 +18,8 @@ from scipy.interpolate import CubicSpline
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, TIME
-from twin.orbit.files.clock import FIRST_DAY, LAST_DAY, calendar, calendar_reading, tai_minus_utc
-from twin.orbit.files.text_file import first_lines, numbers, text_lines
+from twin.orbit.measured.clock import FIRST_DAY, LAST_DAY, calendar, calendar_reading, tai_minus_utc
+from twin.orbit.measured.text_file import first_lines, numbers, text_lines
 from twin.orbit.flight.earth import DAY, tai_of
 
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"

@@ -2,7 +2,7 @@
 
 An attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by a about e that takes frame A to frame B.
 So from A to the body the axes of the body are those of A turned by q, and components in the body become those in A by
-R(q): the sense body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the other sense. Version 1 says by
+R(q): it turns body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the other way. Version 1 says by
 QUATERNION_TYPE where the scalar stands; version 2 has it last.
 """
 
@@ -16,17 +16,17 @@ from xml.etree import ElementTree
 import numpy as np
 
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.files.clock import known_scale
-from twin.orbit.files.platform_readings import (
+from twin.orbit.measured.clock import known_scale
+from twin.orbit.measured.platform_readings import (
     AttitudeReadings,
-    Order,
     OrbitReadings,
-    Sense,
+    Scalar,
+    Turns,
     known_frame,
     require_orbit,
     require_unit,
 )
-from twin.orbit.files.text_file import numbers, readings, require_rising, text_lines
+from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
 
@@ -96,20 +96,20 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     if direction.upper() not in ("A2B", "B2A"):
         raise InputError(Issue("no such direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
     to_body = (direction.upper() == "A2B") == (body[0] == "REF_FRAME_B")
-    sense: Sense = "body_to_frame" if to_body else "frame_to_body"
+    turns: Turns = "body_to_frame" if to_body else "frame_to_body"
     first, type_line = _same(file, segments, "QUATERNION_TYPE", "LAST")
     if first.upper() not in ("FIRST", "LAST"):
         raise InputError(Issue("no such type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
-    order: Order = "wxyz" if first.upper() == "FIRST" else "xyzw"
+    scalar: Scalar = "first" if first.upper() == "FIRST" else "last"
     rows, lines = _joined(segments)
     cells = [row[1:5] if len(row) >= 5 else row[1:] for row in rows]
-    heads = ("QC", "Q1", "Q2", "Q3") if order == "wxyz" else ("Q1", "Q2", "Q3", "QC")
+    heads = ("QC", "Q1", "Q2", "Q3") if scalar == "first" else ("Q1", "Q2", "Q3", "QC")
     quaternion = numbers(file, cells, lines, heads)
     require_unit(file, quaternion, lines)
     clock = readings(file, [row[0] for row in rows], lines)
     require_rising(file, clock, lines)
     frame = known_frame(reference, file, at, "REF_FRAME_A")
-    return AttitudeReadings(file, clock, quaternion, None, frame, _scale(file, segments), order, sense)
+    return AttitudeReadings(file, clock, quaternion, None, frame, _scale(file, segments), scalar, turns)
 
 
 def _segments(path: str | Path, kind: str) -> list[_Segment]:

@@ -14,21 +14,22 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scenes.specs.orbit_files import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
+from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
-from twin.orbit.files.ccsds import message_kind, read_aem, read_oem
-from twin.orbit.files.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
-from twin.orbit.files.earth_orientation import (
+from twin.orbit.measured.ccsds import message_kind, read_aem, read_oem
+from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
+from twin.orbit.measured.earth_orientation import (
     EarthOrientation,
     TableRotation,
     constant_orientation,
     rate_of,
     read_earth_orientation,
 )
-from twin.orbit.files.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
-from twin.orbit.files.sp3 import is_sp3, read_sp3
-from twin.orbit.files.text_file import first_lines, require_rising
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.sp3 import is_sp3, read_sp3
+from twin.orbit.measured.text_file import first_lines, require_rising
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude
 
@@ -56,8 +57,9 @@ class Conventions:
         orbit_frame, attitude_frame: axes.
         orbit_scale, attitude_scale: time scales.
         orbit_offset, attitude_offset: seconds to be added to the times.
-        order: of a quaternion's components.
-        sense: of a quaternion.
+        scalar: where a quaternion's scalar part stands.
+        turns: what a quaternion turns into what.
+        body_axes: of the attitude's body.
         sequence: of angles.
         law: of the orbital frame.
     """
@@ -68,8 +70,9 @@ class Conventions:
     attitude_scale: str
     orbit_offset: float = 0.0
     attitude_offset: float = 0.0
-    order: str = "xyzw"
-    sense: str = "body_to_frame"
+    scalar: str = "last"
+    turns: str = "body_to_frame"
+    body_axes: tuple[str, str, str] = ("forward", "right", "down")
     sequence: str = "xyz"
     law: Attitude = Attitude()
 
@@ -113,8 +116,9 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         _stated(spec_of, "time_scale", spec_of.time_scale, attitude.scale, "the time scale of the attitude"),
         spec.orbit.offset,
         spec_of.offset,
-        _stated(spec_of, "order", spec_of.order, attitude.order, "the order of the components") if turned else "xyzw",
-        _stated(spec_of, "sense", spec_of.sense, attitude.sense, "the sense of the quaternion") if turned else "body_to_frame",
+        _stated(spec_of, "scalar", spec_of.scalar, attitude.scalar, "where the scalar stands") if turned else "last",
+        _stated(spec_of, "turns", spec_of.turns, attitude.turns, "what is turned") if turned else "body_to_frame",
+        spec_of.body_axes,
         "xyz" if turned else _stated(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
@@ -193,12 +197,15 @@ def _to_itrs(frame: str, rotation: TableRotation) -> Any:
 def _body(attitude: AttitudeReadings, meant: Conventions) -> np.ndarray:
     """Rotation (M, 3, 3) from the body to the attitude's frame."""
     if attitude.quaternion is not None:
-        q = attitude.quaternion if meant.order == "xyzw" else np.roll(attitude.quaternion, -1, axis=1)
+        q = attitude.quaternion if meant.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
         matrix = np.asarray(Rotation.from_quat(q).as_matrix())
-        return matrix if meant.sense == "body_to_frame" else np.swapaxes(matrix, 1, 2)
-    assert attitude.angles is not None
-    order = ["xyz".index(axis) for axis in meant.sequence]
-    return np.asarray(Rotation.from_euler(meant.sequence.upper(), attitude.angles[:, order]).as_matrix())
+        if meant.turns == "frame_to_body":
+            matrix = np.swapaxes(matrix, 1, 2)
+    else:
+        assert attitude.angles is not None
+        order = ["xyz".index(axis) for axis in meant.sequence]
+        matrix = np.asarray(Rotation.from_euler(meant.sequence.upper(), attitude.angles[:, order]).as_matrix())
+    return matrix @ np.array(body_axes_matrix(meant.body_axes), dtype=np.float64)
 
 
 def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants:
@@ -264,7 +271,7 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
     if sets[0] == _ANGLES:
         return AttitudeReadings(str(path), clock, None, values, None, scale)
     require_unit(str(path), values, lines)
-    return AttitudeReadings(str(path), clock, values, None, None, scale, "xyzw" if sets[0] == _NAMED else None)
+    return AttitudeReadings(str(path), clock, values, None, None, scale, "last" if sets[0] == _NAMED else None)
 
 
 def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:

@@ -10,12 +10,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from scenes.yaml.errors import InputError, Issue, names_text, shown
-from twin.orbit.files.clock import Readings
+from twin.orbit.measured.clock import Readings
 
 Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 AttitudeFrame = Literal["ITRS", "GCRS", "EME2000", "TEME", "orbital"]
-Order = Literal["xyzw", "wxyz"]
-Sense = Literal["body_to_frame", "frame_to_body"]
+Scalar = Literal["last", "first"]
+Turns = Literal["body_to_frame", "frame_to_body"]
 FRAMES: tuple[str, ...] = get_args(Frame)
 
 
@@ -51,9 +51,8 @@ class AttitudeReadings:
         angles: (M, 3) roll, pitch, yaw, radians; None for quaternions.
         frame: that the body is turned against; None where the file does not say.
         scale: of the clock; None where the file does not say.
-        order: of the components; None where the file does not say.
-        sense: whether the quaternion turns components in the body into those in the frame; None where the file does not
-            say.
+        scalar: where the scalar part stands; None where the file does not say.
+        turns: what the quaternion turns into what; None where the file does not say.
     """
 
     file: str
@@ -62,8 +61,8 @@ class AttitudeReadings:
     angles: np.ndarray | None = None
     frame: str | None = None
     scale: str | None = None
-    order: Order | None = None
-    sense: Sense | None = None
+    scalar: Scalar | None = None
+    turns: Turns | None = None
 
 
 def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, Problem, shown
-from twin.orbit.files.clock import Readings
+from twin.orbit.measured.clock import Readings
 
 
 def text_lines(path: str | Path, what: str) -> list[str]:
