@@ -1,16 +1,17 @@
 """Files of other people's formats that tell of a pass in orbit, with what the files themselves do not say of their numbers."""
 
+import os
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_scene import GroundError
 from scenes.specs.orbit_spec import EarthSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Number, Reference, Spec, Text
+from scenes.yaml.spec import Reference, Spec, Text
 from scenes.yaml.units import ANGLE, LENGTH, TIME
 
 TimeScale = Literal["UTC", "GPS", "TAI", "TT", "GAL", "QZS", "BDT"]
@@ -194,12 +195,26 @@ class RasterFileSpec(Spec):
         return self
 
 
-def _some(value: dict[str, Any]) -> dict[str, Any]:
-    if not value:
-        raise Problem("no lines", "an empty mapping", "one line of the camera or more")
-    return value
+FILE_KEYS = ("file", "geoid", "earth_orientation")
+"""Keys that name files of measurements."""
+SpecType = TypeVar("SpecType", bound=Spec)
 
 
-Lines = AfterValidator(_some)
-PixelOrigin = Annotated[Number, Field(ge=-10.0, le=10.0)]
-HeightSigma = GroundError
+def with_absolute_files(spec: SpecType, folder: Path | None = None) -> SpecType:
+    """The same with the paths of all its files of measurements absolute.
+
+    Args:
+        spec: as it was read.
+        folder: that relative paths start from; None for that of the file it was read from.
+    """
+    place = Path(spec.source.file).parent if folder is None else folder
+    changes: dict[str, Any] = {}
+    for name in type(spec).model_fields:
+        value = getattr(spec, name)
+        if isinstance(value, Spec):
+            changes[name] = with_absolute_files(value, place)
+        elif isinstance(value, Mapping) and any(isinstance(one, Spec) for one in value.values()):
+            changes[name] = FrozenMap({k: with_absolute_files(one, place) for k, one in value.items()})
+        elif name in FILE_KEYS and isinstance(value, str):
+            changes[name] = os.path.abspath(place / value)
+    return spec.model_copy(update=changes)

@@ -23,6 +23,8 @@ from scenes.specs.load import (
 )
 from scenes.specs.orbit_angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+from scenes.specs.orbit_check import OrbitCheckSpec
+from scenes.specs.orbit_files import with_absolute_files
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
@@ -372,3 +374,32 @@ def _require_pixel(test: Spec, key: KeyPath, pixel: float, pixels: int, line: st
     if not -0.5 <= pixel <= last:
         allowed = f"-0.5 to {last:g}, the ends of {line}"
         raise test.error("outside the line", key, found=f"pixel {pixel:g}", allowed=allowed)
+
+
+class CheckSetup(ExperimentSetup[OrbitCheckSpec]):
+    """A check of a pass in files with its camera.
+
+    Attributes:
+        camera: the payload.
+    """
+
+    camera: ThreeLineCameraSpec
+
+    def with_seed(self, seed: int) -> "CheckSetup":
+        """The same: nothing is drawn."""
+        return self
+
+
+def resolve_check(path: str | Path) -> CheckSetup:
+    """Read a check and the camera it refers to; a run's config.yaml can be given in its place. Paths of the files of
+    the pass are made absolute, so that the config.yaml is good anywhere.
+
+    Raises:
+        InputError: a file cannot be read or is not valid.
+    """
+    setup = read_setup(CheckSetup, path)
+    if setup is not None:
+        return setup
+    test = load_orbit_test(OrbitCheckSpec, path)
+    camera = load_three_line_camera(find_payload(test))
+    return CheckSetup.model_construct(test=with_absolute_files(test), camera=camera)

@@ -169,3 +169,87 @@ def sp3(path: Path, scale: str = "GPS", step: float = 1.0, version: str = "d", s
                 lines.append(f"V{name}" + "".join(f"{x * scale_of:14.6f}" for x in v) + f"{999999.999999:14.6f}")
     path.write_text("\n".join([*lines, "EOF"]) + "\n", "utf-8")
     return path
+
+
+AXES = ["forward", "right", "down"]
+LINE_TIME = 0.7e-3
+LINES = 9000
+FIRST = -3.0
+"""Of every line's image: its first line's time, seconds, and so many lines."""
+
+
+def interior_and_bias() -> tuple[np.ndarray, float]:
+    """What the camera and platform really are wrong by: a rotation vector, and pixels along each line."""
+    return np.array([-25.0, 32.0, 40.0]) / 206264.8, 12.0
+
+
+def measured_points(seed: int, count: int, wrong: float = 0.0) -> tuple[list[list[object]], list[list[object]]]:
+    """Rows of ground points and image points of th1's lines, with noise of 0.2 px and 1 m, camera and platform wrong."""
+    from optics.geometry.pose import rotation_matrix
+    from scenes.specs.load import load_three_line_camera
+    from twin.orbit.flight.line_camera import line_cameras
+    from twin.orbit.flight.sensor import Sensor
+
+    class Biased:
+        def __init__(self) -> None:
+            self.path = trajectory()
+            self.position, self.inertial_velocity = self.path.position, self.path.inertial_velocity
+
+        def body_to_itrs(self, seconds):
+            return self.path.body_to_itrs(seconds) @ rotation_matrix(interior_and_bias()[0])
+
+    rng = np.random.default_rng(seed)
+    cameras = line_cameras(load_three_line_camera("th1"))
+    ground, images = [], []
+    for name, start in (("forward", FIRST), ("nadir", FIRST), ("aft", FIRST)):
+        camera = cameras[name]
+        sensor = Sensor(camera, Biased(), EARTH, LINE_TIME, start, LINES)
+        line, pixel = rng.uniform(50, LINES - 50, count), rng.uniform(50, camera.pixels - 50, count)
+        height = rng.uniform(100.0, 900.0, count)
+        itrs = sensor.ground(line, pixel, height)
+        lon, lat, h = EARTH.geodetic(itrs + rng.normal(0.0, 1.0, itrs.shape))
+        line = line + rng.normal(0.0, 0.2, count)
+        pixel = pixel + rng.normal(0.0, 0.2, count) + interior_and_bias()[1] * 0.1
+        gross = rng.uniform(size=count) < wrong
+        line[gross] += rng.uniform(10.0, 40.0, int(gross.sum()))
+        for k in range(count):
+            key = f"{name}{k}"
+            ground.append([key, repr(float(np.degrees(lat[k]))), repr(float(np.degrees(lon[k]))), repr(float(h[k]))])
+            images.append([key, name, float(line[k]), float(pixel[k]), 0.2, 0.2])
+    return ground, images
+
+
+def check_files(folder: Path, count: int = 20, seed: int = 1, wrong: float = 0.0, **platform: object) -> dict[str, object]:
+    """Files of the pass as a check reads them, and its specification as it stands in YAML."""
+    orbit_csv(folder / "orbit.csv")
+    attitude_csv(folder / "attitude.csv")
+    ground, images = measured_points(seed, count, wrong)
+    csv(folder / "ground.csv", ("point", "latitude [deg]", "longitude [deg]", "height [m]"), *zip(*ground, strict=True))
+    heads = ("point", "camera", "line", "pixel", "sigma_line", "sigma_pixel")
+    csv(folder / "image_points.csv", heads, *zip(*images, strict=True))
+    times = [(name, k, calendar(FIRST + k * LINE_TIME, digits=9)) for name in ("forward", "nadir", "aft") for k in (0, LINES - 1)]
+    csv(folder / "lines.csv", ("camera", "line", "date_time"), *zip(*times, strict=True))
+    return {
+        "name": "pass",
+        "camera": "th1",
+        "platform": {
+            "orbit": {"file": "orbit.csv", "frame": "ITRS", "time_scale": "UTC"},
+            "attitude": {
+                "file": "attitude.csv",
+                "frame": "ITRS",
+                "time_scale": "UTC",
+                "scalar": "last",
+                "turns": "body_to_frame",
+                "body_axes": AXES,
+            },
+            "earth": {"ut1_utc": f"{EARTH.dut1} s"},
+        },
+        "lines": {"file": "lines.csv", "time_scale": "UTC", "moment": "middle"},
+        "ground": {"file": "ground.csv", "crs": "EPSG:4979", "sigma": ["1 m", "1 m"]},
+        "image_points": {
+            "file": "image_points.csv",
+            "centre": "integer",
+            "first_pixel": 0,
+            "first_pixel_sees": "right",
+        },
+    }

@@ -91,7 +91,7 @@ class Readings:
                 raise Problem("not a date and time", shown(text), _FORM, within=(k,)) from None
         return cls(day, second)
 
-    def taken(self, keep: np.ndarray) -> Readings:
+    def taken(self, keep: np.ndarray | slice) -> Readings:
         """Some of them, by mask, slice or index (K,)."""
         return Readings(self.day[keep], self.second[keep])
 
