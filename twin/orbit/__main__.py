@@ -9,7 +9,7 @@ if __name__ == "__main__":
 
 import typer
 
-from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_check, resolve_monitor, resolve_simulate
 from twin.orbit.orbit_tests import ORBIT_TESTS
 from twin.run.command import add_test
 
@@ -62,6 +62,24 @@ add_test(
     plan and height of every field before calibration and by each scheme.
 
     Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
+    """,
+)
+
+add_test(
+    app,
+    PROGRAM,
+    "check",
+    resolve_check,
+    ORBIT_TESTS["check"],
+    """Conventions of a pass in files: every reading of what is mistaken for one another (order and sense of the
+    quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two at
+    once, is tried on the ground points and ranked.
+
+    check.json holds the readings with residuals and likelihoods, what the points tell of each convention and what they
+    cannot, and where the first points would fall under each reading. Exit codes: 0 the stated reading stands, 3 another
+    one does, 4 none explains the points.
+
+    Example: `python -m twin.orbit check check.yaml`
     """,
 )
 

@@ -22,6 +22,13 @@ def _calibrate() -> Test[Any]:
     return CALIBRATION, calibration_report
 
 
+def _check() -> Test[Any]:
+    from twin.orbit.conventions.check_numbers import CHECK
+    from twin.orbit.conventions.check_report import check_report
+
+    return CHECK, check_report
+
+
 def _monitor() -> Test[Any]:
     from twin.orbit.monitoring.monitoring_numbers import MONITOR
     from twin.orbit.monitoring.monitoring_report import monitor_report
@@ -39,6 +46,7 @@ def _simulate() -> Test[Any]:
 ORBIT_TESTS: dict[str, Callable[[], Test[Any]]] = {
     "angle": _angle,
     "calibrate": _calibrate,
+    "check": _check,
     "monitor": _monitor,
     "simulate": _simulate,
 }

@@ -98,6 +98,7 @@ class Check:
         factor: chi-square of the best reading over its freedom, at least 1: by how much the sigmas' squares are too
             small.
         answers: question -> its values.
+        first_points: line -> rows of the ground points whose places are listed.
         places: changes of one question -> where the first points of each line fall, ITRS, metres, or why nowhere.
         count: how many readings were tried.
         wrong: points that were left out as gross errors, by line.
@@ -111,6 +112,7 @@ class Check:
     verdict: Verdict
     factor: float
     answers: dict[str, tuple[Answer, ...]]
+    first_points: dict[str, np.ndarray]
     places: dict[Changes, dict[str, np.ndarray] | str]
     count: int
     wrong: dict[str, int]
@@ -150,7 +152,8 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     places = {one: _first_places(bench, stated, one, setup.test.shown) for one in _shown(others, best)}
     tried.sort(key=lambda one: (one.cost, len(one.changes)))
     advance("readings", 3, 3)
-    return Check(setup, readings, stated, tuple(tried), best, verdict, factor, answers, places, count, wrong)
+    first = {name: raw.point[: setup.test.shown] for name, raw in bench.readings.images.items()}
+    return Check(setup, readings, stated, tuple(tried), best, verdict, factor, answers, first, places, count, wrong)
 
 
 def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:

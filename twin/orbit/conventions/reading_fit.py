@@ -220,7 +220,14 @@ class PassBench:
         rise: float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Places (n, 3) at the heights of the ground points, ITRS, metres, and the line time at each, seconds."""
-        times, line_time = line_times(self.readings.lines[name], meant, self.epoch, _line(meant, raw, self.readings.lines[name]))
+        clock = self.readings.lines[name]
+        number = _line(meant, raw, clock)
+        beyond = (number < clock.line[0] - 1.0) | (number > clock.line[-1] + 1.0)
+        if np.any(beyond):
+            worst = float(number[int(np.argmax(beyond))])
+            told = f"{clock.line[0]:.10g} to {clock.line[-1]:.10g}"
+            raise ImpossibleError(f"line {worst:.10g} of {name} has no time in the table, which tells those of {told}")
+        times, line_time = line_times(clock, meant, self.epoch, number)
         path, camera = platform.path, self.cameras[name]
         pixel = _pixel(meant, raw, camera.pixels) + step
         outside = (pixel < -0.5) | (pixel > camera.pixels - 0.5)
