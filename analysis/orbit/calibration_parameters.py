@@ -130,7 +130,7 @@ class CalibrationField:
         name: str,
         rays: Mapping[str, Rays],
         ground: ArrayLike,
-        sigma: float | tuple[float, float],
+        sigma: float | tuple[float, float] | Array,
         control: ArrayLike | None = None,
     ) -> CalibrationField:
         """The field, checked.
@@ -139,7 +139,8 @@ class CalibrationField:
             name: of the field.
             rays: line -> its image points.
             ground: of the points, ITRS, (P, 3), metres.
-            sigma: of control points, one for all axes or (each axis in plan, height), metres, 0 for exact.
+            sigma: of control points, one for all axes or (each axis in plan, height), metres, 0 for exact; or their
+                covariance, (P, 3, 3), m^2, zero for exact ones.
             control: which points are control, (P,); all by default.
 
         Raises:
@@ -149,9 +150,7 @@ class CalibrationField:
         points = np.array(ground, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
             raise CalibrationError(f"field {name!r}: ground must be (m, 3) and finite, found {points.shape}")
-        plan, tall = sigma if isinstance(sigma, tuple) else (sigma, sigma)
-        if not (np.isfinite([plan, tall]).all() and min(plan, tall) >= 0 and (plan > 0) == (tall > 0)):
-            raise CalibrationError(f"field {name!r}: sigma must be finite, and positive or zero for all axes")
+        spread = _control_covariance(name, points, sigma)
         is_control = np.ones(len(points), bool) if control is None else np.array(control, bool)
         if is_control.shape != (len(points),):
             raise CalibrationError(f"field {name!r}: control must be ({len(points)},), found {is_control.shape}")
@@ -172,8 +171,6 @@ class CalibrationField:
             raise CalibrationError(
                 f"field {name!r}: tie point {lonely[0]} is seen by {counts[lonely[0]]} lines, not two"
             )
-        up = vertical(points)
-        spread = plan**2 * np.eye(3) + (tall**2 - plan**2) * up[:, :, None] * up[:, None, :]
         return cls(name, dict(rays), points, spread, is_control)
 
     @property
@@ -181,6 +178,32 @@ class CalibrationField:
         """(3, 3) mean body axes (along, across, down) as columns, ITRS: the rotation nearest to the mean attitude."""
         u, _, vt = np.linalg.svd(np.concatenate([r.attitude for r in self.rays.values()]).mean(axis=0))
         return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
+
+
+def _control_covariance(name: str, points: Array, sigma: float | tuple[float, float] | Array) -> Array:
+    """(m, 3, 3) of control points, m^2."""
+    if isinstance(sigma, np.ndarray):
+        exact = ~np.any(sigma, axis=(1, 2)) if sigma.shape == (len(points), 3, 3) else np.zeros(0, bool)
+        if len(exact) != len(points) or not np.all(np.linalg.eigvalsh(sigma)[~exact] > 0.0):
+            raise CalibrationError(f"field {name!r}: covariances must be ({len(points)}, 3, 3) and positive or zero")
+        return sigma
+    plan, tall = sigma if isinstance(sigma, tuple) else (sigma, sigma)
+    if not (np.isfinite([plan, tall]).all() and min(plan, tall) >= 0 and (plan > 0) == (tall > 0)):
+        raise CalibrationError(f"field {name!r}: sigma must be finite, and positive or zero for all axes")
+    return level_covariance(points, plan, tall)
+
+
+def level_covariance(points: Array, plan: ArrayLike, tall: ArrayLike) -> Array:
+    """(m, 3, 3) covariance in ITRS axes, m^2, of points known alike in both axes in plan.
+
+    Args:
+        points: ITRS, (m, 3), metres.
+        plan: standard deviation of each axis in plan, metres, or (m,).
+        tall: of the height, likewise.
+    """
+    up = vertical(points)
+    flat, high = (np.asarray(v, np.float64)[..., None, None] ** 2 for v in (plan, tall))
+    return np.asarray(flat * np.eye(3) + (high - flat) * up[:, :, None] * up[:, None, :])
 
 
 def _rough_height(points: Array) -> Array:

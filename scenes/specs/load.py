@@ -18,6 +18,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_check import OrbitCheckSpec
+from scenes.specs.orbit_measured import MeasuredTestSpec
 from scenes.specs.orbit_scene import LineImageSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
@@ -205,7 +206,9 @@ def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | N
     return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
 
 
-def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | OrbitCheckSpec) -> Path:
+def find_payload(
+    test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | MeasuredTestSpec | OrbitCheckSpec,
+) -> Path:
     """The file of the payload of a test in orbit. Raises InputError if there is none."""
     return _find(PAYLOADS, test.camera, test, ("camera",))
 

@@ -1,5 +1,6 @@
 """In-orbit calibration of a three-line camera over test fields, with cameras that may drift, as its file gives it."""
 
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
@@ -248,6 +249,20 @@ def _some_fields(fields: Named[FieldSpec]) -> Named[FieldSpec]:
     return fields
 
 
+def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, object]) -> None:
+    """Raises Problem unless there are schemes, and each names some of the fields once."""
+    if not schemes:
+        raise Problem("no schemes", "an empty list", "at least one list of fields", within=("schemes",))
+    for scheme in schemes:
+        for name in scheme:
+            if name not in fields:
+                hint = nearest(name, fields)
+                raise Problem("no such field", name, names_text(tuple(fields)), hint, within=("schemes",))
+        if not scheme or len(set(scheme)) != len(scheme):
+            found = names_text(scheme) or "none"
+            raise Problem("a scheme without fields, or with one twice", found, "each once", within=("schemes",))
+
+
 class OrbitCalibrationSpec(Spec):
     """A calibration over several fields, tested on all of them without ground control.
 
@@ -331,14 +346,5 @@ class OrbitCalibrationSpec(Spec):
 
     @model_validator(mode="after")
     def _schemes_name_fields(self) -> "OrbitCalibrationSpec":
-        if not self.schemes:
-            raise Problem("no schemes", "an empty list", "at least one list of fields", within=("schemes",))
-        for scheme in self.schemes:
-            for name in scheme:
-                if name not in self.fields:
-                    hint = nearest(name, self.fields)
-                    raise Problem("no such field", name, names_text(tuple(self.fields)), hint, within=("schemes",))
-            if not scheme or len(set(scheme)) != len(scheme):
-                found = names_text(scheme) or "none"
-                raise Problem("a scheme without fields, or with one twice", found, "each once", within=("schemes",))
+        checked_schemes(self.schemes, self.fields)
         return self

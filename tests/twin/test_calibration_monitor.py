@@ -26,8 +26,9 @@ from twin.orbit.calibration.camera_drift import (
     with_monitor,
     without_monitor,
 )
-from twin.orbit.calibration.campaign import fly_fields, line_model
+from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.campaign_adjustment import simultaneous
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.flight.payload_changes import drifted_payload
 

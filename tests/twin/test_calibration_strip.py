@@ -17,7 +17,7 @@ from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import invoke, refused
 from tests.twin.strip_prediction import predicted
-from twin.orbit.calibration.campaign import fly_fields
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import averaged
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.calibration.strip import adjusted_strip, calibrated_with_ties, field_with_ties

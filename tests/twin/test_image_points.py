@@ -17,9 +17,10 @@ from scenes.specs.orbit_scene import ImagePointsSpec
 from scenes.specs.orbit_setup import resolve_calibration, resolve_simulate
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
-from twin.orbit.calibration.campaign import Campaign, fly_fields
+from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points

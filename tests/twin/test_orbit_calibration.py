@@ -22,8 +22,8 @@ from scenes.specs.orbit_spec import ThermalDriftSpec
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.calibration.calibration_numbers import calibration_numbers
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
-from twin.orbit.calibration.campaign import fly_fields
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import INNER, surprises
 from twin.orbit.calibration.latitude import fitted, latitude_fits, rate_priors
 from twin.orbit.calibration.observations import PassData, image_sigma, light_shift

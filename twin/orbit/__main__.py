@@ -7,13 +7,30 @@ if __name__ == "__main__":
 
     end_quietly()
 
+from collections.abc import Mapping
+from typing import Any
+
 import typer
 
-from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_check, resolve_monitor, resolve_simulate
+from scenes.specs.orbit_setup import (
+    resolve_angle,
+    resolve_any_calibration,
+    resolve_check,
+    resolve_monitor,
+    resolve_simulate,
+)
 from twin.orbit.orbit_tests import ORBIT_TESTS
 from twin.run.command import add_test
 
 PROGRAM = "twin.orbit"
+
+
+def calibration_export(run: Any) -> Mapping[str, str]:
+    """What a calibration measured, as files."""
+    from twin.orbit.calibration.calibration_export import exported
+
+    return exported(run)
+
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
@@ -53,16 +70,20 @@ add_test(
     app,
     PROGRAM,
     "calibrate",
-    resolve_calibration,
+    resolve_any_calibration,
     ORBIT_TESTS["calibrate"],
     """Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
-    parameters tested on all fields without ground control (paper 003).
+    parameters tested on all fields without ground control (paper 003); simulated, or on measured passes.
+
+    A file with `data: DIR` runs on the measurements of that folder: orbit, attitude, line times, ground and image
+    points. `--export DIR` writes such a folder of what the run measured, with a test file calibrate.yaml.
 
     calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
     plan and height of every field before calibration and by each scheme.
 
     Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
     """,
+    calibration_export,
 )
 
 add_test(

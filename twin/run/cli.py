@@ -43,6 +43,8 @@ Seed = Annotated[
 BackendName = Annotated[str, typer.Option("--backend", help=BACKEND_HELP)]
 Force = Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else.")]
+EXPORT_HELP = "Also write what was measured as a folder of tables that the same command reads, with a test file."
+Export = Annotated[Path | None, typer.Option("--export", readable=False, metavar="DIR", help=EXPORT_HELP)]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 
 
@@ -57,6 +59,7 @@ class Options:
         force: replace the run folder.
         as_json: print the numbers as JSON.
         quiet: print nothing.
+        export: folder for what was measured, None for none.
     """
 
     out: Path | None
@@ -65,6 +68,7 @@ class Options:
     force: bool
     as_json: bool
     quiet: bool
+    export: Path | None = None
 
 
 class InputErrorText(Exception):

@@ -19,6 +19,7 @@ from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_js
 from twin.run.cli import (
     AsJson,
     BackendName,
+    Export,
     File,
     Force,
     Heartbeat,
@@ -38,7 +39,7 @@ from twin.run.cli import (
 )
 from twin.run.procedure import Advance, Procedure, Run
 from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, chosen
+from twin.run.run_folder import RunFolder, chosen, write_manifest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
@@ -160,6 +161,7 @@ def add_test(
     resolve: Callable[[Path], Any],
     load: Callable[[], Test[Run]],
     about: str,
+    export: Callable[[Run], Mapping[str, str]] | None = None,
 ) -> None:
     """Add a test to a program as a subcommand with the options that all tests have.
 
@@ -170,7 +172,25 @@ def add_test(
         resolve: reads the test's file, as its procedure does.
         load: imports the test and its report.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+        export: run -> path and text of files with what was measured; the command then has an option ``--export``.
     """
+    if export is not None:
+
+        @app.command(command, help=about)
+        def exporting_test(
+            file: File,
+            out: Out = None,
+            seed: Seed = None,
+            export_to: Export = None,
+            backend: BackendName = "llvm",
+            force: Force = False,
+            as_json: AsJson = False,
+            quiet: Quiet = False,
+        ) -> None:
+            options = Options(out, seed, backend, force, as_json, quiet, export_to)
+            run_test(program, command, file, resolve, load, options, export)
+
+        return
 
     @app.command(command, help=about)
     def test(
@@ -192,6 +212,7 @@ def run_test(
     resolve: Callable[[Path], Any],
     load: Callable[[], Test[Run]],
     options: Options,
+    export: Callable[[Run], Mapping[str, str]] | None = None,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
@@ -202,6 +223,7 @@ def run_test(
         resolve: reads it, as the test's procedure does; ``test`` of the set-up has a ``seed``.
         load: imports the test and its report.
         options: what the user chose.
+        export: run -> path and text of files with what was measured, where the test has any.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -211,13 +233,21 @@ def run_test(
         from twin.run.page import RunFacts, write_test
         from twin.run.report import with_warnings
 
+        # a folder that cannot be made is told before the run
+        folder = None if options.export is None else RunFolder(options.export, options.force)
         procedure, report = load()
         number = setup.test.seed if options.seed is None else options.seed
         run, given = procedure.performed(setup, session.backend, number, session.advance)
+        if folder is not None and export is not None:
+            with folder:
+                for name, text in export(run).items():
+                    folder.write_text(name, text)
+                facts = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
+                write_manifest(folder, program, session.started, session.seconds, **facts)
         shown = with_warnings(report(run), given)
         numbers = {**procedure.numbers(run), "verdict": shown.verdict}
         config, name = setup.with_seed(number).to_yaml(), session.backend.name
-        drawn = number if procedure.seeded else None
+        drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
         facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
         write_test(procedure.kind, numbers, shown, facts, session.folder)
         return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console), code=shown.code)

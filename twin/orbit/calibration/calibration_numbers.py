@@ -14,10 +14,11 @@ from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, run_calibration
-from twin.orbit.calibration.campaign import FieldPass
+from twin.orbit.calibration.campaign import FieldPass, Rejected, interior_names
 from twin.orbit.calibration.image_numbers import ImageNumbers
-from twin.orbit.calibration.influences import INNER, DatumRow, LightRow, Surprise
+from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise
 from twin.orbit.calibration.latitude import LatitudeFit
+from twin.orbit.calibration.measured_quality import Meeting, ground_sample, meeting_of
 from twin.orbit.calibration.repeatability import Repeatability, repeatability
 from twin.orbit.calibration.scheme_numbers import (
     CampaignNumbers,
@@ -48,7 +49,7 @@ class ParameterNumbers:
     sigma: float
     sigma_with_gauge: float
     held: bool
-    truth: float
+    truth: float | None
     unit: str
 
     @classmethod
@@ -57,9 +58,10 @@ class ParameterNumbers:
         found = run.together
         sigma, held = found.sigma, found.gauge.held
         whole = found.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
+        truth = [None] * len(found.names) if run.truth is None else run.truth.tolist()
         return {
-            name: cls(float(value), sigma[name], whole[name], name in held, float(true), unit(name))
-            for name, value, true in zip(found.names, found.values, run.truth, strict=True)
+            name: cls(float(value), sigma[name], whole[name], name in held, true, unit(name))
+            for name, value, true in zip(found.names, found.values, truth, strict=True)
         }
 
 
@@ -143,7 +145,7 @@ class BiasNumbers:
 
     value: float
     sigma: float
-    truth: float
+    truth: float | None
     unit: str
 
 
@@ -172,13 +174,17 @@ class FieldNumbers:
         """Of one field."""
         alone = result.adjustment
         sigma = alone.sigma
+        interior = interior_names(tuple(alone.cameras))
+        truth = [None] * len(BIAS) if one.known_truth is None else one.bias.tolist()
         return cls(
             latitude_rad=one.latitude,
             bias={
-                name: BiasNumbers(float(v), sigma[f"{one.name} {name}"], float(t), "rad")
-                for name, v, t in zip(BIAS, alone.bias(one.name), one.bias, strict=True)
+                name: BiasNumbers(float(v), sigma[f"{one.name} {name}"], t, "rad")
+                for name, v, t in zip(BIAS, alone.bias(one.name), truth, strict=True)
             },
-            interior={name: InteriorNumbers(alone.value(name), sigma[name], "m") for name in INNER},
+            interior={
+                name: InteriorNumbers(alone.value(name), sigma[name], "m") for name in alone.names if name in interior
+            },
             p_value=alone.p_value,
             orbit_third_difference_rms_m=result.orbit.rms,
             attitude_third_difference_rms_rad=result.attitude.rms,
@@ -308,6 +314,43 @@ class SurpriseNumbers:
 
 
 @dataclass(frozen=True)
+class MeasuredNumbers:
+    """A measured pass: its points, what screening left out, ground sample distance.
+
+    sigma_factor: on the sigmas of image points, by the residuals. check_chi_square: of the check points' rays by the
+    pass's own parameters, with check_degrees_of_freedom.
+    """
+
+    control_points: int
+    tie_points: int
+    check_points: int
+    image_points: Mapping[str, int]
+    gsd_m: Mapping[str, Sequence[float]]
+    rejected: Sequence[Sequence[str]]
+    rejected_check_points: Sequence[str]
+    sigma_factor: float | None
+    check_chi_square: float
+    check_degrees_of_freedom: int
+
+    @classmethod
+    def of(cls, one: FieldPass, rejected: Rejected | None, meeting: Meeting) -> Self:
+        """Of one pass."""
+        ties = len(next(iter(one.tie_images.values())).point) if one.tie_images else 0
+        return cls(
+            control_points=int(one.is_control.sum()),
+            tie_points=int((~one.is_control).sum()) + ties,
+            check_points=len(one.check_ground),
+            image_points={name: len(row.point) for name, row in one.measurements.images.items()},
+            gsd_m={name: ground_sample(one, name) for name in one.data.sensors},
+            rejected=[] if rejected is None else rejected.points,
+            rejected_check_points=[] if rejected is None else rejected.check_points,
+            sigma_factor=None if rejected is None else rejected.factor,
+            check_chi_square=meeting.chi_square,
+            check_degrees_of_freedom=meeting.degrees_of_freedom,
+        )
+
+
+@dataclass(frozen=True)
 class CalibrationNumbers:
     """calibration.json."""
 
@@ -319,6 +362,7 @@ class CalibrationNumbers:
     weak_vectors: Sequence[CombinationNumbers]
     gauge: str
     images: ImageNumbers | None
+    measured: Mapping[str, MeasuredNumbers] | None
     fit: FitNumbers
     stepwise: StepwiseNumbers
     fields: Mapping[str, FieldNumbers]
@@ -351,6 +395,14 @@ class CalibrationNumbers:
             weak_vectors=CombinationNumbers.of(found.weak),
             gauge=str(found.gauge),
             images=None if campaign.images is None else ImageNumbers.of(campaign.images),
+            measured=None
+            if run.truth is not None
+            else {
+                p.name: MeasuredNumbers.of(
+                    p, campaign.rejected.get(p.name), meeting_of(campaign, p, run.fields[p.name].adjustment)
+                )
+                for p in campaign.passes
+            },
             fit=FitNumbers(found.chi_square, found.degrees_of_freedom, found.p_value, found.iterations),
             stepwise=StepwiseNumbers(spec.schemes[0][0], way.rounds, way.rate, way.converged),
             fields={p.name: FieldNumbers.of(p, run.fields[p.name]) for p in campaign.passes},

@@ -8,11 +8,9 @@ from matplotlib.figure import Figure
 
 from analysis.orbit.three_line_model import BIAS, misclosure
 from analysis.units import ARCSEC
-from scenes.specs.orbit_angle import LINES
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors
-from twin.orbit.calibration.campaign import true_bias
-from twin.orbit.calibration.influences import INNER
+from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.schemes import RMS, values_of
 from twin.run.svg import (
     BLUE,
@@ -42,7 +40,7 @@ def expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) 
 
     All fields adjusted at once, each with one drift; the outer lines' d_alpha and the mean of it taken out.
     """
-    spec = run.campaign.spec
+    spec = run.campaign.simulated
     square = sum(one.angles[0] ** 2 for name, one in spec.drift.items() if name != "nadir")
     metres = found.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
     return np.asarray(np.hypot(found.at(0.0).without.together.height, factor * metres))
@@ -135,18 +133,20 @@ def schemes_figure(run: CalibrationRun) -> Figure:
 def latitude_figure(run: CalibrationRun) -> Figure:
     """Bias of every field with sigma, truth, and the fit."""
     figure = new_figure(3.9)
-    spec, passes = run.campaign.spec, run.campaign.passes
+    campaign, passes = run.campaign, run.campaign.passes
     latitude = np.array([p.latitude for p in passes])
     reach = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
-    truth = true_bias(spec, reach)
     for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
         value = np.array([run.together.value(f"{p.name} {axis}") for p in passes]) / ARCSEC
         sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / ARCSEC
-        true = np.array([p.bias[k] for p in passes]) / ARCSEC
-        axes.plot(np.degrees(reach), truth[:, k] / ARCSEC, color=GREY, lw=1.0, ls="--", label="truth, no season")
+        if campaign.known_truth is not None:
+            truth = true_bias(campaign.simulated, reach)
+            axes.plot(np.degrees(reach), truth[:, k] / ARCSEC, color=GREY, lw=1.0, ls="--", label="truth, no season")
         for fit in run.latitude[k : k + 1]:
             axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=VERMILION, lw=1.3, label="fit")
-        axes.plot(np.degrees(latitude), true, "x", color=INK, ms=6, label="truth of the field", zorder=4)
+        if campaign.known_truth is not None:
+            true = np.array([p.bias[k] for p in passes]) / ARCSEC
+            axes.plot(np.degrees(latitude), true, "x", color=INK, ms=6, label="truth of the field", zorder=4)
         axes.errorbar(
             np.degrees(latitude), value, sigma, fmt="o", color=BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
         )
@@ -170,7 +170,7 @@ def correlation_figure(run: CalibrationRun) -> Figure:
     axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
     axes.set_yticks(np.arange(len(names)), names, fontsize=size)
     # lines between the interior and the fields
-    groups = ["interior" if name in INNER else name.split()[0] for name in names]
+    groups = ["interior" if name in run.campaign.inner else name.split()[0] for name in names]
     for k in range(1, len(groups)):
         if groups[k] != groups[k - 1]:
             axes.axhline(k - 0.5, color=INK, lw=0.6)
@@ -180,13 +180,14 @@ def correlation_figure(run: CalibrationRun) -> Figure:
 
 
 def residual_figure(run: CalibrationRun) -> Figure:
-    """Residuals of one field's control points in the images of the three lines, in pixels."""
+    """Residuals of one field's control points in the images of the lines, in pixels."""
     one = run.campaign.passes[0]
     found = run.together
     offset = [found.value(n) if n in found.names else 0.0 for n in _offsets(one.name)]
     figure = new_figure(3.9)
-    panels = figure.subplots(1, 3, sharex=True)
-    for axes, line in zip(panels, LINES, strict=True):
+    shown = tuple(one.control.rays)
+    panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
+    for axes, line in zip(panels, shown, strict=True):
         rays, pitch = one.control.rays[line], one.data.pitch[line]
         left = misclosure(
             found.cameras[line],

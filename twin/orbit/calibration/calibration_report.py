@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from analysis.units import ARCSEC
+from scenes.specs.measured_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.calibration_sections import monitor_gain, scheme_names, scheme_summary, sections, strip_gain
 from twin.orbit.calibration.influences import SURPRISE
+from twin.orbit.calibration.measured_sections import measured_facts, measured_warnings
 from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.scheme_numbers import meets, schemes_within
 from twin.orbit.calibration.schemes import values_of
@@ -44,7 +46,7 @@ def calibration_report(run: CalibrationRun) -> Report:
         "Calibration in orbit over test fields",
         verdict,
         lead,
-        _facts(setup),
+        measured_facts(setup, run) if isinstance(setup, MeasuredCalibrationSetup) else _facts(setup),
         _summary(run),
         sections(run),
         warnings=_warnings(run),
@@ -113,10 +115,11 @@ def _light(setup: CalibrationSetup) -> str:
 
 def _warnings(run: CalibrationRun) -> tuple[str, ...]:
     found, spec, assumptions = run.together, run.campaign.spec, []
+    drifts = run.truth is not None and bool(run.campaign.simulated.drift)
     if spec.errors.switched_on and found.p_value < 1e-3:
         assumptions.append(
             f"the adjustment does not fit: a chi-square as large has a chance of {found.p_value:.1g}; biases may "
-            f"drift during a pass{', and the cameras drift from field to field' * bool(spec.drift)}"
+            f"drift during a pass{', and the cameras drift from field to field' * drifts}"
         )
     if run.surprises:
         first = run.surprises[0]
@@ -134,4 +137,6 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
         assumptions.append(
             "light time, aberration and refraction are left in the image points and go into the parameters"
         )
+    if run.truth is None:
+        assumptions += measured_warnings(run)
     return tuple(assumptions)

@@ -19,20 +19,25 @@ from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
+from scenes.specs.measured_setup import MeasuredCalibrationSetup
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
-from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
+from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise, datum_rows, light_rows, surprises
 from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
 from twin.orbit.calibration.schemes import Repeats, SchemeMeans, repeated, schemes_tested, tested_before
 from twin.orbit.calibration.screening import screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
+from twin.orbit.measured.measurement_tables import read_measurements
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit_setup import AnyCalibration
 
+_EVEN = 1e-3
+"""Of their interval, by which times of readings may be uneven."""
 STEPWISE_TOLERANCE = 1e-3
 """Of the sigmas; the last step of a round of the stepwise solution."""
 
@@ -62,7 +67,7 @@ class CalibrationRun:
         campaign: truth and measurements.
         together: simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it,
             the drift of the biases during the passes.
-        truth: (P,) true values of its unknowns.
+        truth: (P,) true values of its unknowns; None where nobody knows them.
         fields: name -> that field by itself.
         stepwise: the first scheme's first field by the stepwise solution, bias and interior in turn.
         before: field -> errors with the laboratory's camera.
@@ -77,11 +82,11 @@ class CalibrationRun:
         strips: passes adjusted on tie points; None for none.
     """
 
-    setup: CalibrationSetup
+    setup: AnyCalibration
     seed: int
     campaign: Campaign
     together: Adjustment
-    truth: np.ndarray
+    truth: np.ndarray | None
     fields: Mapping[str, FieldResult]
     stepwise: Stepwise
     before: Mapping[str, CheckErrors]
@@ -98,9 +103,9 @@ class CalibrationRun:
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
 def run_calibration(
-    setup: CalibrationSetup, backend: Backend | None, seed: int, advance: Advance = silent
+    setup: AnyCalibration, backend: Backend | None, seed: int, advance: Advance = silent
 ) -> CalibrationRun:
-    """Fly, calibrate, test: ``python -m twin.orbit calibrate``; nothing is traced, so that the backend is not used.
+    """Fly or read, calibrate, test: ``python -m twin.orbit calibrate``. Nothing is traced: the backend is not used.
 
     Raises:
         BenchError: the orbit, the points or the adjustment do not allow it.
@@ -114,13 +119,10 @@ def run_calibration(
         raise BenchError(str(error), ("errors",), "errors that an adjustment can take, and more points") from error
 
 
-def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun:
-    parts = 6 + len(setup.test.fields)
-    advance("calibration", 0, parts)
+def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     shown, others = np.random.SeedSequence(seed).spawn(2)
-    campaign = fly_fields(setup, shown, advance)
-    if campaign.images is not None:
-        campaign = screened(campaign)
+    campaign = source_of(setup, shown, advance)
+    parts = 6 + len(campaign.passes)
     advance("calibration", 1, parts)
     latitude = latitude_fits(campaign, simultaneous(campaign))
     rates = rate_priors(campaign, latitude)
@@ -128,11 +130,13 @@ def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun
     advance("calibration", 2, parts)
     fields = {}
     for k, one in enumerate(campaign.passes):
-        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *_third_differences(campaign, one))
+        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *_third_differences(one))
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
-    in_turn = stepwise([control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=STEPWISE_TOLERANCE)
+    in_turn = stepwise(
+        [control], campaign.laboratory, campaign.noise, held=gauge_of(campaign).held, tolerance=STEPWISE_TOLERANCE
+    )
     alone = {name: result.adjustment for name, result in fields.items()}
     schemes = schemes_tested(campaign, alone)
     advance("calibration", parts - 3, parts)
@@ -145,7 +149,7 @@ def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun
         seed,
         campaign,
         together,
-        true_values(campaign, together.names),
+        None if campaign.known_truth is None else true_values(campaign, together.names),
         FrozenMap(fields),
         in_turn,
         tested_before(campaign),
@@ -155,10 +159,31 @@ def _run(setup: CalibrationSetup, seed: int, advance: Advance) -> CalibrationRun
         light,
         datum,
         surprises(campaign, together),
-        repeated(setup, others, advance),
-        monitored(setup, shown, advance),
+        None if isinstance(setup, MeasuredCalibrationSetup) else repeated(setup, others, advance),
+        None if isinstance(setup, MeasuredCalibrationSetup) else monitored(setup, shown, advance),
         strips_adjusted(campaign, advance),
     )
+
+
+def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
+    """The campaign of a test: read from its files where it names measurements, else flown; and screened where points
+    were measured in images.
+
+    Args:
+        setup: the test.
+        seed: of a simulation.
+        advance: how far it is.
+
+    Raises:
+        InputError: files that cannot be used.
+        BenchError, CalibrationError: as `fly_fields`.
+    """
+    if isinstance(setup, MeasuredCalibrationSetup):
+        measured = read_measurements(setup.data, setup.camera, advance)
+        campaign = campaign_of(setup.test, setup.camera, measured, setup.test.ties == "apart")
+        return screened(campaign) if setup.test.screening == "robust" else campaign
+    campaign = fly_fields(setup, seed, advance)
+    return screened(campaign) if campaign.images is not None else campaign
 
 
 def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
@@ -173,15 +198,14 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
     for one in campaign.passes:
         known |= {f"{one.name} {name}": v for name, v in zip(BIAS, one.bias, strict=True)}
         known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.offset, strict=True)}
-    rates = [(one.bias_at(1.0) - one.bias_at(-1.0)) / 2.0 for one in campaign.passes]
+    rates = [(one.truth.bias_at(1.0) - one.truth.bias_at(-1.0)) / 2.0 for one in campaign.passes]
     known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
     return np.array([known[name] for name in names])
 
 
-def _third_differences(campaign: Campaign, one: FieldPass) -> tuple[ThirdDifference, ThirdDifference]:
-    errors, measured = campaign.spec.errors, one.measured
-    fixes = _readings(measured.first, measured.last, errors.gps.interval)
-    looks = _readings(measured.first, measured.last, errors.star_tracker.interval)
+def _third_differences(one: FieldPass) -> tuple[ThirdDifference, ThirdDifference]:
+    measured = one.measured
+    fixes, looks = (_even(t) for t in (measured.table.orbit_time, measured.table.attitude_time))
     turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
     # small angles: the skew part of the rotation
     skew = 0.5 * (turned - np.swapaxes(turned, 1, 2))
@@ -189,6 +213,10 @@ def _third_differences(campaign: Campaign, one: FieldPass) -> tuple[ThirdDiffere
     return third_difference(fixes, measured.position(fixes)), third_difference(looks, angles)
 
 
-def _readings(first: float, last: float, interval: float) -> np.ndarray:
-    """Times of the readings inside the span, seconds; five at least, or the analysis says so."""
-    return interval * np.arange(np.ceil(first / interval), np.floor(last / interval) + 1.0)
+def _even(time: np.ndarray) -> np.ndarray:
+    """The longest run of readings that are evenly spaced; five at least, or the analysis says so."""
+    step = np.diff(time)
+    even = np.abs(step - np.median(step)) < _EVEN * np.median(step)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], even, [False]]).astype(int)))
+    begin, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0])
+    return np.asarray(time[begin : end + 1])

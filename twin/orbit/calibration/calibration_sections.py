@@ -9,7 +9,6 @@ import numpy as np
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.units import ARCSEC
-from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg
@@ -22,7 +21,7 @@ from twin.orbit.calibration.field_sections import (
     images_section,
     light_section,
 )
-from twin.orbit.calibration.influences import INNER
+from twin.orbit.calibration.measured_sections import measured_section
 from twin.orbit.calibration.scheme_numbers import meets, schemes_within
 from twin.orbit.calibration.schemes import RMS, Repeats, SchemeMeans, values_of
 from twin.orbit.calibration.strip import Strips
@@ -46,7 +45,7 @@ def monitor_gain(found: Monitoring) -> str:
 
 def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     """Errors by size of the drift and by scheme."""
-    spec = run.campaign.spec
+    spec = run.campaign.simulated
     drifts = "; ".join(
         f"{name} {_angles(one.angles)}, Δf {format_quantity(one.focal_length, LENGTH)}"
         for name, one in spec.drift.items()
@@ -212,6 +211,8 @@ def sections(run: CalibrationRun) -> tuple[Section, ...]:
     found = [_schemes(run)]
     if run.repeats is not None:
         found.append(_repeats(run, run.repeats))
+    if run.truth is None:
+        found.append(measured_section(run))
     if run.campaign.images is not None:
         found.append(images_section(run.campaign))
     if run.monitoring is not None:
@@ -248,10 +249,11 @@ def _schemes(run: CalibrationRun) -> Section:
             )
         )
     text = (
-        "Every field is calibrated by itself (three attitude biases and nine elements of the interior orientation), "
-        f"and each scheme uses the mean of the parameters of its fields: {'; '.join(scheme_names(run))}. Check points "
-        "are intersected from all three lines with these parameters and the measured orbit and attitude, without "
-        "ground control.",
+        f"Every field is calibrated by itself (three attitude biases and {len(run.campaign.inner)} elements of the "
+        f"interior orientation, of which two are held), and each scheme uses the mean of the parameters of its "
+        f"fields: {'; '.join(scheme_names(run))}. Check points "
+        "are intersected from all lines that see them with these parameters and the measured orbit and attitude, "
+        "without ground control.",
         scheme_summary(run.scheme_means),
         "What averaging changes are the biases of attitude, which differ from field to field and move all three lines "
         "alike: they act in plan. Heights depend on the difference between the outer lines, which the interior "
@@ -332,23 +334,28 @@ def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
 def _parameters(run: CalibrationRun) -> Section:
     found, laboratory = run.together, run.campaign.laboratory
     sigma = found.sigma
-    start = dict(zip(INNER, np.ravel([laboratory[line].interior for line in LINES]), strict=True))
-    truth = dict(zip(found.names, run.truth, strict=True))
+    inner = run.campaign.inner
+    start = dict(zip(inner, np.ravel([laboratory[line].interior for line in run.campaign.lines]), strict=True))
+    truth = None if run.truth is None else dict(zip(found.names, run.truth.tolist(), strict=True))
     rows: list[tuple[Cell, ...]] = []
-    for name in INNER:
-        change, true = (1e6 * (v - start[name]) for v in (found.value(name), truth[name]))
+    for name in inner:
         held = sigma[name] == 0.0
-        z = None if held else float((found.value(name) - truth[name]) / sigma[name])
-        rows.append((name, float(change), None if held else 1e6 * sigma[name], float(true), z))
+        cells: tuple[Cell, ...] = ()
+        if truth is not None:
+            z = None if held else float((found.value(name) - truth[name]) / sigma[name])
+            cells = (1e6 * (truth[name] - start[name]), z)
+        rows.append((name, 1e6 * (found.value(name) - start[name]), None if held else 1e6 * sigma[name], *cells))
     others: list[tuple[Cell, ...]] = []
-    for name in (n for n in found.names if n not in INNER):
+    for name in (n for n in found.names if n not in inner):
         scale, shown = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}[unit(name)]
-        value, true, s = found.value(name) / scale, truth[name] / scale, sigma[name] / scale
-        others.append((name, shown, float(value), float(s), float(true), float((value - true) / s)))
+        value, s = found.value(name) / scale, sigma[name] / scale
+        cells = () if truth is None else (truth[name] / scale, (value - truth[name] / scale) / s)
+        others.append((name, shown, float(value), float(s), *cells))
     text = [
-        "All fields at once, one interior orientation for all: changes from the laboratory's values. z is the error in "
-        "sigmas of this adjustment.",
+        "All fields at once, one interior orientation for all: changes from the laboratory's values."
+        + " z is the error in sigmas of this adjustment." * (truth is not None),
     ]
+    known = 0 if truth is None else 2
     if any(name in RATE for name in found.names):
         text.append(
             "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
@@ -366,17 +373,17 @@ def _parameters(run: CalibrationRun) -> Section:
             "interior",
             "Interior orientation",
             "Micrometres, changes from the laboratory. Without sigma: held (gauge).",
-            ("element", "change", "σ", "true change", "z"),
+            ("element", "change", "σ", *("true change", "z")[:known]),
             rows,
-            (None, 2, 2, 2, 2),
+            (None, *(2,) * (2 + known)),
         ),
         Table(
             "biases",
             "Biases of the attitude and offsets of the orbit",
             f"From measured to true; offsets {', '.join(OFFSET)} in metres with the orbit's sigma as prior.",
-            ("unknown", "unit", "value", "σ", "truth", "z"),
+            ("unknown", "unit", "value", "σ", *("truth", "z")[:known]),
             others,
-            (None, None, 3, 3, 3, 2),
+            (None, None, 3, 3, *(3, 2)[:known]),
         ),
     )
     one = run.campaign.passes[0].name

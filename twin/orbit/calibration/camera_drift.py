@@ -19,8 +19,9 @@ from analysis.orbit.forward_intersection import CheckErrors, check_errors, inter
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit_angle import LINES
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields, reading_sigma
-from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone, simultaneous
+from twin.orbit.calibration.campaign import Campaign, FieldPass
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
+from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
 from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import averaged, schemes_tested, tested
 from twin.run.procedure import Advance
@@ -183,7 +184,7 @@ def adjust_field_with_readings(campaign: Campaign, one: FieldPass) -> Adjustment
         campaign.noise,
         unknowns=Unknowns(drift="field"),
         priors=_reading_priors(campaign, one),
-        gauge=GAUGE,
+        gauge=gauge_of(campaign),
     )
 
 
@@ -200,7 +201,7 @@ def height_per_arcsec(campaign: Campaign) -> float:
 
 
 def _reading_priors(campaign: Campaign, one: FieldPass) -> list[Prior]:
-    sigma = reading_sigma(campaign.spec)
+    sigma = reading_sigma(campaign.simulated)
     return [p for line in LINES for p in monitor_priors(one.name, line, one.readings[line], sigma)]
 
 

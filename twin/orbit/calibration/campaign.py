@@ -1,98 +1,65 @@
-"""Passes over test fields, with a three-line camera that has changed since the laboratory and may drift.
+"""Passes over fields of points as an analysis has them, whoever flew them: a satellite, or the simulation.
 
-Ground points come from the nadir line's image and terrain of given relief; every line sees them through the rigorous
-sensor of `twin.orbit.flight.sensor`, from the true orbit and attitude, with light time, aberration and refraction. The
-analysis gets image points, control coordinates and the measured orbit and attitude, and takes the effects on the light
-out of the image points by the laboratory's camera (`twin.orbit.calibration.observations`).
+Each pass is what was measured (`twin.orbit.measured.pass_measurements`): readings of orbit and attitude, line times,
+ground and image points. The camera is that of the laboratory, and the effects on the light are taken out of the image
+points by it (`twin.orbit.calibration.observations`). The truth is there where a simulation knows it, for comparisons
+alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.calibration_parameters import CalibrationField, Noise
-from analysis.orbit.three_line_model import LineModel, Rays
+from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise
+from analysis.orbit.forward_intersection import intersect
+from analysis.orbit.three_line_model import INTERIOR, LineModel, Rays
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_spec import OrbitSpec, PassingSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
-from twin.orbit.calibration.field_images import FieldImages, Imager
-from twin.orbit.calibration.observations import FieldPoints, PassData, image_sigma, light_effects
+from twin.orbit.calibration.observations import PassData, image_sigma, light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import LineCamera, line_cameras
-from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.payload_changes import changed_payload, drifted_payload
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
-from twin.orbit.measured.pass_measurements import ImagePoints
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
+from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
+from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+    from scenes.specs.orbit_measured import MeasuredCalibrationSpec, ReadingErrorsSpec
+    from scenes.specs.orbit_spec import ErrorsSpec
+    from twin.orbit.calibration.field_images import FieldImages
 
 
-_DRIFT, _READING = 6, 7
-"""Streams of a field's seed. What else is drawn of a field does not change with them."""
+@dataclass(frozen=True, eq=False)
+class PassTruth:
+    """What a simulation knows of a pass.
 
-
-def sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
-    """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
-
-    The draws of a line are the same whatever their sigmas are.
-
-    Args:
-        spec: the test.
-        seed: of the field.
+    Attributes:
+        bias: (3,) true roll, pitch, yaw at the field's middle, radians: from measured to true attitude.
+        offset: (3,) true minus measured station at the field's middle, along X, Y, Z of the orbital frame, metres.
+        trajectory: the true one.
+        errors: of the readings.
+        drift: line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, radians and metres; empty for no drift.
     """
-    if not spec.drift:
-        return FrozenMap({})
-    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
-    sigma = {name: np.array([*one.angles, one.focal_length]) for name, one in spec.drift.items()}
-    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
+    bias: np.ndarray
+    offset: np.ndarray
+    trajectory: Trajectory
+    errors: MeasurementErrors
+    drift: Mapping[str, np.ndarray] = FrozenMap({})
 
-def sample_readings(
-    spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
-) -> FrozenMap[str, np.ndarray]:
-    """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
-
-    Args:
-        spec: the test.
-        drift: the true one.
-        seed: of the field.
-    """
-    if spec.monitor is None:
-        return FrozenMap({})
-    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(LINES), 4))
-    sigma = reading_sigma(spec) * spec.errors.switched_on
-    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(LINES, noise, strict=True)})
-
-
-def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
-    """(4,) standard deviation of the monitor's readings of a camera, radians and metres. The test has a monitor."""
-    assert spec.monitor is not None
-    return np.array([*spec.monitor.angles, spec.monitor.focal_length])
-
-
-_LEAST_IMAGE = 0.02
-"""Pixels. Image points without errors are given this sigma, for an adjustment needs weights."""
-_SPARE = 1.25
-"""Candidates for each ground point; those that a line does not see are left out."""
-_PICTURES = 5
-"""Stream of a field's seed for its images; the others are of what is drawn without them."""
-_TIES = 8
-"""Stream of a field's seed for the tie points of its strip; `twin.orbit.calibration.campaign` has two before."""
-_MARGIN = 6.0
-"""Sigmas. No point is taken so near to the end of an image that its measured place could lie outside."""
+    def bias_at(self, time: float) -> np.ndarray:
+        """(3,) true roll, pitch, yaw at a time, seconds from the field's middle, radians, without slow errors."""
+        latitude = self.trajectory.orbit.earth.geodetic(self.trajectory.position(time))[1]
+        turn = self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal
+        return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,52 +67,90 @@ class FieldPass:
     """One pass over one field.
 
     Attributes:
-        name: of the field.
-        latitude: of its middle, radians.
-        data: what is known of the pass.
-        control_images: line -> measured image points of the control points.
-        control_ground: (n, 3) their given coordinates, ITRS, metres.
-        check_images: line -> measured image points of the check points.
+        measurements: as they came.
+        data: what is known of the pass beside its points.
+        latitude: mean of the control points, radians.
+        control_images: line -> image points of control points, and of tie points that calibrate with them.
+        control_ground: (n, 3) their given coordinates, of ties those of a first intersection, ITRS, metres.
+        control_covariance: (n, 3, 3) of given coordinates, m^2.
+        is_control: (n,) which of them are control.
+        control_ids: (n,) names.
+        check_images: line -> image points of the check points.
+        check_ground: (m, 3) given coordinates of the check points, ITRS, metres.
+        check_ids: (m,) names.
+        tie_images: line -> image points of tie points that are kept apart for the strip; empty for none.
         control: what the calibration gets.
         check: line -> rays of the check points.
-        check_ground: (m, 3) true coordinates of the check points, ITRS, metres.
-        sigma: of each given coordinate, or of each axis in plan and of the height, metres.
-        bias: (3,) true roll, pitch, yaw at the field's middle, radians: from measured to true attitude.
-        offset: (3,) true minus measured station at the field's middle, along X, Y, Z of the orbital frame, metres.
-        trajectory: the true one.
-        measured: with the errors of the satellite's data.
-        drift: line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, radians and metres; empty for no drift.
-        readings: line -> (4,) what the monitor reads of it; empty for no monitor.
-        tie_images: line -> measured image points of the strip's tie points; empty for no strip.
-        ties: line -> their rays.
+        ties: line -> rays of the ties apart.
+        readings: line -> (4,) what a monitor reads of its camera; empty for no monitor.
+        known_truth: of a simulated pass.
     """
 
-    name: str
-    latitude: float
+    measurements: PassMeasurements
     data: PassData
+    latitude: float
     control_images: Mapping[str, ImagePoints]
     control_ground: np.ndarray
+    control_covariance: np.ndarray
+    is_control: np.ndarray
+    control_ids: np.ndarray
     check_images: Mapping[str, ImagePoints]
+    check_ground: np.ndarray
+    check_ids: np.ndarray
+    tie_images: Mapping[str, ImagePoints]
     control: CalibrationField
     check: Mapping[str, Rays]
-    check_ground: np.ndarray
-    sigma: float | tuple[float, float]
-    bias: np.ndarray
-    offset: np.ndarray
-    trajectory: Trajectory
-    measured: Trajectory
-    drift: Mapping[str, np.ndarray] = FrozenMap({})
+    ties: Mapping[str, Rays]
     readings: Mapping[str, np.ndarray] = FrozenMap({})
-    tie_images: Mapping[str, ImagePoints] = FrozenMap({})
-    ties: Mapping[str, Rays] = FrozenMap({})
+    known_truth: PassTruth | None = None
 
-    def bias_at(self, time: float) -> np.ndarray:
-        """(3,) true roll, pitch, yaw at a time, seconds from the field's middle, radians, without slow errors."""
-        errors = self.measured.errors
-        assert errors is not None
-        latitude = self.trajectory.orbit.earth.geodetic(self.trajectory.position(time))[1]
-        turn = errors.bias + np.sin(latitude - errors.reference) * errors.thermal
-        return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+    @property
+    def name(self) -> str:
+        """Of the field."""
+        return self.measurements.name
+
+    @property
+    def measured(self) -> TabulatedTrajectory:
+        """Orbit and attitude by their readings."""
+        return TabulatedTrajectory(self.measurements.platform)
+
+    @property
+    def truth(self) -> PassTruth:
+        """Of a simulated pass. AssertionError for a measured one."""
+        assert self.known_truth is not None, "nobody knows the truth of a measured pass"
+        return self.known_truth
+
+    @property
+    def bias(self) -> np.ndarray:
+        """True bias; see `PassTruth`."""
+        return self.truth.bias
+
+    @property
+    def offset(self) -> np.ndarray:
+        """True offset; see `PassTruth`."""
+        return self.truth.offset
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The true one."""
+        return self.truth.trajectory
+
+    @property
+    def drift(self) -> Mapping[str, np.ndarray]:
+        """True drift; see `PassTruth`."""
+        return self.truth.drift
+
+    @property
+    def middle(self) -> float:
+        """Mean time at which control points were seen, seconds of the trajectory."""
+        sensors = self.data.sensors
+        return float(np.mean(np.concatenate([sensors[k].time(r.line) for k, r in self.control_images.items()])))
+
+    @property
+    def altitude(self) -> float:
+        """Of the satellite above the ellipsoid in the middle of the pass, metres."""
+        path = self.measured
+        return float(self.data.earth.geodetic(path.position(self.middle))[2])
 
     def shifted(self, datum: tuple[float, float, float]) -> FieldPass:
         """With control points given farther east, north and up, metres; rays stay as they are."""
@@ -156,23 +161,56 @@ class FieldPass:
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """All passes, and the camera before and after launch.
+    """All passes, and the camera as the laboratory knows it.
 
     Attributes:
         spec: the test.
         laboratory: line -> camera as it was measured before launch; what the analysis starts from.
-        truth: line -> camera as it is, without the drift of single fields.
         noise: what the analysis is told of the independent errors.
         passes: in the file's order.
-        images: what became of points measured in images, by field; None for drawn ones.
+        images: what became of points measured in simulated images, by field; None otherwise.
+        known_truth: line -> camera as it is, without the drift of single fields; None where nobody knows.
+        rejected: field -> what the adjustment has left out; empty where nothing was looked for.
     """
 
-    spec: OrbitCalibrationSpec
+    spec: OrbitCalibrationSpec | MeasuredCalibrationSpec
     laboratory: Mapping[str, LineModel]
-    truth: Mapping[str, LineModel]
     noise: Noise
     passes: tuple[FieldPass, ...]
     images: tuple[FieldImages, ...] | None = None
+    known_truth: Mapping[str, LineModel] | None = None
+    rejected: Mapping[str, Rejected] = FrozenMap({})
+
+    @property
+    def truth(self) -> Mapping[str, LineModel]:
+        """Line -> camera as it is. AssertionError where nobody knows."""
+        assert self.known_truth is not None, "nobody knows the truth of a measured campaign"
+        return self.known_truth
+
+    @property
+    def simulated(self) -> OrbitCalibrationSpec:
+        """The test of a simulation. AssertionError for measurements."""
+        from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+
+        assert isinstance(self.spec, OrbitCalibrationSpec), "this campaign was measured"
+        return self.spec
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Line cameras, in the payload's order."""
+        return tuple(self.laboratory)
+
+    @property
+    def inner(self) -> tuple[str, ...]:
+        """Names of the interior's unknowns."""
+        return interior_names(self.lines)
+
+    @property
+    def reference(self) -> str:
+        """The line whose principal point is the gauge: the nadir line, or that which looks down most steeply."""
+        if "nadir" in self.laboratory:
+            return "nadir"
+        return max(self.lines, key=lambda name: float(self.laboratory[name].to_body[2, 2]))
 
     @property
     def effects(self) -> LightEffects:
@@ -198,8 +236,10 @@ class Campaign:
         passes = tuple(
             replace(
                 p,
-                control=p.data.control_field(p.control_images, p.control_ground, p.sigma, removed, p.control.control),
-                check=FrozenMap(p.data.check_rays(p.check_images, removed, self.noise)),
+                control=p.data.control_field(
+                    p.control_images, p.control_ground, p.control_covariance, removed, p.is_control
+                ),
+                check=FrozenMap(p.data.check_rays(p.check_images, removed, self.noise) if p.check_images else {}),
                 ties=FrozenMap(p.data.check_rays(p.tie_images, removed, self.noise) if p.tie_images else {}),
             )
             for p in self.passes
@@ -211,37 +251,30 @@ class Campaign:
         return replace(self, passes=tuple(p.shifted(datum) for p in self.passes))
 
 
-def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
-    """Pass over every field once; image points are drawn or, where the file has a section `images`, measured.
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """What the adjustment has left out of a pass.
 
-    Raises:
-        BenchError: no such orbit, or the lines do not all see enough points.
-        CalibrationError: the measured points cannot be used.
+    Attributes:
+        entered, left: image points of control and tie points before and after.
+        points: names of control and tie points with a rejected image point, and its line camera.
+        check_entered, check_left: check points before and after the test of their intersection.
+        check_points: names of those that were left out.
+        factor: on the sigmas of the image points, by the residuals of those that remain; 1 where they are right.
     """
-    spec, payload = setup.test, setup.camera
-    changed = changed_payload(spec, payload)
-    earth = Earth.from_spec(spec.earth)
-    laboratory, truth = (FrozenMap({k: line_model(p, k) for k in LINES}) for p in (payload, changed))
-    known = line_cameras(payload)
-    pitch = FrozenMap({k: payload.pitch_of(k) for k in LINES})
-    imager = Imager.of(setup, stream(seed, len(spec.fields)), advance) if spec.images is not None else None
-    flown = [
-        _pass(name, field, spec, pitch, (known, laboratory), changed, earth, own, imager)
-        for (name, field), own in zip(spec.fields.items(), seed.spawn(len(spec.fields)), strict=True)
-    ]
-    passes, images = tuple(p for p, _ in flown), tuple(i for _, i in flown if i is not None)
-    first = passes[0]
-    noise = _noise(spec, first.data.unit or image_sigma(first.control_images, first.data))
-    campaign = Campaign(spec, laboratory, truth, noise, passes, images or None)
-    return campaign.without_effects(campaign.effects if spec.effects.corrected else NO_EFFECTS)
+
+    entered: int
+    left: int
+    points: tuple[tuple[str, str], ...]
+    check_entered: int
+    check_left: int
+    check_points: tuple[str, ...]
+    factor: float
 
 
-def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw (n, 3) from measured to true attitude at latitudes (n,), radians, without the season."""
-    tracker = spec.errors.star_tracker
-    drift = np.array(tracker.thermal.amplitude) * spec.errors.switched_on
-    turn = np.array(tracker.bias) + np.sin(latitude - tracker.thermal.reference)[:, None] * drift
-    return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
+    """Names of the unknowns f, x, y of these line cameras."""
+    return tuple(f"{line} {name}" for line in lines for name in INTERIOR)
 
 
 def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
@@ -251,182 +284,117 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
     return LineModel.of(to_body, (line.focal_length, *line.principal_point), line.position, line.k1, line.k2)
 
 
-def _noise(spec: OrbitCalibrationSpec, image: float) -> Noise:
-    """Sigmas of readings as given, root mean square over axes, and their intervals."""
-    errors = spec.errors
-    if not errors.switched_on:
+def campaign_of(
+    spec: OrbitCalibrationSpec | MeasuredCalibrationSpec,
+    payload: ThreeLineCameraSpec,
+    measured: Sequence[PassMeasurements],
+    ties_apart: bool,
+) -> Campaign:
+    """The campaign of measured passes, with the effects on the light taken out where the test says so.
+
+    Args:
+        spec: the test.
+        payload: as the laboratory knows it.
+        measured: the passes.
+        ties_apart: whether tie points are kept for the strip, and do not calibrate.
+
+    Raises:
+        CalibrationError: points that cannot be used.
+    """
+    seen = {name for one in measured for name in one.images}
+    laboratory = FrozenMap({name: line_model(payload, name) for name in payload.lines if name in seen})
+    passes = [_field_pass(one, payload, laboratory, ties_apart) for one in measured]
+    unit = image_sigma(passes[0].control_images, passes[0].data)
+    noise = noise_of(spec.errors, unit, [one.measured for one in passes])
+    weighed = tuple(replace(p, data=replace(p.data, unit=unit)) for p in passes)
+    campaign = Campaign(spec, laboratory, noise, tuple(_with_ties(p, noise) for p in weighed))
+    return campaign.without_effects(campaign.effects if spec.effects.corrected else NO_EFFECTS)
+
+
+def noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequence[TabulatedTrajectory] = ()) -> Noise:
+    """Sigmas of readings as given, root mean square over axes, and their intervals.
+
+    Args:
+        errors: of the readings.
+        image: unit of the image points, metres.
+        paths: their tables, for intervals that are not given.
+    """
+    if not getattr(errors, "switched_on", True):
         return Noise(image)
     tracker, gps = errors.star_tracker, errors.gps
     attitude, station, slow = (
         float(np.sqrt(np.mean(np.square(v)))) for v in (tracker.noise, gps.noise, tracker.slow.noise)
     )
-    return Noise(image, attitude, station, tracker.interval, gps.interval, slow, tracker.slow.interval)
-
-
-def _pass(
-    name: str,
-    field: FieldSpec,
-    spec: OrbitCalibrationSpec,
-    pitch: Mapping[str, float],
-    known: tuple[Mapping[str, LineCamera], Mapping[str, LineModel]],
-    changed: ThreeLineCameraSpec,
-    earth: Earth,
-    seed: np.random.SeedSequence,
-    imager: Imager | None,
-) -> tuple[FieldPass, FieldImages | None]:
-    """Fly and measure; rays are made later, when the effects on the light are taken out."""
-    pictures, drift = stream(seed, _PICTURES), sample_drift(spec, seed)
-    readings = sample_readings(spec, drift, seed)
-    cameras = line_cameras(drifted_payload(changed, drift))
-    place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
-    trajectory = _trajectory(name, field, spec, earth)
-    errors = spec.errors
-    turn = np.array(errors.star_tracker.bias) + np.array(errors.season) * season.standard_normal(3)
-    tracker = errors.star_tracker.model_copy(update={"bias": tuple(turn.tolist())})
-    terms = TERMS if errors.switched_on else ("attitude_bias",)
-    measured = trajectory.with_errors(
-        errors.model_copy(update={"star_tracker": tracker}), int(data.integers(2**31)), terms
+    between = (
+        tracker.interval or float(np.median([p.attitude_interval for p in paths])),
+        gps.interval or float(np.median([p.orbit_interval for p in paths])),
     )
-    effects = light_effects(spec.effects)
-    sensors = {k: _sensor(cameras[k], trajectory, earth, spec, effects) for k in LINES}
-    laboratory = {k: _sensor(known[0][k], measured, earth, spec, NO_EFFECTS) for k in LINES}
-    pass_data = PassData(name, FrozenMap(laboratory), known[1], pitch, field.height)
-    images = None
-    if imager is None:
-        assert spec.points is not None
-        points = _simulated_points(field, spec, spec.points, sensors, pass_data, (place, image, ground))
-    else:
-        points, images = imager.measured(field, sensors, pass_data, effects, pictures)
-    ties: Mapping[str, ImagePoints] = {}
-    if spec.strip is not None and spec.points is not None:
-        tie_points = spec.points.model_copy(
-            update={"control": 0, "check": spec.strip.ties, "length": spec.strip.length}
-        )
-        own = stream(seed, _TIES)
-        a, b, c = (np.random.default_rng(s) for s in own.spawn(3))
-        try:
-            ties = _simulated_points(field, spec, tie_points, sensors, pass_data, (a, b, c)).check_images
-        except BenchError as error:
-            remedy = "a shorter strip, or a longer pass (`span`)"
-            raise BenchError(f"tie points: {error}", ("strip", "length"), remedy) from error
-    attitude_errors = measured.errors
-    assert attitude_errors is not None
-    middle = float(earth.geodetic(trajectory.position(0.0))[1])
-    shape = np.sin(middle - attitude_errors.reference)
-    found = rotation_matrix(attitude_errors.bias + shape * attitude_errors.thermal).T
-    given = points.control_ground
-    one = FieldPass(
-        name,
-        field.latitude,
-        points.data,
-        FrozenMap(points.control_images),
-        given,
-        FrozenMap(points.check_images),
-        CalibrationField.of(name, points.data.rays(points.control_images), given, points.sigma, points.control),
-        FrozenMap(points.data.rays(points.check_images)),
-        points.check_ground,
-        points.sigma,
-        Rotation.from_matrix(found).as_euler("XYZ"),
-        -attitude_errors.position(np.array(0.0)),
-        trajectory,
-        measured,
-        drift,
-        readings,
-        FrozenMap(ties),
+    return Noise(image, attitude, station, *between, slow, tracker.slow.interval)
+
+
+def _field_pass(
+    one: PassMeasurements, payload: ThreeLineCameraSpec, models: Mapping[str, LineModel], ties_apart: bool
+) -> FieldPass:
+    """Sort the points of a pass; rays are made later, when the effects on the light are taken out."""
+    earth, cameras, path = Earth(), line_cameras(payload), TabulatedTrajectory(one.platform)
+    sensors = {
+        name: Sensor.of_lines(cameras[name], path, earth, one.line_times[name], NO_EFFECTS) for name in one.images
+    }
+    role = one.ground.role
+    rays = np.zeros(len(role), int)
+    for row in one.images.values():
+        np.add.at(rays, row.point, 1)
+    known = (role == "control") & (rays > 0)
+    if not np.any(known):
+        raise CalibrationError(f"field {one.name!r}: no image shows a control point")
+    _, latitude, height = earth.geodetic(one.ground.itrs[known])
+    pitch = {name: payload.pitch_of(name) for name in one.images}
+    own = FrozenMap({name: models[name] for name in one.images})
+    data = PassData(one.name, FrozenMap(sensors), own, FrozenMap(pitch), float(np.mean(height)))
+    check = (role == "check") & (rays > 1)
+    tie = (role == "tie") & (rays > 1)
+    # control points first, ties after them
+    calibrating = np.concatenate([np.flatnonzero(known), np.flatnonzero(tie & (not ties_apart))])
+    where = one.ground.taken(calibrating)
+    checks = np.flatnonzero(check)
+    empty = CalibrationField(one.name, {}, where.itrs, where.covariance, where.role == "control")
+    return FieldPass(
+        measurements=one,
+        data=data,
+        latitude=float(np.mean(latitude)),
+        control_images=_numbered(one.images, calibrating, len(role)),
+        control_ground=where.itrs,
+        control_covariance=where.covariance,
+        is_control=where.role == "control",
+        control_ids=where.ids,
+        check_images=_numbered(one.images, checks, len(role)) if len(checks) else FrozenMap({}),
+        check_ground=one.ground.itrs[checks],
+        check_ids=one.ground.ids[checks],
+        tie_images=_numbered(one.images, np.flatnonzero(tie), len(role))
+        if ties_apart and np.any(tie)
+        else FrozenMap({}),
+        control=empty,
+        check=FrozenMap({}),
+        ties=FrozenMap({}),
     )
-    return (one.shifted(errors.datum) if errors.switched_on and any(errors.datum) else one), images
 
 
-def _simulated_points(
-    field: FieldSpec,
-    spec: OrbitCalibrationSpec,
-    wanted: PointsSpec,
-    sensors: Mapping[str, Sensor],
-    data: PassData,
-    random: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
-) -> FieldPoints:
-    """Places of points, their image points and control coordinates, by three random streams."""
-    place, image, ground = random
-    points, seen = _points(data.name, field, spec, wanted, sensors, place)
-    errors = spec.errors
-    sigma, control = (v * errors.switched_on for v in (errors.image, errors.control))
-    images = {}
-    for k, (line, pixel) in seen.items():
-        # sigma is that of x and y in the focal plane
-        unit = np.array([1.0 / data.pixels_per_line(k), 1.0])
-        noise = sigma * unit * image.standard_normal((len(line), 2))
-        spread = np.diag((max(sigma, _LEAST_IMAGE) * unit) ** 2)
-        images[k] = ImagePoints.of(np.arange(len(line)), line + noise[:, 0], pixel + noise[:, 1], spread)
-    count = wanted.control
-    given = points[:count] + control * ground.standard_normal((count, 3))
-    control_images = {k: row.taken(np.arange(count)) for k, row in images.items()}
-    check_images = {k: row.taken(np.arange(count, len(points))).numbered(count) for k, row in images.items()}
-    return FieldPoints(data, control_images, given, np.ones(count, bool), control, check_images, points[count:])
+def _numbered(images: Mapping[str, ImagePoints], chosen: np.ndarray, count: int) -> FrozenMap[str, ImagePoints]:
+    """Line -> image points of the chosen ground points, which are counted anew from 0."""
+    number = np.full(count, -1)
+    number[chosen] = np.arange(len(chosen))
+    found = {}
+    for name, row in images.items():
+        some = row.taken(number[row.point] >= 0)
+        found[name] = replace(some, point=number[some.point])
+    return FrozenMap(found)
 
 
-def _trajectory(name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: Earth) -> Trajectory:
-    """The true orbit, which passes the field's middle at its epoch, and the true attitude."""
-    passing = PassingSpec.model_construct(
-        longitude=field.longitude,
-        latitude=field.latitude,
-        altitude=spec.altitude,
-        direction="descending",
-        inclination=None,
-    )
-    orbit = OrbitSpec.model_construct(
-        epoch=field.epoch, before=spec.span, after=spec.span, passing=passing, elements=None, state=None
-    )
-    try:
-        return Trajectory(propagate(orbit, earth), Attitude.from_spec(spec.attitude))
-    except ValueError as error:
-        remedy = "a field that a sun-synchronous orbit passes"
-        raise BenchError(str(error), ("fields", name), remedy) from error
-
-
-def _sensor(
-    camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: OrbitCalibrationSpec, effects: LightEffects
-) -> Sensor:
-    lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
-    return Sensor(camera, trajectory, earth, spec.line_time, trajectory.first + 0.5 * spec.line_time, lines, effects)
-
-
-def _points(
-    name: str,
-    field: FieldSpec,
-    spec: OrbitCalibrationSpec,
-    asked: PointsSpec,
-    sensors: Mapping[str, Sensor],
-    random: np.random.Generator,
-) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Ground points (n, 3), control first, and line -> their image lines and pixels, (n,) each."""
-    wanted, nadir = asked.control + asked.check, sensors["nadir"]
-    height = field.height + field.relief * random.uniform(-1.0, 1.0, int(np.ceil(_SPARE * wanted)))
-    pixel = random.uniform(asked.first, asked.last, len(height))
-    trajectory = nadir.trajectory
-    assert isinstance(trajectory, Trajectory)
-    above = float(nadir.earth.geodetic(trajectory.position(0.0))[2])
-    radius = float(np.linalg.norm(trajectory.position(0.0)))
-    speed = float(np.linalg.norm(trajectory.velocity(0.0))) * (1.0 - above / radius)
-    reach = 0.5 * asked.length / speed
-    if reach > 0.99 * spec.span:  # the image ends a line before the orbit
-        raise BenchError("the pass is shorter than the field", ("span",), f"more than {reach:.3g} s")
-    line = (random.uniform(-reach, reach, len(height)) - nadir.first_line_time) / spec.line_time
-    points = nadir.ground(line, pixel, height)
-    seen = {k: s.image(points) for k, s in sensors.items()}
-    edge = _MARGIN * spec.errors.image * spec.errors.switched_on - 0.5
-    inside = [
-        (line > edge)
-        & (line < sensors[k].lines - 1.0 - edge)
-        & (at > edge)
-        & (at < sensors[k].camera.pixels - 1.0 - edge)
-        for k, (line, at) in seen.items()
-    ]
-    good = np.flatnonzero(np.all(inside, axis=0))[:wanted]
-    if len(good) < wanted:
-        key = ("span",) if not all(np.any(np.isfinite(line)) for line, _ in seen.values()) else ("points",)
-        raise BenchError(
-            f"over {name} only {len(good)} of {len(height)} places are seen by all three lines",
-            key,
-            "a longer pass, and a field inside all three strips",
-        )
-    return points[good], {k: (line[good], at[good]) for k, (line, at) in seen.items()}
+def _with_ties(one: FieldPass, noise: Noise) -> FieldPass:
+    """First coordinates of the tie points, by the laboratory's camera."""
+    tie = ~one.is_control
+    if not np.any(tie):
+        return one
+    rays = one.data.rays(one.control_images)
+    found = intersect(rays, one.data.models, noise, count=len(tie)).ground
+    return replace(one, control_ground=np.where(tie[:, None], found, one.control_ground))

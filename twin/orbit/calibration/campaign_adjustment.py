@@ -12,10 +12,15 @@ from analysis.orbit.null_space import Gauge
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 
 GAUGE = Gauge(held=("nadir x", "nadir y"))
-"""The nadir line's principal point stays as the laboratory has it: x is not observable against pitch, y against roll so
-weakly that a field would not know it to a pixel."""
+"""Of three lines. The nadir line's principal point stays as the laboratory has it: x is not observable against pitch,
+y against roll so weakly that a field would not know it to a pixel."""
 _LEAST_OFFSET = 1e-3
 """Metres; sigma of an orbit without a drift along one axis."""
+
+
+def gauge_of(campaign: Campaign) -> Gauge:
+    """The principal point of one line is held; see `GAUGE`."""
+    return Gauge(held=(f"{campaign.reference} x", f"{campaign.reference} y"))
 
 
 def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior] = ()) -> Adjustment:
@@ -29,7 +34,7 @@ def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior]
     Raises:
         CalibrationError: it cannot be solved.
     """
-    return adjust([one.control], campaign.laboratory, campaign.noise, priors=priors, gauge=GAUGE)
+    return adjust([one.control], campaign.laboratory, campaign.noise, priors=priors, gauge=gauge_of(campaign))
 
 
 def simultaneous(
@@ -68,6 +73,6 @@ def simultaneous(
             rate="common" if rate else "none",
         ),
         priors=(*(drifts if offsets else ()), *priors),
-        gauge=GAUGE,
+        gauge=gauge_of(campaign),
         robust=robust,
     )

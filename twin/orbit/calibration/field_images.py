@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from scenes.specs.orbit_scene import GroundSpec
     from scenes.specs.orbit_setup import CalibrationSetup
 
-UNIT = 0.1
-"""Pixels: unit of weight of measured image points, whose own covariances count in it."""
 BEYOND = 0.1
 """Pixels: standard deviation added to what the matching claims, for what no fit shows: another season's light (RMS of
 matches 0.11 px where 0.06 is claimed), the attitude between its readings. A tie point has it where it was chosen."""
@@ -220,7 +218,7 @@ class Imager:
         sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
         both = known.followed_by(tie)
         points = FieldPoints(
-            replace(data, unit=UNIT * max(data.pitch.values())),
+            data,
             both.images,
             both.ground,
             np.arange(both.count) < known.count,

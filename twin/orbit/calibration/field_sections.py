@@ -7,14 +7,13 @@ import numpy as np
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
-from scenes.specs.orbit_angle import LINES
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import BEYOND, FieldImages
 from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
-from twin.orbit.calibration.influences import INNER, SURPRISE, LightRow
+from twin.orbit.calibration.influences import SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
 from twin.orbit.images.point_judgement import WRONG
 from twin.orbit.images.point_report import points_png
@@ -28,16 +27,17 @@ def fields_section(run: CalibrationRun) -> Section:
     for one in run.campaign.passes:
         alone = run.fields[one.name].adjustment
         bias = alone.bias(one.name) / ARCSEC
-        errors = bias - one.bias / ARCSEC
-        rows.append((one.name, float(np.degrees(one.latitude)), *map(float, bias), *map(float, errors), alone.p_value))
+        errors = [] if one.known_truth is None else (bias - one.bias / ARCSEC).tolist()
+        rows.append((one.name, float(np.degrees(one.latitude)), *map(float, bias), *errors, alone.p_value))
+    truth = ("Δ roll", "Δ pitch", "Δ yaw") if run.truth is not None else ()
     table = Table(
         "fields",
         "Each field by itself",
-        "Roll, pitch and yaw of the bias, arcseconds, and minus the truth at the field's middle. An offset of the "
-        "orbit, which the twelve unknowns do not have, goes into roll and pitch: 0.3 m are 0.1 arcsec.",
-        ("field", "latitude [deg]", *BIAS, "Δ roll", "Δ pitch", "Δ yaw", "chance of the fit"),
+        f"Roll, pitch and yaw of the bias, arcseconds{', and minus the truth at the middle' * bool(truth)}. "
+        "An offset of the orbit, which these unknowns do not have, goes into roll and pitch: 0.3 m are 0.1 arcsec.",
+        ("field", "latitude [deg]", *BIAS, *truth, "chance of the fit"),
         rows,
-        (None, 1, 3, 3, 3, 3, 3, 3, 3),
+        (None, 1, *(3,) * (len(BIAS) + len(truth) + 1)),
     )
     found = repeatability(run)
     if not found:
@@ -93,9 +93,12 @@ def biases_section(run: CalibrationRun) -> Section:
         few = "There are too few fields, or all at one latitude, to tell a drift with latitude from the season."
         return Section("Biases against latitude", (few,), (figure,))
     spec = run.campaign.spec
-    # measured to true is the inverse of the drift of the measured attitude
-    true = -np.array(spec.errors.star_tracker.thermal.amplitude) * spec.errors.switched_on / ARCSEC
-    season = np.array(spec.errors.season) / ARCSEC
+    true = season = np.zeros(0)
+    if run.truth is not None:
+        # measured to true is the inverse of the drift of the measured attitude
+        errors = run.campaign.simulated.errors
+        true = -np.array(errors.star_tracker.thermal.amplitude) * errors.switched_on / ARCSEC
+        season = np.array(errors.season) / ARCSEC
     rows: list[tuple[Cell, ...]] = []
     for k, fit in enumerate(run.latitude):
         numbers = (fit.amplitude, fit.amplitude_sigma, fit.constant, fit.constant_sigma, fit.remainder)
@@ -105,14 +108,14 @@ def biases_section(run: CalibrationRun) -> Section:
                 fit.axis,
                 amplitude,
                 amplitude_sigma,
-                float(true[k]),
+                *true[k : k + 1].tolist(),
                 constant,
                 constant_sigma,
                 fit.chi_square,
                 fit.degrees_of_freedom,
                 fit.p_value,
                 left,
-                float(season[k]),
+                *season[k : k + 1].tolist(),
             )
         )
     table = Table(
@@ -125,21 +128,21 @@ def biases_section(run: CalibrationRun) -> Section:
             "axis",
             "amplitude",
             "σ",
-            "true amplitude",
+            *["true amplitude"] * len(true[:1]),
             "constant",
             "σ",
             "chi-square",
             "degrees",
             "chance",
             "remains, 1σ",
-            "true season",
+            *["true season"] * len(true[:1]),
         ),
         rows,
-        (None, 2, 2, 2, 2, 2, 1, None, 3, 2, 2),
+        (None, 2, 2, *(2,) * len(true[:1]), 2, 2, 1, None, 3, 2, *(2,) * len(true[:1])),
     )
     values = np.array([[run.together.value(f"{p.name} {axis}") for p in run.campaign.passes] for axis in BIAS[:2]])
     spread = float(np.hypot(*values.std(axis=1, ddof=1)))
-    metres, most = spread * spec.altitude, max(len(s) for s in spec.schemes)
+    metres, most = spread * run.campaign.passes[0].altitude, max(len(s) for s in spec.schemes)
     weak = [f.axis for f in run.latitude if abs(f.amplitude) < 2.0 * f.amplitude_sigma]
     seen = f"in this campaign the drift does not show in {', '.join(weak)}" if weak else "the drift shows in all axes"
     reach = np.ptp(np.sin(run.latitude[0].latitude - run.latitude[0].reference))
@@ -165,8 +168,8 @@ _SORTS = {"control": "orthophoto", "tie": "tie"}
 def images_section(campaign: Campaign) -> Section:
     """How many points were matched, lost and wrong, by field, sort and line."""
     assert campaign.images is not None
-    assert campaign.spec.images is not None
-    spec = campaign.spec.images
+    spec = campaign.simulated.images
+    assert spec is not None
     total = ImageTotals.of(campaign.images)
     matching = _matching(campaign.images)
     rows: list[tuple[Cell, ...]] = []
@@ -275,18 +278,18 @@ def light_section(run: CalibrationRun) -> Section:
     for row in run.light:
         name = _left(row)
         if row.left:
-            moved = [float(v / pitch[line]) for line in LINES for v in row.moved[line]]
+            moved = [float(v / pitch[line]) for line in run.campaign.lines for v in row.moved[line]]
             sizes.append((name, *moved))
-        inner, turned = row.most(INNER), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
+        inner, turned = row.most(run.campaign.inner), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
         shifts = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
         rows.append((f"{name} left in" if row.left else name, *row.before, *row.after, *shifts, row.p_value))
     pixels = Table(
         "light-pixels",
         "How far image points move",
         "RMS over the check points, pixels, x along the track and y along the line.",
-        ("effect", *(f"{line} {axis}" for line in LINES for axis in "xy")),
+        ("effect", *(f"{line} {axis}" for line in run.campaign.lines for axis in "xy")),
         sizes,
-        (None, *(3,) * 6),
+        (None, *(3,) * (2 * len(run.campaign.lines))),
     )
     effects = Table(
         "light",
@@ -308,7 +311,7 @@ def light_section(run: CalibrationRun) -> Section:
         (None, 2, 2, 2, 2, None, None, 3),
     )
     left = run.light[-1]
-    most, ratio = left.most(INNER)
+    most, ratio = left.most(run.campaign.inner)
     text = (
         "Light time, aberration and refraction are in the image points. The analysis takes them out by its own models "
         "of them, with the laboratory's camera and the measured orbit and attitude: for each image point, the "
@@ -322,7 +325,9 @@ def light_section(run: CalibrationRun) -> Section:
         "fit need not show, and they are no longer those of the camera: seen from another height, or by a satellite "
         "that tilts, the light does something else.",
         "The corrections use the same models of the atmosphere and of the light as the simulation: they show that the "
-        "method is right, not how well an atmosphere is known.",
+        "method is right, not how well an atmosphere is known."
+        if run.truth is not None
+        else "Refraction is that of the standard atmosphere; how far the day's air differed from it is in no sigma.",
     )
     return Section("Effects on the light", text, (pixels, effects))
 
@@ -356,9 +361,9 @@ def datum_section(run: CalibrationRun) -> Section:
         rows,
         (None, 2, 2, 2, None, 3, 3, 3, 1, 3, 2, 2),
     )
-    launch, spec = run.campaign.spec.launch, run.campaign.spec
+    launch = run.campaign.spec.launch
     roll, inner = (format_quantity(v, k) for v, k in ((launch.bias[0], ANGLE), (launch.interior, LENGTH)))
-    metres = SURPRISE * launch.bias[0] * spec.altitude
+    metres = SURPRISE * launch.bias[0] * run.campaign.passes[0].altitude
     text = [
         "A shift that all control points share in plan is a turn of the camera by shift over altitude, and one in "
         "height a change of all principal distances and of the outer lines' x. Biases and interior take it up, the "

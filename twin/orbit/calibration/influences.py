@@ -13,15 +13,15 @@ import numpy as np
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.forward_intersection import CheckErrors
-from analysis.orbit.three_line_model import BIAS, INTERIOR
+from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit_angle import LINES
-from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.campaign import Campaign, interior_names
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import RMS, schemes_tested, tested_before, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS
 
-INNER = tuple(f"{line} {name}" for line in LINES for name in INTERIOR)
+INNER = interior_names(LINES)
 SURPRISE = 4.0
 """Sigmas of what is expected of an unknown; one of seventy lies beyond by chance in 1 of 200 campaigns."""
 _TRIAL_SHIFT = 100.0
@@ -128,12 +128,13 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
                         [
                             (a.check[line].image - b.check[line].image) ** 2
                             for a, b in zip(case.passes, clean.passes, strict=True)
+                            if line in b.check
                         ]
                     ),
                     axis=0,
                 )
             )
-            for line in LINES
+            for line in campaign.lines
         }
         shift = dict(zip(found.names, (found.values - base.values).tolist(), strict=True))
         rows.append(LightRow(left, moved, _means(tested_before(case)), _after(case), shift, sigma, found.p_value))
@@ -163,7 +164,7 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
             DatumRow(
                 (float(east), float(north), float(up)),
                 np.array([np.mean([change[f"{n} {axis}"] for n in names]) for axis in BIAS]),
-                {n: float(change[n]) for n in INNER},
+                {n: float(change[n]) for n in campaign.inner},
                 np.array([np.mean([change.get(f"{n} offset {axis}", 0.0) for n in names]) for axis in OFFSET]),
                 found.chi_square - base.chi_square,
                 found.p_value,
@@ -176,8 +177,9 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
 def surprises(campaign: Campaign, found: Adjustment) -> tuple[Surprise, ...]:
     """Estimates beyond `SURPRISE` sigmas of what launch and orbit leave to expect, the largest first."""
     launch, errors = campaign.spec.launch, campaign.spec.errors
-    start = dict(zip(INNER, np.ravel([campaign.laboratory[line].interior for line in LINES]), strict=True))
-    known = {name: (start[name], launch.interior) for name in INNER}
+    inner = campaign.inner
+    start = dict(zip(inner, np.ravel([campaign.laboratory[line].interior for line in campaign.lines]), strict=True))
+    known = {name: (start[name], launch.interior) for name in inner}
     for one in campaign.passes:
         # a season's part is no surprise either
         spread = np.hypot(launch.bias, np.array(errors.season))

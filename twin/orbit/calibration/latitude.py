@@ -98,8 +98,9 @@ def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prio
 
 def _sine_rate(one: FieldPass, reference: float) -> float:
     """Change of sin(latitude - reference) at a pass's middle by the measured orbit, 1/s."""
-    ends = one.measured.position(np.array([-1.0, 1.0]))
-    latitude = one.measured.orbit.earth.geodetic(ends)[1]
+    middle = one.middle
+    ends = one.measured.position(np.array([middle - 1.0, middle + 1.0]))
+    latitude = one.data.earth.geodetic(ends)[1]
     return float(np.diff(np.sin(latitude - reference))[0] / 2.0)
 
 

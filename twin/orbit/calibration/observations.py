@@ -22,6 +22,7 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.pass_measurements import ImagePoints
 
@@ -84,6 +85,8 @@ def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
     return np.asarray(found)
 
 
+_SAME_PHASE = 1e-6
+"""Of an interval between readings: times of readings are rounded."""
 _HEIGHTS = (-500.0, 9000.0)
 """Metres: of land. A control point outside of them is refused by the calibration, not here."""
 
@@ -98,8 +101,8 @@ class PassData:
         models: line -> the same camera as the adjustment has it.
         pitch: line -> of its pixels, metres.
         height: mean of the ground above the ellipsoid, metres.
-        unit: metres in the focal plane; where given, every ray carries the covariance of its own image point in units
-            of it squared. None: all image points of a campaign weigh alike.
+        unit: metres in the focal plane; every ray carries the covariance of its own image point in units of it
+            squared. None: rays carry none.
     """
 
     name: str
@@ -108,6 +111,22 @@ class PassData:
     pitch: Mapping[str, float]
     height: float
     unit: float | None = None
+
+    @property
+    def phase(self) -> float:
+        """Of the attitude's readings: time of one of them from the next whole multiple of their interval, seconds.
+
+        Readings of the orbit are as far from their multiples at most, half of their interval, which shared noise does
+        not know: its variance then is that of another place between two readings.
+        """
+        path = next(iter(self.sensors.values())).trajectory
+        if not isinstance(path, TabulatedTrajectory):
+            return 0.0
+        time, step = path.table.attitude_time, path.attitude_interval
+        # a table may begin with an odd end
+        reading = float(time[1 + int(np.argmin(np.abs(np.diff(time[1:]) - step)))]) if len(time) > 2 else float(time[0])
+        phase = reading - step * round(reading / step)
+        return phase if abs(phase) > _SAME_PHASE * step else 0.0
 
     @property
     def earth(self) -> Earth:
@@ -140,7 +159,8 @@ class PassData:
             y = self.pitch[name] * (row.pixel - 0.5 * (sensor.camera.pixels - 1))
             image = np.column_stack([np.zeros_like(y), y])
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
-            rays = Rays.of(row.point, image, station, attitude, seconds)
+            # the noise of readings is shared by its own clock, which ticks at the readings
+            rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
             found[name] = rays if self.unit is None else replace(rays, spread=self._spread(name, row) / self.unit**2)
         return found
 
@@ -153,7 +173,7 @@ class PassData:
         self,
         images: Mapping[str, ImagePoints],
         ground: np.ndarray,
-        sigma: float | tuple[float, float],
+        covariance: np.ndarray,
         removed: LightEffects,
         control: np.ndarray | None = None,
     ) -> CalibrationField:
@@ -162,7 +182,7 @@ class PassData:
         Args:
             images: line -> their image points.
             ground: (m, 3) given coordinates, ITRS, metres.
-            sigma: of each coordinate, or of each axis in plan and of the height, metres.
+            covariance: (m, 3, 3) of the coordinates, m^2; of ties not used.
             removed: effects on the light that are taken out.
             control: (m,) which of them are control, the others are ties; None for all.
 
@@ -171,7 +191,7 @@ class PassData:
             ValueError: a point outside the image.
         """
         # the calibration's own check comes first: a place without a height has no refraction
-        field = CalibrationField.of(self.name, self.rays(images), ground, sigma, control)
+        field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
         return replace(field, rays=self._corrected(field.rays, images, removed, self._heights(ground)))
 
     def check_rays(self, images: Mapping[str, ImagePoints], removed: LightEffects, noise: Noise) -> dict[str, Rays]:

@@ -9,7 +9,6 @@ from scipy.stats import chi2
 
 from analysis.orbit.three_line_model import BIAS
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.influences import INNER
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ def repeatability(run: CalibrationRun) -> tuple[Repeatability, ...]:
     if len(run.fields) < 2:
         return ()
     found = []
-    for name in (*INNER, *BIAS):
+    for name in (*run.campaign.inner, *BIAS):
         alone = [(field, r.adjustment) for field, r in run.fields.items()]
         names = [f"{field} {name}" if name in BIAS else name for field, _ in alone]
         value = np.array([a.value(n) for n, (_, a) in zip(names, alone, strict=True)])

@@ -14,8 +14,9 @@ from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.three_line_model import LineModel
 from optics.numerics.frozen_map import FrozenMap
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.observations import EFFECTS
 from twin.run.procedure import Advance
 

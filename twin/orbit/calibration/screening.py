@@ -15,7 +15,7 @@ from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.residual_weights import REJECT
 from optics.numerics.frozen_map import FrozenMap
-from twin.orbit.calibration.campaign import Campaign, FieldPass
+from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages, Screening
 from twin.orbit.flight.light_effects import NO_EFFECTS
@@ -35,22 +35,27 @@ def screened(campaign: Campaign) -> Campaign:
     Raises:
         CalibrationError: it cannot be adjusted.
     """
-    assert campaign.images is not None
     found, kept = _robust(campaign)
+    total = 1.0
     for _ in range(_ROUNDS):
         factor = _factor(found, kept)
         if factor <= _SETTLED:
             break
+        total *= factor
         campaign = replace(campaign, noise=replace(campaign.noise, image=campaign.noise.image * factor))
         found, kept = _robust(campaign)
-    assert campaign.images is not None
-    passes, images = [], []
-    for one, shown in zip(campaign.passes, campaign.images, strict=True):
+    passes, rejected, judged = [], {}, []
+    for k, one in enumerate(campaign.passes):
         less, keep_check = _without(campaign, one, kept[one.name], found)
         passes.append(less)
-        images.append(replace(shown, screening=_counted(one, shown, kept[one.name], keep_check)))
+        rejected[one.name] = _rejected(one, kept[one.name], keep_check, total)
+        if campaign.images is not None:
+            shown = campaign.images[k]
+            judged.append(replace(shown, screening=_counted(one, shown, kept[one.name], keep_check)))
     removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
-    return replace(campaign, passes=tuple(passes), images=tuple(images)).without_effects(removed)
+    images = None if campaign.images is None else tuple(judged)
+    rest = replace(campaign, passes=tuple(passes), images=images, rejected=FrozenMap(rejected))
+    return rest.without_effects(removed)
 
 
 _Kept = dict[str, dict[str, np.ndarray]]
@@ -86,35 +91,45 @@ def _without(
     seen = np.zeros(count, int)
     for name, row in one.control_images.items():
         np.add.at(seen, row.point[kept[name]], 1)
-    stays = np.where(one.control.control, seen > 0, seen > 1)
-    number = np.cumsum(stays) - 1
-    images = {}
-    for name, row in one.control_images.items():
-        rest = row.taken(kept[name] & stays[row.point])
-        images[name] = replace(rest, point=number[rest.point])
-    meeting = intersect(one.check, found.cameras_of(one.name), campaign.noise, bias=found.bias(one.name))
-    # three rays are six conditions of three coordinates
-    keep = meeting.chi_square <= chi2.isf(_FALSE_ALARM, 2 * meeting.rays - 3)
-    check = {name: _renumbered(row.taken(keep[row.point])) for name, row in one.check_images.items()}
+    stays = np.where(one.is_control, seen > 0, seen > 1)
+    images = {
+        name: _renumbered(row.taken(kept[name] & stays[row.point]), stays) for name, row in one.control_images.items()
+    }
+    keep = np.ones(len(one.check_ground), bool)
+    if one.check:
+        meeting = intersect(one.check, found.cameras_of(one.name), campaign.noise, bias=found.bias(one.name))
+        # three rays are six conditions of three coordinates
+        keep = meeting.chi_square <= chi2.isf(_FALSE_ALARM, 2 * meeting.rays - 3)
+    check = {name: _renumbered(row.taken(keep[row.point]), keep) for name, row in one.check_images.items()}
     less = replace(
         one,
         control_images=FrozenMap(images),
         control_ground=one.control_ground[stays],
-        control=replace(
-            one.control,
-            ground=one.control.ground[stays],
-            covariance=one.control.covariance[stays],
-            control=one.control.control[stays],
-        ),
+        control_covariance=one.control_covariance[stays],
+        is_control=one.is_control[stays],
+        control_ids=one.control_ids[stays],
         check_images=FrozenMap(check),
         check_ground=one.check_ground[keep],
+        check_ids=one.check_ids[keep],
     )
     return less, keep
 
 
-def _renumbered(row: ImagePoints) -> ImagePoints:
-    """Check points are seen by every line, in one order."""
-    return replace(row, point=np.arange(len(row.point)))
+def _renumbered(row: ImagePoints, stays: np.ndarray) -> ImagePoints:
+    """Image points of ground points that stay (n,), which are counted anew."""
+    return replace(row, point=(np.cumsum(stays) - 1)[row.point])
+
+
+def _rejected(one: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, factor: float) -> Rejected:
+    """Names of what was left out."""
+    points = [
+        (str(one.control_ids[point]), name)
+        for name, row in one.control_images.items()
+        for point in row.point[~kept[name]].tolist()
+    ]
+    entered = sum(len(row.point) for row in one.control_images.values())
+    gone = tuple(str(name) for name in one.check_ids[~check])
+    return Rejected(entered, entered - len(points), tuple(points), len(check), int(check.sum()), gone, factor)
 
 
 def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], check: np.ndarray) -> Screening:

@@ -21,7 +21,7 @@ from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.campaign_adjustment import GAUGE
+from twin.orbit.calibration.campaign_adjustment import gauge_of
 from twin.orbit.calibration.schemes import averaged
 from twin.run.procedure import Advance
 
@@ -55,7 +55,7 @@ def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
         CalibrationError: a strip cannot be adjusted.
     """
     spec = campaign.spec
-    if spec.strip is None:
+    if not spec.strip:
         return None
     fields = len(campaign.passes)
     parts = (len(spec.schemes) + 2) * fields
@@ -79,7 +79,7 @@ def calibrated_with_ties(campaign: Campaign, one: FieldPass) -> Adjustment:
     Raises:
         CalibrationError: it cannot be solved.
     """
-    return adjust([field_with_ties(campaign, one)], campaign.laboratory, campaign.noise, gauge=GAUGE)
+    return adjust([field_with_ties(campaign, one)], campaign.laboratory, campaign.noise, gauge=gauge_of(campaign))
 
 
 def field_with_ties(campaign: Campaign, one: FieldPass) -> CalibrationField:

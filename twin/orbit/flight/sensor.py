@@ -28,6 +28,7 @@ from twin.orbit.flight.light_effects import (
     unrefracted,
 )
 from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.line_times import LineTimes
 
 _COUNTS = (8, 12, 16, 24, 32, 48)
 _TRIAL_LINES = 9
@@ -165,6 +166,7 @@ class Sensor:
         first_line_time: middle of the exposure of line 0, seconds of the trajectory.
         lines: how many lines the image has.
         effects: which of light time, aberration and refraction are on.
+        times: of its lines, where they are given as a table; None where lines follow one another evenly.
 
     Raises:
         ValueError: the image begins or ends outside of the trajectory's times.
@@ -177,14 +179,29 @@ class Sensor:
     first_line_time: float
     lines: int
     effects: LightEffects = field(default_factory=LightEffects)
+    times: LineTimes | None = None
 
     def __post_init__(self) -> None:
         if not self.line_time > 0.0 or self.lines < 1:
             raise ValueError("an image needs at least one line and a line time above zero")
         self.trajectory.position(self.time(np.array([-0.5, self.lines - 0.5])))
 
+    @classmethod
+    def of_lines(
+        cls, camera: LineCamera, trajectory: Platform, earth: Earth, times: LineTimes, effects: LightEffects
+    ) -> Sensor:
+        """The sensor whose lines, counted from 0, were exposed at the times of a table.
+
+        Raises:
+            ValueError: the image begins or ends outside of the trajectory's times.
+        """
+        lines = int(times.line[-1]) + 1
+        return cls(camera, trajectory, earth, times.line_time, float(times.time[0]), lines, effects, times)
+
     def time(self, line: np.ndarray) -> np.ndarray:
         """Time of exposure of lines (N,), seconds of the trajectory."""
+        if self.times is not None:
+            return self.times.at(line)
         return self.first_line_time + np.asarray(line, dtype=np.float64) * self.line_time
 
     def ground(self, line: np.ndarray, pixel: np.ndarray, height: np.ndarray | float = 0.0) -> np.ndarray:

@@ -18,8 +18,9 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit_angle import LINES, EffectsSpec
 from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
 from scenes.specs.orbit_spec import ThermalDriftSpec
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields, line_model
+from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.payload_changes import changed_payload

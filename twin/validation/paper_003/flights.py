@@ -10,8 +10,9 @@ import numpy as np
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_setup import CalibrationSetup
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.latitude import LatitudeFit, fitted
 from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of

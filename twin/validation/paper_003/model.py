@@ -12,7 +12,8 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_calibration import CalibrationImagesSpec
 from scenes.specs.orbit_setup import CalibrationSetup
-from twin.orbit.calibration.campaign import Campaign, fly_fields
+from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.run.artefact import SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg

@@ -15,8 +15,9 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit_angle import LINES
 from scenes.specs.orbit_scene import TerrainSpec
 from scenes.specs.orbit_setup import CalibrationSetup
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.image_numbers import ImageTotals
 from twin.orbit.calibration.schemes import tested, tested_before
 from twin.orbit.calibration.screening import screened

@@ -12,7 +12,8 @@ from analysis.orbit.third_difference import third_difference
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.specs.orbit_setup import CalibrationSetup
-from twin.orbit.calibration.campaign import Campaign, FieldPass, fly_fields
+from twin.orbit.calibration.campaign import Campaign, FieldPass
+from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.validation.checks.check import CONSISTENT, CORRECTED, UNDECIDED, Check, CheckResult, Explanation, mean_of
 from twin.validation.checks.chosen import Chosen
 from twin.validation.checks.group import Context

@@ -1,0 +1,136 @@
+"""Tests in orbit on measurements, together with the camera and the files that they refer to."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.load import find_payload, load_orbit_test, load_three_line_camera
+from scenes.specs.orbit_measured import (
+    FILE_KEYS,
+    MeasuredAngleSpec,
+    MeasuredCalibrationSpec,
+    MeasuredTestSpec,
+    OrbitDataSpec,
+    PassFilesSpec,
+)
+from scenes.specs.resolved import ExperimentSetup, read_setup
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.yaml.errors import Problem
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import read_yaml
+
+DATA_FILE = "data.yaml"
+"""Of a folder of measurements."""
+MEASURED_KEYS = {"data", "passes"}
+"""A test with one of these keys runs on measurements."""
+
+
+class MeasuredCalibrationSetup(ExperimentSetup[MeasuredCalibrationSpec]):
+    """A calibration on measurements, with its camera.
+
+    Attributes:
+        camera: the payload.
+        data: the passes, with paths that hold from anywhere.
+    """
+
+    camera: ThreeLineCameraSpec
+    data: OrbitDataSpec
+
+    def with_seed(self, seed: int) -> "MeasuredCalibrationSetup":
+        """The same: nothing is drawn."""
+        return self
+
+
+class MeasuredAngleSetup(ExperimentSetup[MeasuredAngleSpec]):
+    """Intersection angles on measurements, with the camera.
+
+    Attributes:
+        camera: the payload.
+        data: the passes, with paths that hold from anywhere.
+    """
+
+    camera: ThreeLineCameraSpec
+    data: OrbitDataSpec
+
+    def with_seed(self, seed: int) -> "MeasuredAngleSetup":
+        """The same: nothing is drawn."""
+        return self
+
+
+Setup = TypeVar("Setup", MeasuredCalibrationSetup, MeasuredAngleSetup)
+
+
+def is_measured(path: str | Path) -> bool:
+    """Whether a file, or a run's config.yaml, is a test on measurements. InputError if it cannot be read."""
+    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
+        return False
+    data = read_yaml(path).data
+    if isinstance(data, dict) and isinstance(data.get("test"), dict):
+        return bool(MEASURED_KEYS & set(data["test"]))
+    return isinstance(data, dict) and bool(MEASURED_KEYS & set(data))
+
+
+def resolve_measured_calibration(path: str | Path) -> MeasuredCalibrationSetup:
+    """Read a calibration on measurements and what it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or the schemes name passes that are none.
+    """
+    setup = _resolved(MeasuredCalibrationSetup, MeasuredCalibrationSpec, path)
+    try:
+        setup.test.check_schemes(setup.data.passes)
+    except Problem as problem:
+        raise setup.test.error(
+            problem.problem,
+            problem.within,
+            found=problem.found,
+            allowed=problem.allowed,
+            suggestion=problem.suggestion,
+        ) from None
+    return setup
+
+
+def resolve_measured_angle(path: str | Path) -> MeasuredAngleSetup:
+    """Read intersection angles on measurements and what they refer to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid.
+    """
+    return _resolved(MeasuredAngleSetup, MeasuredAngleSpec, path)
+
+
+def _resolved(model: type[Setup], kind: type[Any], path: str | Path) -> Setup:
+    setup = read_setup(model, path)
+    if setup is not None:
+        return setup
+    test: Any = load_orbit_test(kind, path)
+    return model.model_construct(test=test, camera=load_three_line_camera(find_payload(test)), data=data_of(test))
+
+
+def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
+    """The passes of a test, with paths that hold from anywhere.
+
+    Raises:
+        InputError: there is no such folder, or its file is not valid.
+    """
+    folder = Path(test.source.file).parent if test.source.file else Path()
+    if test.data is None:
+        assert test.conventions is not None
+        assert test.passes is not None
+        return OrbitDataSpec.model_construct(conventions=test.conventions, passes=_placed(test.passes, folder))
+    place = folder / test.data
+    file = place / DATA_FILE if place.is_dir() else place
+    if not file.is_file():
+        allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
+        raise test.error("no such measurements", ("data",), found=str(place), allowed=allowed)
+    data = validate(OrbitDataSpec, read_yaml(file))
+    return data.model_copy(update={"passes": _placed(data.passes, file.parent)})
+
+
+def _placed(passes: Mapping[str, PassFilesSpec], folder: Path) -> FrozenMap[str, PassFilesSpec]:
+    found = {}
+    for name, one in passes.items():
+        files = {key: str((folder / value).absolute()) for key, value in one.files.items() if key in FILE_KEYS}
+        found[name] = one.model_copy(update=files)
+    return FrozenMap(found)

@@ -1,0 +1,288 @@
+"""Measurements of passes as files give them, with every convention stated, and the tests that run on them.
+
+Nothing here has a default where two readings are usual: a file that does not say which one it means is refused.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from scenes.specs.orbit_angle import Angles, EffectsSpec, Flag, Moment
+from scenes.specs.orbit_calibration import LaunchSpec, MapLimitsSpec, checked_schemes
+from scenes.specs.orbit_spec import AngleSigmas, Interval, LengthSigmas, SlowErrorsSpec, UtcTime
+from scenes.yaml.errors import Problem, names_text
+from scenes.yaml.spec import Name, Named, Reference, Spec, Text
+
+Toward = Literal["forward", "back", "right", "left", "up", "down"]
+_TOWARD: Mapping[str, tuple[int, int, int]] = {
+    "forward": (1, 0, 0),
+    "back": (-1, 0, 0),
+    "right": (0, 1, 0),
+    "left": (0, -1, 0),
+    "down": (0, 0, 1),
+    "up": (0, 0, -1),
+}
+"""In the project's body axes: X forward, Y right, Z down."""
+
+
+def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], ...]:
+    """Rows: the file's body x, y and z in the project's body axes, so that v_file = matrix @ v_project."""
+    return tuple(_TOWARD[axis] for axis in axes)
+
+
+def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, Toward]:
+    (a, b, c), (d, e, f), (g, h, i) = body_axes_matrix(axes)
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
+        allowed = "three directions square to each other, z = x × y, as [forward, right, down]"
+        raise Problem("no right-handed axes", names_text(axes), allowed)
+    return axes
+
+
+BodyAxes = Annotated[tuple[Toward, Toward, Toward], AfterValidator(_right_handed)]
+
+
+class QuaternionSpec(Spec):
+    """What the four numbers q1, q2, q3, q4 of an attitude mean.
+
+    Attributes:
+        scalar: whether the scalar part (the cosine of half the turn) is the first or the last of the four.
+        turns: what the quaternion does to the components of a vector, v' = q v q*: from body axes into those of the
+            frame, or the other way.
+    """
+
+    scalar: Literal["first", "last"]
+    turns: Literal["body_to_frame", "frame_to_body"]
+
+
+class ConventionsSpec(Spec):
+    """How the numbers of the tables are to be read. All of it must be said.
+
+    Attributes:
+        frame: axes of positions, velocities and quaternions; velocities are those against these axes. itrs is
+            Earth-fixed (WGS 84, CGCS2000 and ITRF agree with it to some centimetres).
+        quaternion: order and sense.
+        body_axes: what x, y and z of the quaternions' body point to in flight, as [forward, right, down].
+        time_scale: in which the epochs of the passes are written. Times in tables are SI seconds from them.
+        line_moment: which moment of its exposure the time of a line is.
+        centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
+        first_pixel: number of the first pixel of a line.
+        first_pixel_sees: to which side of the track the first pixel looks.
+    """
+
+    frame: Literal["itrs"]
+    quaternion: QuaternionSpec
+    body_axes: BodyAxes
+    time_scale: Literal["utc"]
+    line_moment: Literal["start", "middle", "end"]
+    centre: Literal["integer", "half"]
+    first_pixel: Annotated[int, Field(strict=True, ge=0, le=1)]
+    first_pixel_sees: Literal["right", "left"]
+
+
+FILE_KEYS = ("platform", "orbit", "attitude", "lines", "ground", "image_points", "tie_points")
+"""Of a pass, those that name a table."""
+
+
+class PassFilesSpec(Spec):
+    """The tables of a pass, CSV; paths are relative to the file that names them.
+
+    Attributes:
+        epoch: of the times in all tables.
+        platform: orbit and attitude in one table; or each in its own:
+        orbit: time, x, y, z and perhaps vx, vy, vz.
+        attitude: time, q1, q2, q3, q4.
+        lines: when the lines of each line camera were exposed.
+        ground: points on the ground, with coordinates, sigmas and roles.
+        image_points: where the line cameras see them.
+        tie_points: likewise, of points without known coordinates; None for none.
+    """
+
+    epoch: UtcTime
+    platform: Reference | None = None
+    orbit: Reference | None = None
+    attitude: Reference | None = None
+    lines: Reference
+    ground: Reference
+    image_points: Reference
+    tie_points: Reference | None = None
+
+    @model_validator(mode="after")
+    def _has_a_platform(self) -> "PassFilesSpec":
+        apart = (self.orbit is not None, self.attitude is not None)
+        if (self.platform is not None) == any(apart) or (any(apart) and not all(apart)):
+            given = [k for k in ("platform", "orbit", "attitude") if getattr(self, k) is not None]
+            allowed = "`platform: FILE`, or `orbit: FILE` and `attitude: FILE`"
+            raise Problem("orbit and attitude are not given once", " and ".join(given) or "none of them", allowed)
+        return self
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Key -> what it names, for all that are given."""
+        found = {name: getattr(self, name) for name in FILE_KEYS}
+        return {name: file for name, file in found.items() if file is not None}
+
+
+def _some_passes(passes: Named[PassFilesSpec]) -> Named[PassFilesSpec]:
+    if not passes:
+        raise Problem("no passes", "an empty mapping", "at least one pass")
+    return passes
+
+
+Passes = Annotated[Named[PassFilesSpec], AfterValidator(_some_passes)]
+
+
+class OrbitDataSpec(Spec):
+    """Measurements of passes: ``data.yaml`` of a folder.
+
+    Attributes:
+        conventions: of all tables.
+        passes: by name, of the pass or of the field that it passes.
+    """
+
+    conventions: ConventionsSpec
+    passes: Passes
+
+
+class OrbitReadingsSpec(Spec):
+    """What is known of the errors of the orbit's readings, along X, Y and Z of the orbital frame.
+
+    Attributes:
+        noise: standard deviation of a reading, independent from reading to reading, metres.
+        drift: standard deviation of what the whole pass has in common, metres.
+        interval: between readings that are independent, seconds; None for the median of the table.
+    """
+
+    noise: LengthSigmas
+    drift: LengthSigmas = (0.0, 0.0, 0.0)
+    interval: Interval | None = None
+
+
+class AttitudeReadingsSpec(Spec):
+    """What is known of the errors of the attitude's readings, about X, Y and Z of the body. Biases are solved for.
+
+    Attributes:
+        noise: standard deviation of a reading, independent from reading to reading, radians.
+        slow: what changes within a pass.
+        interval: between readings that are independent, seconds; None for the median of the table.
+    """
+
+    noise: AngleSigmas
+    slow: SlowErrorsSpec = SlowErrorsSpec()
+    interval: Interval | None = None
+
+
+class ReadingErrorsSpec(Spec):
+    """Standard deviations of the readings; those of points stand in their tables.
+
+    Attributes:
+        gps: of the orbit.
+        star_tracker: of the attitude.
+        season: by how much biases may differ from pass to pass about body X, Y, Z, radians; used for warnings only.
+    """
+
+    gps: OrbitReadingsSpec
+    star_tracker: AttitudeReadingsSpec
+    season: AngleSigmas = (0.0, 0.0, 0.0)
+
+    @property
+    def switched_on(self) -> bool:
+        """Measurements have errors."""
+        return True
+
+    @property
+    def datum(self) -> tuple[float, float, float]:
+        """A wrong datum of which the analysis knew would not be one."""
+        return (0.0, 0.0, 0.0)
+
+
+class MeasuredTestSpec(Spec):
+    """What all tests on measurements say.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+        conventions: of all tables.
+        passes: by name.
+        effects: on the light, that are in the image points; `corrected` takes them out.
+    """
+
+    name: Name
+    description: Text = ""
+    camera: Reference
+    data: Reference | None = None
+    conventions: ConventionsSpec | None = None
+    passes: Passes | None = None
+    effects: EffectsSpec = EffectsSpec()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _says_where_the_data_are(cls, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            here = [key for key in ("conventions", "passes") if value.get(key) is not None]
+            if ("data" in value) == bool(here) or len(here) == 1:
+                found = names_text([*(["data"] if "data" in value else []), *here]) or "none of them"
+                allowed = "`data: DIR`, or `conventions:` and `passes:`"
+                raise Problem("where the measurements are is not said once", found, allowed, within=("data",))
+        return value
+
+    @property
+    def seed(self) -> int:
+        """Nothing is drawn."""
+        return 0
+
+
+class MeasuredCalibrationSpec(MeasuredTestSpec):
+    """A calibration on measured passes.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+        conventions: of all tables.
+        passes: by name.
+        effects: on the light, that are in the image points; `corrected` takes them out.
+        schemes: passes whose parameters are averaged; each by itself is added.
+        errors: of the readings of orbit and attitude.
+        screening: whether image points are given robust weights and those with gross errors left out.
+        ties: whether tie points calibrate together with the control points, or are kept apart for the strips.
+        strip: whether every pass is adjusted on its tie points before check points are intersected.
+        launch: how much of a change is no surprise.
+        limits: for the verdict.
+    """
+
+    schemes: tuple[tuple[Name, ...], ...]
+    errors: ReadingErrorsSpec
+    screening: Literal["robust", "none"] = "robust"
+    ties: Literal["with_control", "apart"] = "with_control"
+    strip: Flag = False
+    launch: LaunchSpec = LaunchSpec()
+    limits: MapLimitsSpec = MapLimitsSpec()
+
+    def check_schemes(self, passes: Mapping[str, Any]) -> None:
+        """Raises Problem unless the schemes name passes."""
+        checked_schemes(self.schemes, passes)
+
+
+class MeasuredAngleSpec(MeasuredTestSpec):
+    """Intersection angles from the ground points that the lines of one moment see.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+        conventions: of all tables.
+        passes: by name.
+        effects: on the light, that are in the image points; `corrected` takes them out.
+        angles: name -> the two lines that the angle lies between; None for the usual ones.
+        time: the moment, seconds from the pass's epoch; None for the middle of the image points of each line.
+        errors: of the readings of orbit and attitude.
+    """
+
+    angles: Angles = None
+    time: Moment | None = None
+    errors: ReadingErrorsSpec

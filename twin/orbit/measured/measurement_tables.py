@@ -1,0 +1,455 @@
+"""Tables of a pass, as files give them, brought to the project's conventions (docs/conventions.md).
+
+Rows may stand in any order, columns in any order and unit. What cannot be told from the numbers, such as the order of a
+quaternion, the file of the test says; what can be told, such as a velocity that is not that of the positions, is
+checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.orbit.calibration_parameters import level_covariance
+from scenes.specs.orbit_measured import ConventionsSpec, OrbitDataSpec, PassFilesSpec, body_axes_matrix
+from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.yaml.csv_table import Column, Table, read_table
+from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.units import LENGTH, SPEED, TIME
+from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
+from twin.run.procedure import Advance, silent
+
+Array = NDArray[np.float64]
+
+_TIME = Column("time", TIME)
+_PLACE = tuple(Column(axis, LENGTH) for axis in "xyz")
+_SPEED = tuple(Column(f"v{axis}", SPEED, needed=False) for axis in "xyz")
+_QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
+_CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
+COLUMNS: Mapping[str, tuple[Column, ...]] = {
+    "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
+    "orbit": (_TIME, *_PLACE, *_SPEED),
+    "attitude": (_TIME, *_QUATERNION),
+    "lines": (Column("camera", text=True), Column("line"), _TIME),
+    "ground": (
+        Column("point", text=True),
+        Column("role", text=True),
+        *_PLACE,
+        Column("sigma", LENGTH, needed=False, least=0.0),
+        *(Column(f"sigma_{axis}", LENGTH, needed=False, least=0.0) for axis in ("plan", "height", *"xyz")),
+        *(Column(name, needed=False, least=-1.0, most=1.0) for name in _CORRELATIONS),
+    ),
+    "image_points": (
+        Column("point", text=True),
+        Column("camera", text=True),
+        Column("line"),
+        Column("pixel"),
+        Column("sigma_line", least=1e-6, most=1e3),
+        Column("sigma_pixel", least=1e-6, most=1e3),
+        Column("correlation", needed=False, least=-0.999999, most=0.999999),
+    ),
+}
+"""Key of a pass -> columns of its table; `tie_points` has those of `image_points`."""
+_SIGMAS = (("sigma",), ("sigma_plan", "sigma_height"), ("sigma_x", "sigma_y", "sigma_z"))
+_LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
+"""Metres from the Earth's centre: of satellites that map the Earth."""
+_MOST_HEIGHT = 2.0e4
+"""Metres above or below the ellipsoid: farther no ground point lies, whatever its datum."""
+_EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
+_SPEED_TOLERANCE = 0.02
+"""Of a velocity: positions of 1 m noise 1 s apart differ by less; that against the stars differs by 6 % and more."""
+_UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PassTables:
+    """The tables of a pass as they were read, for whoever reads them in other conventions.
+
+    Attributes:
+        name: of the pass.
+        epoch: of all times.
+        orbit, attitude, lines, ground, image_points: the tables.
+        tie_points: likewise, None where there are none.
+    """
+
+    name: str
+    epoch: str
+    orbit: Table
+    attitude: Table
+    lines: Table
+    ground: Table
+    image_points: Table
+    tie_points: Table | None
+
+    @classmethod
+    def read(cls, name: str, spec: PassFilesSpec) -> PassTables:
+        """Read all tables of a pass.
+
+        Args:
+            name: of the pass.
+            spec: its epoch and files, with paths that hold from here.
+
+        Raises:
+            InputError: a table cannot be read or is not as `COLUMNS` says.
+        """
+        files = spec.files
+        if "platform" in files:
+            orbit = attitude = read_table(files["platform"], COLUMNS["platform"], 2)
+        else:
+            orbit, attitude = (read_table(files[key], COLUMNS[key], 2) for key in ("orbit", "attitude"))
+        lines, ground, images = (read_table(files[key], COLUMNS[key]) for key in ("lines", "ground", "image_points"))
+        ties = read_table(files["tie_points"], COLUMNS["image_points"]) if "tie_points" in files else None
+        return cls(name, spec.epoch, orbit, attitude, lines, ground, images, ties)
+
+    def measurements(self, conventions: ConventionsSpec, camera: ThreeLineCameraSpec) -> PassMeasurements:
+        """What they say in these conventions.
+
+        Args:
+            conventions: of all tables.
+            camera: whose lines they name.
+
+        Raises:
+            InputError: what they say cannot be, with file, line and column.
+        """
+        platform = platform_of(self.epoch, self.orbit, self.attitude, conventions)
+        times, origins = line_times_of(self.lines, conventions, camera, platform)
+        ground = ground_of(self.ground)
+        number = {name: k for k, name in enumerate(ground.ids.tolist())}
+        tables = [(self.image_points, number)]
+        if self.tie_points is not None:
+            ties = list(dict.fromkeys(self.tie_points["point"].tolist()))
+            for row in np.flatnonzero([name in number for name in self.tie_points["point"]])[:1]:
+                allowed = "a point without coordinates, or another name"
+                raise self.tie_points.error(
+                    int(row), "point", f"this point has coordinates in {self.ground.file}", allowed=allowed
+                )
+            count = len(ground)
+            empty = GroundPoints.of(ties, np.full((len(ties), 3), np.nan), np.zeros((3, 3)), "tie")
+            ground = _joined(ground, empty)
+            tables.append((self.tie_points, {name: count + k for k, name in enumerate(ties)}))
+        trajectory = TabulatedTrajectory(platform)
+        parts: dict[str, list[ImagePoints]] = {name: [] for name in times}
+        for table, names in tables:
+            for name, row in image_points_of(table, names, times, origins, conventions, camera, trajectory).items():
+                parts[name].append(row)
+        images = {name: _all_of(rows) for name, rows in parts.items() if any(len(r.point) for r in rows)}
+        rays = np.zeros(len(ground), int)
+        for row in images.values():
+            np.add.at(rays, row.point, 1)
+        for role, least in (("control", 1), ("check", 2)):
+            if not np.any((ground.role == role) & (rays >= least)):
+                seen = "one line camera" if least == 1 else "two line cameras"
+                allowed = f"{role} points in the ground table whose image points are measured"
+                raise InputError(Issue(f"no {role} point is seen by {seen}", self.image_points.file, allowed=allowed))
+        if len(images) < 2:
+            found = f"of {names_text(tuple(images)) or 'none'}"
+            allowed = "image points of two line cameras or more"
+            raise InputError(Issue("too few line cameras", self.image_points.file, found=found, allowed=allowed))
+        return PassMeasurements(self.name, platform, {k: times[k] for k in images}, ground, images)
+
+
+def read_measurements(
+    data: OrbitDataSpec, camera: ThreeLineCameraSpec, advance: Advance = silent
+) -> tuple[PassMeasurements, ...]:
+    """All passes of a test.
+
+    Args:
+        data: conventions and files.
+        camera: whose lines they name.
+        advance: how far it is.
+
+    Raises:
+        InputError: a table cannot be read, or what it says cannot be, with file, line and column.
+    """
+    found = []
+    for name, files in data.passes.items():
+        found.append(PassTables.read(name, files).measurements(data.conventions, camera))
+        advance("read", len(found), len(data.passes))
+    return tuple(found)
+
+
+def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
+    """Orbit and attitude.
+
+    Args:
+        epoch: UTC.
+        orbit: its table.
+        attitude: its table, which may be the same.
+        conventions: of both.
+
+    Raises:
+        InputError: a time twice, a place where no satellite is, a velocity that is not that of the places, a
+            quaternion that is not of unit length.
+    """
+    order, looks = _rising(orbit), _rising(attitude)
+    time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
+    radius = np.linalg.norm(place, axis=1)
+    wrong = np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))
+    if len(wrong):
+        found = f"{radius[wrong[0]] / 1e3:.6g} km from the Earth's centre"
+        allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
+        raise orbit.error(int(order[wrong[0]]), "x", "no place of a satellite", found, allowed)
+    speed = None
+    given = [name for name in ("vx", "vy", "vz") if name in orbit]
+    if given:
+        missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
+        if missing:
+            raise InputError(
+                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(given), allowed="all three or none")
+            )
+        speed = orbit.stacked("vx", "vy", "vz")[order]
+        _check_velocity(orbit, order, time, place, speed)
+    numbers = attitude.stacked("q1", "q2", "q3", "q4")[looks]
+    norm = np.linalg.norm(numbers, axis=1)
+    far = np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)
+    if len(far):
+        found = f"a norm of {norm[far[0]]:.6g}"
+        raise attitude.error(int(looks[far[0]]), "q1", "no unit quaternion", found, "four numbers of norm 1")
+    quaternion = quaternions_of(numbers, conventions)
+    return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
+
+
+def quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
+    """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
+
+    Args:
+        numbers: (n, 4) q1 to q4 as the file has them.
+        conventions: what they mean.
+    """
+    said = conventions.quaternion
+    xyzw = numbers if said.scalar == "last" else np.roll(numbers, -1, axis=1)
+    if said.turns == "frame_to_body":
+        xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
+    axes = np.array(body_axes_matrix(conventions.body_axes), np.float64)
+    if np.array_equal(axes, np.eye(3)):
+        return np.asarray(xyzw, np.float64)
+    from scipy.spatial.transform import Rotation
+
+    # v_frame = R(q) v_file, v_file = axes @ v_project
+    return np.asarray((Rotation.from_quat(xyzw) * Rotation.from_matrix(axes)).as_quat(canonical=False))
+
+
+def line_times_of(
+    table: Table, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
+) -> tuple[dict[str, LineTimes], dict[str, float]]:
+    """Line camera -> its line times with the first line as 0, and the number of that line in the file.
+
+    Args:
+        table: of the lines of all cameras.
+        conventions: which moment of an exposure its times are.
+        camera: whose lines they are.
+        platform: whose readings must cover them.
+
+    Raises:
+        InputError: a camera that is none, a line twice, times that do not rise, lines outside the readings.
+    """
+    _known(table, "camera", tuple(camera.lines))
+    path = TabulatedTrajectory(platform)
+    found, origins = {}, {}
+    for name in dict.fromkeys(table["camera"].tolist()):
+        rows = np.flatnonzero(table["camera"] == name)
+        rows = rows[np.argsort(table["line"][rows], kind="stable")]
+        line, time = table["line"][rows], table["time"][rows]
+        if len(rows) < 2:
+            raise table.error(int(rows[0]), "line", f"one line of {name} tells no line time", allowed="two or more")
+        twice = np.flatnonzero(np.diff(line) == 0.0)
+        if len(twice):
+            raise table.error(
+                int(rows[twice[0] + 1]), "line", f"this line of {name} stands twice", f"{line[twice[0]]:g}"
+            )
+        falls = np.flatnonzero(np.diff(time) <= 0.0)
+        if len(falls):
+            allowed = "a later time than that of the line before; number the lines as they were exposed"
+            raise table.error(int(rows[falls[0] + 1]), "time", "times do not rise with the lines", allowed=allowed)
+        step = np.gradient(time, line)
+        time = time + {"start": 0.5, "middle": 0.0, "end": -0.5}[conventions.line_moment] * step
+        at = LineTimes.of(line - line[0], time)
+        ends = at.at(np.array([-0.5, at.line[-1] + 0.5]))
+        for end, row in zip(ends, (rows[0], rows[-1]), strict=True):
+            if not path.first <= end <= path.last:
+                allowed = f"within orbit and attitude, {path.first:.9g} s to {path.last:.9g} s; leave out other lines"
+                raise table.error(int(row), "time", "a line outside the readings", f"{end:.9g} s", allowed)
+        found[name], origins[name] = at, float(line[0])
+    return found, origins
+
+
+def ground_of(table: Table) -> GroundPoints:
+    """Points with coordinates.
+
+    Args:
+        table: of them.
+
+    Raises:
+        InputError: a name twice, another role, a point far from the Earth's surface, sigmas that are missing, given in
+            two ways, or no covariance.
+    """
+    _once(table, "point")
+    _known(table, "role", ("control", "check"))
+    place = table.stacked("x", "y", "z")
+    radius = np.linalg.norm(place, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        height = radius - radius / np.linalg.norm(place / _EARTH_AXES, axis=1)
+    far = np.flatnonzero(~(np.abs(height) < _MOST_HEIGHT))
+    if len(far):
+        found = f"{height[far[0]] / 1e3:.6g} km above the ellipsoid"
+        allowed = "Earth-centred, Earth-fixed coordinates of the ground, not geodetic ones; and is the unit right?"
+        raise table.error(int(far[0]), "x", "no place on the ground", found, allowed)
+    return GroundPoints.of(table["point"], place, _covariance(table, place), table["role"])
+
+
+def _covariance(table: Table, place: Array) -> Array:
+    """(n, 3, 3) in axes of the ITRS, m^2."""
+    ways = [way for way in _SIGMAS if any(name in table for name in way)]
+    allowed = "or ".join(", ".join(f"{name} [m]" for name in way) + " " for way in _SIGMAS).strip()
+    if len(ways) != 1:
+        problem = "sigmas are given in two ways" if ways else "no sigmas of the coordinates"
+        raise InputError(Issue(problem, table.file, int(table.lines[0]) - 1, allowed=allowed))
+    missing = [name for name in ways[0] if name not in table]
+    if missing:
+        raise InputError(Issue(f"no column {missing[0]!r}", table.file, int(table.lines[0]) - 1, allowed=allowed))
+    correlated = [name for name in _CORRELATIONS if name in table]
+    if correlated and ways[0] != _SIGMAS[2]:
+        text = "correlations go with sigma_x, sigma_y and sigma_z"
+        raise InputError(Issue(text, table.file, int(table.lines[0]) - 1, (table.heads[correlated[0]],)))
+    for name in ways[0]:
+        bad = np.flatnonzero((table[name] == 0.0) & (table["role"] == "control"))
+        if len(bad) and np.any(table[name] > 0.0):
+            raise table.error(int(bad[0]), name, "some sigmas are zero", "0", "all positive, or all zero for exact")
+    if ways[0] == ("sigma",):
+        return np.asarray(table["sigma"][:, None, None] ** 2 * np.eye(3))
+    if ways[0] == _SIGMAS[1]:
+        return level_covariance(place, *(table[name] for name in ways[0]))
+    sigma = table.stacked(*ways[0])
+    like = np.broadcast_to(np.eye(3), (len(table), 3, 3)).copy()
+    for name, (i, j) in zip(_CORRELATIONS, ((0, 1), (0, 2), (1, 2)), strict=True):
+        if name in table:
+            like[:, i, j] = like[:, j, i] = table[name]
+    bad = np.flatnonzero(np.linalg.eigvalsh(like)[:, 0] < -1e-9)
+    if len(bad):
+        allowed = "correlations that a covariance can have"
+        raise table.error(int(bad[0]), correlated[0], "these correlations contradict each other", allowed=allowed)
+    return np.asarray(sigma[:, :, None] * like * sigma[:, None, :])
+
+
+def image_points_of(
+    table: Table,
+    names: Mapping[str, int],
+    times: Mapping[str, LineTimes],
+    origins: Mapping[str, float],
+    conventions: ConventionsSpec,
+    camera: ThreeLineCameraSpec,
+    trajectory: TabulatedTrajectory,
+) -> dict[str, ImagePoints]:
+    """Line camera -> its image points, by number of the point.
+
+    Args:
+        table: of all cameras.
+        names: point -> its number.
+        times: line camera -> line times.
+        origins: line camera -> number of its first line.
+        conventions: of pixels.
+        camera: its lines.
+        trajectory: must be known when the points were exposed.
+
+    Raises:
+        InputError: a point or camera that is none, a point twice in a camera, a place outside the image or exposed
+            where orbit or attitude are not known.
+    """
+    _known(table, "camera", tuple(times))
+    number = np.array([names.get(name, -1) for name in table["point"].tolist()])
+    if np.any(number < 0):
+        row = int(np.argmax(number < 0))
+        meant = nearest(str(table["point"][row]), names)
+        problem = "this point has no coordinates"
+        allowed = "a point of the ground table; points without coordinates belong into `tie_points`"
+        raise table.error(row, "point", problem, repr(str(table["point"][row])), allowed, meant)
+    found = {}
+    half = 0.5 if conventions.centre == "half" else 0.0
+    for name in times:
+        rows = np.flatnonzero(table["camera"] == name)
+        order = rows[np.argsort(number[rows], kind="stable")]
+        twice = np.flatnonzero(np.diff(number[order]) == 0)
+        if len(twice):
+            row = int(order[twice[0] + 1])
+            raise table.error(row, "point", f"this point stands twice in {name}", repr(str(table["point"][row])))
+        pixels, last = camera.pixels_of(name), times[name].line[-1]
+        line = table["line"][order] - half - origins[name]
+        pixel = table["pixel"][order] - half - conventions.first_pixel
+        for what, value, most, first in (
+            ("line", line, last, origins[name]),
+            ("pixel", pixel, pixels - 1, conventions.first_pixel),
+        ):
+            out = np.flatnonzero((value < -0.5) | (value > most + 0.5))
+            if len(out):
+                low, high = (v + half + first for v in (-0.5, most + 0.5))
+                row = int(order[out[0]])
+                where = f"{low:.10g} to {high:.10g}, the {what}s of {name}"
+                raise table.error(row, what, "outside the image", f"{table[what][row]:.10g}", where)
+        known = trajectory.known(times[name].at(line))
+        if not np.all(known):
+            row = int(order[np.argmin(known)])
+            problem = "exposed in a gap of the readings of orbit or attitude"
+            raise table.error(row, "line", problem, allowed="points where readings are at most 5 intervals apart")
+        sense = 1.0
+        if conventions.first_pixel_sees == "left":
+            pixel, sense = pixels - 1.0 - pixel, -1.0
+        a, b = table["sigma_line"][order], table["sigma_pixel"][order]
+        c = sense * table["correlation"][order] if "correlation" in table else np.zeros(len(order))
+        spread = np.stack([np.stack([a * a, a * b * c], -1), np.stack([a * b * c, b * b], -1)], axis=1)
+        found[name] = ImagePoints.of(number[order], line, pixel, spread)
+    return found
+
+
+def _rising(table: Table) -> NDArray[np.intp]:
+    """Rows in the order of time. InputError for a time twice."""
+    order = np.argsort(table["time"], kind="stable")
+    twice = np.flatnonzero(np.diff(table["time"][order]) == 0.0)
+    if len(twice):
+        row = int(order[twice[0] + 1])
+        raise table.error(row, "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
+    return np.asarray(order, np.intp)
+
+
+def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
+    """InputError unless the velocity is the rate of change of the places."""
+    rate = np.diff(place, axis=0) / np.diff(time)[:, None]
+    mean = 0.5 * (speed[1:] + speed[:-1])
+    # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
+    far = np.linalg.norm(rate - mean, axis=1) / np.linalg.norm(rate, axis=1)
+    if np.median(far) > _SPEED_TOLERANCE:
+        row = int(order[int(np.argsort(far)[len(far) // 2])])
+        found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
+        allowed = "velocities against the same axes as the positions; those against the stars differ by 6 % and more"
+        raise table.error(row, "vx", "not the velocity of these positions", found, allowed)
+
+
+def _known(table: Table, column: str, names: tuple[str, ...]) -> None:
+    """InputError unless every cell is one of these names."""
+    for row in np.flatnonzero(~np.isin(table[column].astype(str), names))[:1]:
+        cell = str(table[column][row])
+        raise table.error(int(row), column, f"no such {column}", repr(cell), names_text(names), nearest(cell, names))
+
+
+def _once(table: Table, column: str) -> None:
+    """InputError for a name that stands twice."""
+    seen: dict[str, int] = {}
+    for row, name in enumerate(table[column].tolist()):
+        if name in seen:
+            problem = f"stands twice, first on line {int(table.lines[seen[name]])}"
+            raise table.error(row, column, problem, repr(name), "each once")
+        seen[name] = row
+
+
+def _joined(one: GroundPoints, other: GroundPoints) -> GroundPoints:
+    names = ("ids", "itrs", "covariance", "role")
+    return GroundPoints(*(np.concatenate([getattr(one, k), getattr(other, k)]) for k in names))
+
+
+def _all_of(parts: list[ImagePoints]) -> ImagePoints:
+    names = ("point", "line", "pixel", "covariance")
+    return ImagePoints(*(np.concatenate([getattr(p, k) for p in parts]) for k in names))
