@@ -15,6 +15,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_check import OrbitCheckSpec
+from scenes.specs.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.study import StudySpec
@@ -85,6 +86,7 @@ FILE_KINDS = (
     FileKind("orbit_calibration", OrbitCalibrationSpec, "an in-orbit calibration", "twin.orbit calibrate"),
     FileKind("orbit_simulate", OrbitSimulateSpec, "a simulation of images of the ground", "twin.orbit simulate"),
     FileKind("orbit_check", OrbitCheckSpec, "a check of the conventions of a pass", "twin.orbit check"),
+    FileKind("orbit_match", OrbitMatchSpec, "points to be measured in line images", "twin.orbit match"),
     FileKind("orbit_monitor", OrbitMonitorSpec, "a test of monitoring in orbit", "twin.orbit monitor"),
     FileKind(
         "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"

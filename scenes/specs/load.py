@@ -18,6 +18,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_check import OrbitCheckSpec
+from scenes.specs.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_measured import MeasuredTestSpec
 from scenes.specs.orbit_scene import LineImageSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
@@ -207,7 +208,7 @@ def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | N
 
 
 def find_payload(
-    test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | MeasuredTestSpec | OrbitCheckSpec,
+    test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | MeasuredTestSpec | OrbitCheckSpec | OrbitMatchSpec,
 ) -> Path:
     """The file of the payload of a test in orbit. Raises InputError if there is none."""
     return _find(PAYLOADS, test.camera, test, ("camera",))

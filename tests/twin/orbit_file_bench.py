@@ -80,7 +80,13 @@ def orbit_csv(path: Path, frame: str = "ITRS", scale: str = "UTC", step: float =
     s = sampled(frame, step)
     texts = [calendar(t, scale) for t in s.seconds]
     heads = ("date_time", "x [m]", "y [m]", "z [m]", "vx [m/s]", "vy [m/s]", "vz [m/s]")
-    return csv(path, heads, texts, *(map(repr, c) for c in s.position.T.tolist()), *(map(repr, c) for c in s.velocity.T.tolist()))
+    return csv(
+        path,
+        heads,
+        texts,
+        *(map(repr, c) for c in s.position.T.tolist()),
+        *(map(repr, c) for c in s.velocity.T.tolist()),
+    )
 
 
 def attitude_csv(
@@ -219,7 +225,9 @@ def measured_points(seed: int, count: int, wrong: float = 0.0) -> tuple[list[lis
     return ground, images
 
 
-def check_files(folder: Path, count: int = 20, seed: int = 1, wrong: float = 0.0, **platform: object) -> dict[str, object]:
+def check_files(
+    folder: Path, count: int = 20, seed: int = 1, wrong: float = 0.0, **platform: object
+) -> dict[str, object]:
     """Files of the pass as a check reads them, and its specification as it stands in YAML."""
     orbit_csv(folder / "orbit.csv")
     attitude_csv(folder / "attitude.csv")
@@ -227,7 +235,11 @@ def check_files(folder: Path, count: int = 20, seed: int = 1, wrong: float = 0.0
     csv(folder / "ground.csv", ("point", "latitude [deg]", "longitude [deg]", "height [m]"), *zip(*ground, strict=True))
     heads = ("point", "camera", "line", "pixel", "sigma_line", "sigma_pixel")
     csv(folder / "image_points.csv", heads, *zip(*images, strict=True))
-    times = [(name, k, calendar(FIRST + k * LINE_TIME, digits=9)) for name in ("forward", "nadir", "aft") for k in (0, LINES - 1)]
+    times = [
+        (name, k, calendar(FIRST + k * LINE_TIME, digits=9))
+        for name in ("forward", "nadir", "aft")
+        for k in (0, LINES - 1)
+    ]
     csv(folder / "lines.csv", ("camera", "line", "date_time"), *zip(*times, strict=True))
     return {
         "name": "pass",

@@ -16,6 +16,7 @@ from scenes.specs.orbit_setup import (
     resolve_angle,
     resolve_any_calibration,
     resolve_check,
+    resolve_match,
     resolve_monitor,
     resolve_simulate,
 )
@@ -28,6 +29,20 @@ PROGRAM = "twin.orbit"
 def calibration_export(run: Any) -> Mapping[str, str]:
     """What a calibration measured, as files."""
     from twin.orbit.calibration.calibration_export import exported
+
+    return exported(run)
+
+
+def match_export(run: Any) -> Mapping[str, str]:
+    """Points that were matched, with the pass, as files."""
+    from twin.orbit.matching.match_numbers import exported
+
+    return exported(run)
+
+
+def check_export(run: Any) -> Mapping[str, str]:
+    """A pass whose conventions stand, in the project's own."""
+    from twin.orbit.conventions.check_export import exported
 
     return exported(run)
 
@@ -91,6 +106,7 @@ add_test(
     PROGRAM,
     "check",
     resolve_check,
+    resolve_match,
     ORBIT_TESTS["check"],
     """Conventions of a pass in files: every reading of what is mistaken for one another (order and sense of the
     quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two at
@@ -98,10 +114,29 @@ add_test(
 
     check.json holds the readings with residuals and likelihoods, what the points tell of each convention and what they
     cannot, and where the first points would fall under each reading. Exit codes: 0 the stated reading stands, 3 another
-    one does, 4 none explains the points.
+    one does, 4 none explains the points. With `--export DIR` a pass whose conventions stand goes into a folder that
+    `twin.orbit calibrate` reads.
 
     Example: `python -m twin.orbit check check.yaml`
     """,
+    check_export,
+)
+
+add_test(
+    app,
+    PROGRAM,
+    "match",
+    resolve_match,
+    ORBIT_TESTS["match"],
+    """Points measured in a user's line images: distinct places of an orthophoto with heights of an elevation model, and
+    tie points, are sought in every image by least squares matching, as in a simulated patch.
+
+    match.json holds for every line how many points were matched and what by. With `--export DIR` the points go with
+    orbit, attitude and line times into a folder that `twin.orbit calibrate` reads.
+
+    Example: `python -m twin.orbit match match.yaml --export points`
+    """,
+    match_export,
 )
 
 add_test(

@@ -29,6 +29,13 @@ def _check() -> Test[Any]:
     return CHECK, check_report
 
 
+def _match() -> Test[Any]:
+    from twin.orbit.matching.match_numbers import MATCH
+    from twin.orbit.matching.match_report import match_report
+
+    return MATCH, match_report
+
+
 def _monitor() -> Test[Any]:
     from twin.orbit.monitoring.monitoring_numbers import MONITOR
     from twin.orbit.monitoring.monitoring_report import monitor_report
@@ -47,6 +54,7 @@ ORBIT_TESTS: dict[str, Callable[[], Test[Any]]] = {
     "angle": _angle,
     "calibrate": _calibrate,
     "check": _check,
+    "match": _match,
     "monitor": _monitor,
     "simulate": _simulate,
 }

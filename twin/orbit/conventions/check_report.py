@@ -75,7 +75,9 @@ def _lead(run: Check) -> tuple[str, ...]:
             others = [one for one in answers if one.possible and not one.best]
             moved = max(one.moved or 0.0 for one in others)
             texts = ", ".join(question.text(one.value) for one in (best, *others))
-            lines.append(f"{question.title}: {texts} fit alike; they differ by {_metres(moved)}, which the uncertainty hides.")
+            lines.append(
+                f"{question.title}: {texts} fit alike; they differ by {_metres(moved)}, which the uncertainty hides."
+            )
     return tuple(lines)
 
 
@@ -176,5 +178,7 @@ def _warnings(run: Check) -> tuple[str, ...]:
     elif accuracy > 0.1:
         found.append(f"the way of the ground points' datum to WGS 84 is good to {accuracy:g} m only")
     if run.readings.platform.earth is None:
-        found.append("no Earth orientation was given, so that inertial frames were tried with UT1 - UTC and polar motion of 0")
+        found.append(
+            "no Earth orientation was given, so that inertial frames were tried with UT1 - UTC and polar motion of 0"
+        )
     return tuple(found)

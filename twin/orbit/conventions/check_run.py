@@ -135,7 +135,7 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     others = asked(stated, readings.platform.attitude.quaternion is not None)
     best, tried, count = _searched(bench, stated, others)
     advance("readings", 1, 3)
-    wrong = {name: 0 for name in readings.images}
+    wrong = dict.fromkeys(readings.images, 0)
     if best.fit is not None:
         masks = _wrong(bench, best.fit)
         share = float(np.mean(np.concatenate(list(masks.values()))))
@@ -252,7 +252,11 @@ def _answers(
         one = question.put(reading, value)
         try:
             fit = bench.fit(one)
-            moved = None if best.fit is None else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
+            moved = (
+                None
+                if best.fit is None
+                else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
+            )
             found.append(Answer(value, value == said, value == here, (fit.cost - best.cost) / factor, moved, ""))
         except ImpossibleError as error:
             found.append(Answer(value, value == said, value == here, np.inf, None, str(error)))
@@ -265,7 +269,9 @@ def _shown(others: dict[str, tuple[Any, ...]], best: Tried) -> list[Changes]:
     return list(dict.fromkeys([(), best.changes, *singles]))
 
 
-def _first_places(bench: PassBench, stated: PassConventions, changes: Changes, count: int) -> dict[str, np.ndarray] | str:
+def _first_places(
+    bench: PassBench, stated: PassConventions, changes: Changes, count: int
+) -> dict[str, np.ndarray] | str:
     try:
         return {name: at[:count] for name, at in bench.places(changed(stated, changes)).items()}
     except ImpossibleError as error:

@@ -118,9 +118,7 @@ class PassReadings:
     images: Mapping[str, RawPoints]
 
 
-def read_pass(
-    spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path
-) -> tuple[PassReadings, PassConventions]:
+def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -> tuple[PassReadings, PassConventions]:
     """What the files of a pass hold, and what is stated of it.
 
     Args:

@@ -76,7 +76,9 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
             _turned,
             ", ".join,
         ),
-        "angle_sequence": _of_platform("sequence of the angles", "sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")),
+        "angle_sequence": _of_platform(
+            "sequence of the angles", "sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
+        ),
         "attitude_frame": _of_platform("frame of the attitude", "attitude_frame", _FRAMES),
         "orbit_frame": _of_platform("frame of the orbit", "orbit_frame", _FRAMES),
         "orbit_time_scale": _of_platform("time scale of the orbit", "orbit_scale", _SCALES),
@@ -85,7 +87,9 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
         "line_time_offset": _of_pass("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
         "line_moment": _of_pass("moment of a line's time", "moment", ("start", "middle", "end")),
         "line_origin": _of_pass("middle of line 0 at", "line_origin", (0.0, 0.5, 1.0), lambda v: f"{v:g}"),
-        "pixel_origin": _of_pass("middle of the first pixel at", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"),
+        "pixel_origin": _of_pass(
+            "middle of the first pixel at", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"
+        ),
         "first_pixel_sees": _of_pass("first pixel sees", "sees", ("right", "left")),
         "line_axis": _of_pass(
             "lines are counted", "backward", (False, True), lambda v: "from the last" if v else "from the first"

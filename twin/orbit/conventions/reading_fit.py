@@ -171,7 +171,7 @@ class PassBench:
             rows.append(here)
             common.append(np.concatenate([turn, shift, delay[..., None] * size.time], axis=-1))
             camera = self.cameras[name]
-            from_middle = _pixel(meant, raw, camera.pixels) - 0.5 * (camera.pixels - 1)
+            from_middle = pixel_of(meant, raw, camera.pixels) - 0.5 * (camera.pixels - 1)
             scale = size.scale * from_middle[:, None]
             own.append(np.stack([line * size.interior, pixel * size.interior, pixel * scale], axis=-1))
             image = np.stack([line, pixel], axis=-1)
@@ -204,7 +204,7 @@ class PassBench:
             found.append(self._ground(name, meant, raw, replace(start, shift=_SHIFT * np.eye(3)[k]))[0])
         found.append(self._ground(name, meant, raw, start, delay=_DELAY)[0])
         pixels = self.cameras[name].pixels
-        step = np.where(_pixel(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
+        step = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
         found.append(self._ground(name, meant, raw, start, step=step)[0])
         found.append(self._ground(name, meant, raw, start, rise=_RISE)[0])
         return found, step, line_time
@@ -221,7 +221,7 @@ class PassBench:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Places (n, 3) at the heights of the ground points, ITRS, metres, and the line time at each, seconds."""
         clock = self.readings.lines[name]
-        number = _line(meant, raw, clock)
+        number = line_of(meant, raw, clock)
         beyond = (number < clock.line[0] - 1.0) | (number > clock.line[-1] + 1.0)
         if np.any(beyond):
             worst = float(number[int(np.argmax(beyond))])
@@ -229,7 +229,7 @@ class PassBench:
             raise ImpossibleError(f"line {worst:.10g} of {name} has no time in the table, which tells those of {told}")
         times, line_time = line_times(clock, meant, self.epoch, number)
         path, camera = platform.path, self.cameras[name]
-        pixel = _pixel(meant, raw, camera.pixels) + step
+        pixel = pixel_of(meant, raw, camera.pixels) + step
         outside = (pixel < -0.5) | (pixel > camera.pixels - 0.5)
         if np.any(outside):
             worst = float(pixel[int(np.argmax(outside))])
@@ -250,9 +250,7 @@ class PassBench:
         return found, line_time
 
 
-def line_times(
-    clock: LineClock, meant: PassConventions, epoch: str, line: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Middles of the exposures of lines and time from one line to the next, seconds, (n,) each.
 
     Args:
@@ -279,14 +277,14 @@ def spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
-def _line(meant: PassConventions, raw: RawPoints, clock: LineClock) -> np.ndarray:
-    """Lines of image points in the table's numbering."""
+def line_of(meant: PassConventions, raw: RawPoints, clock: LineClock) -> np.ndarray:
+    """Lines of image points (n,) in the numbering of the table of times."""
     number = raw.line - meant.line_origin
     return clock.line[0] + clock.line[-1] - number if meant.backward else number
 
 
-def _pixel(meant: PassConventions, raw: RawPoints, pixels: int) -> np.ndarray:
-    """Pixels of image points, the middle of the one that looks farthest to the right of the track being 0."""
+def pixel_of(meant: PassConventions, raw: RawPoints, pixels: int) -> np.ndarray:
+    """Pixels of image points (n,), the middle of the one that looks farthest to the right of the track being 0."""
     number = raw.pixel - meant.pixel_origin
     return number if meant.sees == "right" else pixels - 1.0 - number
 

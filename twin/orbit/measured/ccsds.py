@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
-import numpy as np
-
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
 from twin.orbit.measured.clock import known_scale
 from twin.orbit.measured.platform_readings import (
@@ -73,7 +71,9 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     clock = readings(file, [row[0] for row in rows], lines)
     require_rising(file, clock, lines)
     require_orbit(file, found[:, :3], lines)
-    return OrbitReadings(file, clock, found[:, :3], found[:, 3:], known_frame(frame, file, line), _scale(file, segments))
+    return OrbitReadings(
+        file, clock, found[:, :3], found[:, 3:], known_frame(frame, file, line), _scale(file, segments)
+    )
 
 
 def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings:
@@ -173,7 +173,9 @@ def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
         segment = _Segment()
         for meta in one.iter("metadata"):
             segment.keys |= {item.tag: ((item.text or "").strip(), 1) for item in meta}
-        heads = _STATE if kind == "OEM" else _TURN[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
+        heads = (
+            _STATE if kind == "OEM" else _TURN[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
+        )
         for state in (*one.iter("stateVector"), *one.iter("attitudeState")):
             cells = {item.tag: (item.text or "").strip() for item in state.iter()}
             if missing := [head for head in heads if not cells.get(head)]:
@@ -196,7 +198,9 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
             found = names_text(names)
             raise InputError(Issue("which satellite is not said", file, None, ("satellite",), found, "one of them"))
         return segments
-    found_segments = [s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))]
+    found_segments = [
+        s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))
+    ]
     if not found_segments:
         meant = nearest(satellite, every)
         raise InputError(Issue("no such satellite", file, None, ("satellite",), satellite, names_text(every), meant))

@@ -18,9 +18,9 @@ from scipy.interpolate import CubicSpline
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, TIME
+from twin.orbit.flight.earth import DAY, tai_of
 from twin.orbit.measured.clock import FIRST_DAY, LAST_DAY, calendar, calendar_reading, tai_minus_utc
 from twin.orbit.measured.text_file import first_lines, numbers, text_lines
-from twin.orbit.flight.earth import DAY, tai_of
 
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
 _ARCSEC = np.pi / 648000.0
@@ -168,7 +168,9 @@ def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) 
     day, _ = calendar_reading(epoch)
     mjd = day + np.arange(-3.0, 5.0)
     ones = np.ones((len(mjd), 1))
-    return EarthOrientation("", mjd, ones[:, 0] * (ut1_utc - tai_minus_utc(day)), ones * np.array(pole), 0.0 * mjd[:, None] * np.ones(2))
+    return EarthOrientation(
+        "", mjd, ones[:, 0] * (ut1_utc - tai_minus_utc(day)), ones * np.array(pole), 0.0 * mjd[:, None] * np.ones(2)
+    )
 
 
 def read_earth_orientation(path: str | Path) -> EarthOrientation:

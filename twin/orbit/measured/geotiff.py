@@ -42,7 +42,7 @@ class GeoRaster:
     dtype: str
 
     def coordinates_of(self, row: Any, column: Any) -> tuple[np.ndarray, np.ndarray]:
-        """x and y in the raster's system of places (row, column), whole or not, (...)."""
+        """X and y in the raster's system of places (row, column), whole or not, (...)."""
         a, b, c, d, e, f = self.transform
         return a * np.asarray(column) + b * np.asarray(row) + c, d * np.asarray(column) + e * np.asarray(row) + f
 
@@ -68,7 +68,7 @@ class GeoRaster:
             found = f"{size[0]} x {size[1]} pixels"
             allowed = f"at most {LARGEST_PART:.0e} pixels at once; a map that is cut to the images"
             raise InputError(Issue("too large a part of a map", self.file, None, (), found, allowed))
-        with _opened(self.file) as source:
+        with opened(self.file) as source:
             from rasterio.windows import Window
 
             window = Window(part[1].start, part[0].start, size[1], size[0])
@@ -93,7 +93,7 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
     file = str(path)
     if not is_file(Path(path)):
         raise InputError(Issue("no such file", file, allowed="a GeoTIFF"))
-    with _opened(file) as source:
+    with opened(file) as source:
         affine, tags = source.transform, source.crs
         shape, count, dtypes = (source.height, source.width), source.count, source.dtypes
         text = None if tags is None else tags.to_wkt()
@@ -107,7 +107,9 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
         found = "ground control points only" if ground else "no georeference"
         raise InputError(Issue("a raster without a place", file, None, (), found, "a GeoTIFF with a geotransform"))
     if text is None and crs is None:
-        raise InputError(Issue("a raster that does not say its system", file, None, ("crs",), None, "`crs:`, EPSG:32650"))
+        raise InputError(
+            Issue("a raster that does not say its system", file, None, ("crs",), None, "`crs:`, EPSG:32650")
+        )
     try:
         system = pyproj.CRS.from_wkt(text) if text is not None else pyproj.CRS(str(crs))
         if text is not None and crs is not None and not system.to_2d().equals(pyproj.CRS(crs).to_2d(), True):
@@ -120,7 +122,7 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
 
 
 @contextmanager
-def _opened(file: str) -> Iterator[Any]:
+def opened(file: str) -> Iterator[Any]:
     import rasterio
     from rasterio.errors import RasterioError
 

@@ -14,10 +14,10 @@ import numpy as np
 from scenes.yaml.csv_table import Column, read_table, table_text
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, shown
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
-from twin.orbit.measured.datum import Datum, Geoid
-from twin.orbit.measured.text_file import numbers, text_lines
 from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.measured.datum import Datum, Geoid
 from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
+from twin.orbit.measured.text_file import numbers, text_lines
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_files import GroundFileSpec
@@ -96,7 +96,9 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
     if np.any(high):
         row = int(np.argmax(high))
         found = f"{height[row]:.6g} m above the ellipsoid"
-        raise InputError(Issue("no place on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?"))
+        raise InputError(
+            Issue("no place on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
+        )
     covariance = _covariance(spec, file, rows, itrs, path.suffix.lower() == ".gcp" and spec.sigma_axes == "xyz")
     try:
         points = GroundPoints.of(np.array(rows.ids, object), itrs, covariance, np.array(rows.roles, object))
@@ -149,7 +151,9 @@ def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
     others = [n for names in _PLACES for n in names if n in table and not (sets and n in sets[0])]
     if len(sets) != 1 or others:
         allowed = "; or ".join(names_text(names) for names in _PLACES)
-        raise InputError(Issue("not one complete set of coordinates", file, None, (), names_text(table.columns), allowed))
+        raise InputError(
+            Issue("not one complete set of coordinates", file, None, (), names_text(table.columns), allowed)
+        )
     places = table.stacked(*sets[0])
     if sets[0] == _PLACES[0]:
         places[:, :2] = np.degrees(places[:, :2])
@@ -175,7 +179,9 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
         return  # told by whoever needs it
     right = _PLACES[0] if crs.is_geographic else _PLACES[2] if crs.is_geocentric else _PLACES[1]
     if names != right:
-        raise spec.error(f"columns {names_text(names)} are not coordinates of {crs.name}", ("crs",), allowed=names_text(right))
+        raise spec.error(
+            f"columns {names_text(names)} are not coordinates of {crs.name}", ("crs",), allowed=names_text(right)
+        )
 
 
 def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:

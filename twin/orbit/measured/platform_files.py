@@ -18,6 +18,8 @@ from scenes.specs.orbit_measured import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
+from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
+from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.ccsds import message_kind, read_aem, read_oem
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
 from twin.orbit.measured.earth_orientation import (
@@ -30,8 +32,6 @@ from twin.orbit.measured.earth_orientation import (
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
 from twin.orbit.measured.sp3 import is_sp3, read_sp3
 from twin.orbit.measured.text_file import first_lines, require_rising
-from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.flight.trajectory import Attitude
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_files import AttitudeFileSpec, OrbitFileSpec, PlatformFilesSpec
@@ -155,9 +155,7 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
     matrix = _body(attitude, meant)
     if meant.attitude_frame == "orbital":
         unit = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
-        flown = TabulatedTrajectory(
-            PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), meant.law
-        )
+        flown = TabulatedTrajectory(PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), meant.law)
         try:
             matrix = flown.orbital_to_itrs(turn_time) @ matrix
         except ValueError as error:
@@ -220,7 +218,9 @@ def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str)
     if said is None and found is None:
         raise spec.error(f"{what} is not said, neither by the file nor here", (key,), allowed=f"`{key}:` here")
     if said is not None and found is not None and said != found:
-        raise spec.error(f"{what} is said differently by the file", (key,), found=said, allowed=f"{found}, as the file says")
+        raise spec.error(
+            f"{what} is said differently by the file", (key,), found=said, allowed=f"{found}, as the file says"
+        )
     return str(said or found)
 
 
@@ -246,7 +246,9 @@ def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
     clock, scale = _clock(table, spec)
     have = [name for name in ("vx", "vy", "vz") if name in table]
     if len(have) in (1, 2):
-        raise InputError(Issue("velocities are not complete", str(path), None, (), ", ".join(have), "vx, vy, vz or none"))
+        raise InputError(
+            Issue("velocities are not complete", str(path), None, (), ", ".join(have), "vx, vy, vz or none")
+        )
     position, lines = table.stacked("x", "y", "z"), [int(v) for v in table.lines]
     require_orbit(str(path), position, lines)
     velocity = table.stacked("vx", "vy", "vz") if have else None
@@ -278,7 +280,9 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
     """Readings of a table; with the scale UTC where each of them says so by a Z."""
     if ("time" in table) == ("date_time" in table):
         found = ", ".join(table.columns)
-        raise InputError(Issue("times are not said once", table.file, None, (), found, "time [s] with `epoch:`, or date_time"))
+        raise InputError(
+            Issue("times are not said once", table.file, None, (), found, "time [s] with `epoch:`, or date_time")
+        )
     lines = [int(v) for v in table.lines]
     if "date_time" in table:
         if spec.epoch is not None:

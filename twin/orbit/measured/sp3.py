@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
 from twin.orbit.measured.clock import known_scale
 from twin.orbit.measured.platform_readings import OrbitReadings, known_frame, require_orbit
@@ -95,7 +93,9 @@ def _only_satellite(file: str, lines: list[str]) -> str:
 def satellites_near(file: str, lines: list[str], wanted: str) -> InputError:
     """What to say of a satellite that a file does not have."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
-    issue = Issue("no such satellite", file, None, ("satellite",), wanted, names_text(names[:20]), nearest(wanted, names))
+    issue = Issue(
+        "no such satellite", file, None, ("satellite",), wanted, names_text(names[:20]), nearest(wanted, names)
+    )
     return InputError(issue)
 
 
