@@ -21,7 +21,7 @@ from scenes.specs.load import (
     load_three_line_camera,
     paths_of_cameras,
 )
-from scenes.specs.measured_setup import MeasuredCalibrationSetup, is_measured, resolve_measured_calibration
+from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup, is_measured, resolve_measured_calibration
 from scenes.specs.orbit_angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_check import OrbitCheckSpec
@@ -308,6 +308,7 @@ def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> Non
         if name not in names:
             allowed = f"{names_text(names)}, the lines of {camera.name}"
             raise test.error("no such line", key, found=name, allowed=allowed, suggestion=nearest(name, names))
+    _require_places(test, test.changes, camera)
     _require_images_of(test, test.lines, camera)
     line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
     _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
@@ -325,6 +326,7 @@ def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec
         problem = f"the camera has no {' and no '.join(missing)} line"
         raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
     _require_lines(test, test.changes)
+    _require_places(test, (*test.changes, *test.drift), camera)
     if "nadir" in test.changes and any(test.changes["nadir"].principal_point):
         raise test.error(
             "the nadir line's principal point is the gauge",
@@ -343,6 +345,14 @@ def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec
 
 
 _THREE_LINES = "a camera with lines forward, nadir and aft"
+
+
+def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraSpec) -> None:
+    """InputError for a change of a line that is known by looks and not by places."""
+    for name in changes:
+        if name in camera.lines and camera.lines[name].by_look_angles:
+            problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
+            raise test.error(problem, ("changes", name), allowed="a line with `shift` and `rotate` of its CCDs")
 
 
 def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...] = LINES) -> None:

@@ -7,7 +7,7 @@ distortion) and by how it is mounted on the base.
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import LookAngle
@@ -15,14 +15,52 @@ from scenes.specs.orbit_scene import LineImageSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Name, Named, Spec, Text, Whole
-from scenes.yaml.units import ANGLE, Kind
+from scenes.yaml.units import ANGLE, LENGTH, Kind
 
 _PER_LENGTH2 = Kind("an inverse length squared", "1/m^2", ("1/m^2", "1/mm^2"), "0.02 1/m^2")
 _PER_LENGTH4 = Kind("an inverse length to the fourth", "1/m^4", ("1/m^4", "1/mm^4"), "1 1/m^4")
 Distortion3 = Annotated[float, Quantity(_PER_LENGTH2, largest="100 1/m^2")]
 Distortion5 = Annotated[float, Quantity(_PER_LENGTH4, largest="1e5 1/m^4")]
 Misalignment = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
+LookCoefficient = Annotated[float, Quantity(ANGLE, largest="60 deg")]
+CcdShift = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="50 mm"), 2)]
+CcdTurn = Annotated[float, Quantity(ANGLE, largest="1 deg")]
+LookAngles = Annotated[tuple[LookCoefficient, ...], Field(min_length=1, max_length=10)]
 LongestLine = Annotated[Whole, Field(ge=2, le=1_000_000)]
+
+
+class CcdSpec(Spec):
+    """What is known of one CCD of a line that is made of several: where it lies, or where its pixels look.
+
+    A place, ``shift`` and ``rotate``, is against that of the same pixels on a straight line of the payload's pitch.
+    Look angles, ``psi_x`` and ``psi_y``, are coefficients c0, c1, ... of c0 + c1 s + c2 s^2 + ... of the pixel's number
+    s, counted from 0 on the whole line; the look is along (tan psi_x, tan psi_y, 1) in the camera's axes. They hold for
+    the line's focal_length and principal_point, whose changes are counted from there, and contain the distortion.
+
+    Attributes:
+        first, last: its pixels, both included.
+        shift: x (flight) and y (along the line) in the focal plane, metres.
+        rotate: about the line of sight, from +x toward +y, about the CCD's middle, radians.
+        psi_x: forward, radians; per pixel, pixel^2, ... after the first.
+        psi_y: to the right, likewise.
+    """
+
+    first: Annotated[Whole, Field(ge=0)]
+    last: Annotated[Whole, Field(ge=0)]
+    shift: CcdShift = (0.0, 0.0)
+    rotate: CcdTurn = 0.0
+    psi_x: LookAngles | None = None
+    psi_y: LookAngles | None = None
+
+    @model_validator(mode="after")
+    def _is_known_in_one_way(self) -> "CcdSpec":
+        if self.last <= self.first:
+            raise Problem("a CCD of one pixel or none", f"{self.first} to {self.last}", "a last pixel after the first")
+        if (self.psi_x is None) != (self.psi_y is None):
+            raise Problem("look angles along one axis only", None, "both psi_x and psi_y")
+        if self.psi_x is not None and (any(self.shift) or self.rotate):
+            raise Problem("look angles and a place", None, "psi_x and psi_y, or shift and rotate")
+        return self
 
 
 class LineCameraSpec(Spec):
@@ -45,6 +83,7 @@ class LineCameraSpec(Spec):
         pixels: how many; None for as many as the payload says.
         pitch: of its pixels, metres; None for the payload's.
         image: how it forms and records its image; None for the payload's.
+        ccds: of which it is made, from pixel 0 on; empty for one straight line.
     """
 
     look: LookAngle
@@ -57,6 +96,19 @@ class LineCameraSpec(Spec):
     pixels: LongestLine | None = None
     pitch: PixelPitch | None = None
     image: LineImageSpec | None = None
+    ccds: tuple[CcdSpec, ...] = ()
+
+    @property
+    def by_look_angles(self) -> bool:
+        """Whether a CCD of it is known by the looks of its pixels."""
+        return any(ccd.psi_x is not None for ccd in self.ccds)
+
+    @model_validator(mode="after")
+    def _is_distorted_once(self) -> "LineCameraSpec":
+        if self.by_look_angles and (self.k1 or self.k2):
+            problem = "look angles contain the distortion"
+            raise Problem(problem, f"k1 {self.k1:g} 1/m^2, k2 {self.k2:g} 1/m^4", "neither", within=("k1",))
+        return self
 
 
 def _some_lines(lines: Named[LineCameraSpec]) -> Named[LineCameraSpec]:
@@ -84,6 +136,23 @@ class ThreeLineCameraSpec(Spec):
     pitch: PixelPitch
     lines: Annotated[Named[LineCameraSpec], AfterValidator(_some_lines)]
     image: LineImageSpec | None = None
+
+    @model_validator(mode="after")
+    def _ccds_make_lines(self) -> "ThreeLineCameraSpec":
+        for name, line in self.lines.items():
+            following = 0
+            for k, ccd in enumerate(line.ccds):
+                if ccd.first != following:
+                    found = f"pixel {ccd.first} where {following} is the next"
+                    allowed = "each pixel of the line on one CCD, in order"
+                    key = ("lines", name, "ccds", k, "first")
+                    raise Problem("CCDs leave a gap or overlap", found, allowed, within=key)
+                following = ccd.last + 1
+            if line.ccds and following != self.pixels_of(name):
+                found = f"{following} pixels of {self.pixels_of(name)}"
+                allowed = "each pixel on one CCD"
+                raise Problem("CCDs do not make up the line", found, allowed, within=("lines", name, "ccds"))
+        return self
 
     def pixels_of(self, line: str) -> int:
         """How many pixels a line has. KeyError if there is no such line."""

@@ -242,8 +242,8 @@ def run_test(
             with folder:
                 for name, text in export(run).items():
                     folder.write_text(name, text)
-                facts = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
-                write_manifest(folder, program, session.started, session.seconds, **facts)
+                said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
+                write_manifest(folder, program, session.started, session.seconds, **said)
         shown = with_warnings(report(run), given)
         numbers = {**procedure.numbers(run), "verdict": shown.verdict}
         config, name = setup.with_seed(number).to_yaml(), session.backend.name

@@ -86,10 +86,7 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
     if setup.camera is not None:
         laboratory = line_cameras(setup.camera)
         turns = {name: rotation_matrix(change.rotate).T for name, change in spec.changes.items()}
-        turned = {
-            name: replace(camera, directions=camera.directions @ turns[name]) if name in turns else camera
-            for name, camera in laboratory.items()
-        }
+        turned = {name: camera.turned(turns[name]) if name in turns else camera for name, camera in laboratory.items()}
         return AngleCamera(FrozenMap(laboratory), FrozenMap(turned), FrozenMap())
     if setup.instrument is None or backend is None:
         raise ValueError("an instrument's lines need a backend to be traced")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from scenes.specs.measured_setup import MeasuredCalibrationSetup
+from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.measured.measurement_files import CAMERA_FILE, campaign_files

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from analysis.units import ARCSEC
-from scenes.specs.measured_setup import MeasuredCalibrationSetup
+from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_run import CalibrationRun

@@ -19,7 +19,7 @@ from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.measured_setup import MeasuredCalibrationSetup
+from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous

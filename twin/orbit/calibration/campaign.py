@@ -31,8 +31,8 @@ from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
+    from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec, ReadingErrorsSpec
     from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-    from scenes.specs.orbit_measured import MeasuredCalibrationSpec, ReadingErrorsSpec
     from scenes.specs.orbit_spec import ErrorsSpec
     from twin.orbit.calibration.field_images import FieldImages
 
@@ -350,7 +350,7 @@ def _field_pass(
     _, latitude, height = earth.geodetic(one.ground.itrs[known])
     pitch = {name: payload.pitch_of(name) for name in one.images}
     own = FrozenMap({name: models[name] for name in one.images})
-    data = PassData(one.name, FrozenMap(sensors), own, FrozenMap(pitch), float(np.mean(height)))
+    data = PassData(one.name, FrozenMap(sensors), own, FrozenMap(pitch), float(np.mean(height)), lines=payload.lines)
     check = (role == "check") & (rays > 1)
     tie = (role == "tie") & (rays > 1)
     # control points first, ties after them

@@ -22,12 +22,14 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import pixel_places
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.pass_measurements import ImagePoints
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_angle import EffectsSpec
+    from scenes.specs.three_line_camera import LineCameraSpec
 
 
 EFFECTS = ("light_time", "aberration", "refraction")
@@ -103,6 +105,7 @@ class PassData:
         height: mean of the ground above the ellipsoid, metres.
         unit: metres in the focal plane; every ray carries the covariance of its own image point in units of it
             squared. None: rays carry none.
+        lines: line -> what the payload's file says of it, for CCDs that do not lie in one line; None where they do.
     """
 
     name: str
@@ -111,6 +114,14 @@ class PassData:
     pitch: Mapping[str, float]
     height: float
     unit: float | None = None
+    lines: Mapping[str, LineCameraSpec] | None = None
+
+    def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
+        """Where pixels (n,) of a line lie in its focal plane, (n, 2), metres."""
+        if self.lines is not None:
+            return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
+        y = self.pitch[name] * (pixel - 0.5 * (self.sensors[name].camera.pixels - 1))
+        return np.column_stack([np.zeros_like(y), y])
 
     @property
     def phase(self) -> float:
@@ -156,8 +167,7 @@ class PassData:
         for name, row in images.items():
             sensor = self.sensors[name]
             seconds = sensor.time(row.line)
-            y = self.pitch[name] * (row.pixel - 0.5 * (sensor.camera.pixels - 1))
-            image = np.column_stack([np.zeros_like(y), y])
+            image = self.places(name, row.pixel)
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
             # the noise of readings is shared by its own clock, which ticks at the readings
             rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
@@ -173,7 +183,7 @@ class PassData:
         self,
         images: Mapping[str, ImagePoints],
         ground: np.ndarray,
-        covariance: np.ndarray,
+        covariance: float | tuple[float, float] | np.ndarray,
         removed: LightEffects,
         control: np.ndarray | None = None,
     ) -> CalibrationField:
@@ -182,7 +192,8 @@ class PassData:
         Args:
             images: line -> their image points.
             ground: (m, 3) given coordinates, ITRS, metres.
-            covariance: (m, 3, 3) of the coordinates, m^2; of ties not used.
+            covariance: (m, 3, 3) of the coordinates, m^2, of ties not used; or a sigma of each coordinate, or of each
+                axis in plan and of the height, metres.
             removed: effects on the light that are taken out.
             control: (m,) which of them are control, the others are ties; None for all.
 

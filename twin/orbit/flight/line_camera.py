@@ -9,7 +9,7 @@ polynomial, and for a traced line as good as the trace.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -23,13 +23,29 @@ from optics.raytrace.system import assemble
 from scenes.models.camera_assembly import line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.channel import BASE
-from scenes.specs.three_line_camera import LineCameraSpec, ThreeLineCameraSpec
+from scenes.specs.three_line_camera import CcdSpec, LineCameraSpec, ThreeLineCameraSpec
 
 TRACED_POINTS = 49
 """Points of a traced line. An unperturbed line needs nine terms; the rest is for figure errors."""
 _NOISE = 1e-14
 """Terms of a traced series below this share are rounding and are dropped (one pixel is 1e-6 rad)."""
 _PLANE_POINTS = 1001
+_LOOK_TERMS = 12
+"""Of the tangent of a look angle within 30 deg over one CCD: its series falls off by a thousandfold every few terms."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinePiece:
+    """One CCD of a line.
+
+    Attributes:
+        first, last: its pixels.
+        directions: as those of `LineCamera`, over its own pixels.
+    """
+
+    first: int
+    last: int
+    directions: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +61,20 @@ class LineCamera:
         directions: Chebyshev coefficients over the line of a vector along the look, body frame, (K, 3); its length does
             not matter.
         origins: those of a point on the ray, body frame, (J, 3), metres.
+        pieces: of a line of several CCDs, from its first pixel on, in place of ``directions``, which then are those
+            without offsets.
     """
 
     name: str
     pixels: int
     directions: np.ndarray
     origins: np.ndarray
+    pieces: tuple[LinePiece, ...] = ()
+
+    def turned(self, turn: np.ndarray) -> LineCamera:
+        """The line with its looks turned in body axes, look @ turn, (3, 3)."""
+        pieces = tuple(replace(piece, directions=piece.directions @ turn) for piece in self.pieces)
+        return replace(self, directions=self.directions @ turn, pieces=pieces)
 
     def look(self, pixel: np.ndarray) -> np.ndarray:
         """Unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
@@ -58,7 +82,7 @@ class LineCamera:
         Raises:
             ValueError: a pixel outside the line.
         """
-        vector = self._series(self.directions, pixel)
+        vector = self._vector(pixel)[0]
         return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
     def look_and_slope(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,8 +91,7 @@ class LineCamera:
         Raises:
             ValueError: a pixel outside the line.
         """
-        vector = self._series(self.directions, pixel)
-        change = self._series(chebyshev.chebder(self.directions), pixel) * (2.0 / self.pixels)
+        vector, change = self._vector(pixel)
         length = np.linalg.norm(vector, axis=-1, keepdims=True)
         look = vector / length
         return look, (change - look * np.sum(look * change, axis=-1, keepdims=True)) / length
@@ -80,6 +103,20 @@ class LineCamera:
             ValueError: a pixel outside the line.
         """
         return self._series(self.origins, pixel)
+
+    def _vector(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A vector along the look and its derivative by the pixel, both (N, 3)."""
+        change = self._series(chebyshev.chebder(self.directions), pixel) * (2.0 / self.pixels)
+        vector = self._series(self.directions, pixel)
+        at = np.asarray(pixel, dtype=np.float64)
+        for piece in self.pieces:
+            here = (at >= piece.first - 0.5) & (at <= piece.last + 0.5)
+            width = piece.last - piece.first + 1
+            place = (2.0 * (at[here] - piece.first) + 1.0) / width - 1.0
+            slope = chebyshev.chebder(piece.directions) * (2.0 / width)
+            vector[here] = np.moveaxis(chebyshev.chebval(place, piece.directions), 0, -1)
+            change[here] = np.moveaxis(chebyshev.chebval(place, slope), 0, -1)
+        return vector, change
 
     def _series(self, coefficients: np.ndarray, pixel: np.ndarray) -> np.ndarray:
         pixel = np.asarray(pixel, dtype=np.float64)
@@ -98,17 +135,55 @@ def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
 
 def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> LineCamera:
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
-    x0, y0 = line.principal_point
+    degree = 5 if line.k2 else 3
 
-    def look(pixel: np.ndarray) -> np.ndarray:
-        y = (pixel - 0.5 * (pixels - 1)) * pitch - y0
-        x = np.full_like(y, -x0)
+    def look(pixel: np.ndarray, ccd: CcdSpec | None = None) -> np.ndarray:
+        x, y = (ccd_places(line, ccd, pixel, pixels, pitch) - np.array(line.principal_point)).T
         square = x**2 + y**2
         corrected = 1.0 + line.k1 * square + line.k2 * square**2
         return np.stack([-x * corrected, -y * corrected, np.full_like(y, line.focal_length)], axis=-1) @ to_body.T
 
-    degree = 5 if line.k2 else 3
-    return LineCamera(name, pixels, _coefficients(look, pixels, degree + 1), np.array([line.position]))
+    pieces = []
+    for ccd in line.ccds:
+        terms = degree + 1 if ccd.psi_x is None else max(_LOOK_TERMS, len(ccd.psi_x), len(ccd.psi_y or ()))
+        width = ccd.last - ccd.first + 1
+        nodes = ccd.first + _nodes(width, terms)
+        pieces.append(LinePiece(ccd.first, ccd.last, _through(look(nodes, ccd))))
+    straight = _coefficients(look, pixels, degree + 1)
+    return LineCamera(name, pixels, straight, np.array([line.position]), tuple(pieces))
+
+
+def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
+    """Where pixels of a line lie in its focal plane, x (flight) and y (along the line) from the line's centre, metres.
+
+    Args:
+        line: of a payload.
+        pixel: places on the line, (N,).
+        pixels: how many it has.
+        pitch: of its pixels, metres.
+
+    Returns:
+        (N, 2).
+    """
+    at = np.asarray(pixel, dtype=np.float64)
+    found = ccd_places(line, None, at, pixels, pitch)
+    for ccd in line.ccds:
+        here = (at >= ccd.first - 0.5) & (at <= ccd.last + 0.5)
+        found[here] = ccd_places(line, ccd, at[here], pixels, pitch)
+    return found
+
+
+def ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
+    """As `pixel_places`, of pixels of one CCD, or of a straight line without CCDs."""
+    straight = (pixel - 0.5 * (pixels - 1)) * pitch
+    if ccd is None:
+        return np.stack([np.zeros_like(straight), straight], axis=-1)
+    if ccd.psi_x is not None and ccd.psi_y is not None:
+        x, y = (np.tan(np.polynomial.polynomial.polyval(pixel, c)) for c in (ccd.psi_x, ccd.psi_y))
+        return np.array(line.principal_point) - line.focal_length * np.stack([x, y], axis=-1)
+    middle = (0.5 * (ccd.first + ccd.last) - 0.5 * (pixels - 1)) * pitch
+    along, turn = straight - middle, ccd.rotate
+    return np.stack([ccd.shift[0] - along * np.sin(turn), ccd.shift[1] + middle + along * np.cos(turn)], axis=-1)
 
 
 def traced_line_cameras(instrument: Instrument, backend: Backend, state: State | None = None) -> dict[str, LineCamera]:
@@ -145,7 +220,7 @@ def traced_line_cameras(instrument: Instrument, backend: Backend, state: State |
         offset = position[i] - camera_origin
         nearest = position[i] - direction[i] * np.sum(offset * direction[i], axis=-1, keepdims=True)
         series = [_chopped(_through(values)) for values in (direction[i], nearest)]
-        cameras[name] = LineCamera(name, line.pixels, *series)
+        cameras[name] = LineCamera(name, line.pixels, series[0], series[1])
     return cameras
 
 

@@ -40,7 +40,9 @@ def _verdict(run: Match) -> str:
     if ways:
         way, name = max(ways)
         far = f"camera and platform expected them {way:.1f} px away in {name}, the line in which they are most wrong"
-    shares = [(float(line.accepted.mean()), name) for one in run.points.sorts.values() for name, line in one.lines.items()]
+    shares = [
+        (float(line.accepted.mean()), name) for one in run.points.sorts.values() for name, line in one.lines.items()
+    ]
     share, name = min(shares)
     return one_sentence(
         f"{', '.join(counts)} points were measured in {len(run.ground.images)} images",

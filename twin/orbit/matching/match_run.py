@@ -191,12 +191,16 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> 
         first_pixel = sensor.camera.pixels - spec.first_pixel - column - columns
     if first_pixel < 0 or first_pixel + columns > sensor.camera.pixels:
         found = f"columns {column} to {column + columns - 1} from pixel {spec.first_pixel}"
-        allowed = f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
+        allowed = (
+            f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
+        )
         raise InputError(spec.issue("an image wider than its line", ("first_pixel",), found=found, allowed=allowed))
     if first_line + rows > sensor.lines + 1:
         found = f"lines to {first_line + rows - 1}"
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
-        raise InputError(spec.issue("an image longer than its line times", ("first_line",), found=found, allowed=allowed))
+        raise InputError(
+            spec.issue("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
+        )
     return UserImage(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
@@ -219,7 +223,9 @@ def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
             raise InputError(spec.issue("a window outside of the image", ("window",), allowed=allowed))
         if rows * columns > LARGEST_PART:
             found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
-            raise InputError(spec.issue("too large an image to be matched at once", ("window",), found=found, allowed=allowed))
+            raise InputError(
+                spec.issue("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
+            )
         values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
     if values.dtype.kind not in "uif":
         raise InputError(Issue("values that are no grey values", file, None, (), str(values.dtype), "real numbers"))
@@ -296,4 +302,6 @@ def _used(points: MatchedPoints) -> np.ndarray:
 
 
 def _joined(parts: list[ImagePoints]) -> ImagePoints:
-    return ImagePoints(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("point", "line", "pixel", "covariance")))
+    return ImagePoints(
+        *(np.concatenate([getattr(p, n) for p in parts]) for n in ("point", "line", "pixel", "covariance"))
+    )

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.specs.measured_setup import DATA_FILE
+from scenes.specs.measured.orbit_data_setup import DATA_FILE
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 

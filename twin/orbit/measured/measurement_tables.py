@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.calibration_parameters import level_covariance
-from scenes.specs.orbit_measured import ConventionsSpec, OrbitDataSpec, PassFilesSpec, body_axes_matrix
+from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec, body_axes_matrix
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest

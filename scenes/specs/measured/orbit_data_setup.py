@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import find_payload, load_orbit_test, load_three_line_camera
-from scenes.specs.orbit_measured import (
+from scenes.specs.measured.orbit_data import (
     FILE_KEYS,
     MeasuredAngleSpec,
     MeasuredCalibrationSpec,

@@ -1,0 +1,1 @@
+"""Tests that run on what somebody measured, and what their files say of it."""
