@@ -12,10 +12,10 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.measured.orbit_check import OrbitCheckSpec
+from scenes.specs.measured.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_check import OrbitCheckSpec
-from scenes.specs.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
 from scenes.specs.study import StudySpec

@@ -166,9 +166,8 @@ def sp3(path: Path, scale: str = "GPS", step: float = 1.0, version: str = "d", s
     ]
     for t, r, v in zip(s.seconds, s.position / 1e3, s.velocity * 10.0, strict=True):
         now = datetime.fromisoformat(calendar(t, scale))
-        lines.append(
-            f"*  {now:%Y} {now.month:2d} {now.day:2d} {now.hour:2d} {now.minute:2d} {now.second + now.microsecond * 1e-6:11.8f}"
-        )
+        second = now.second + now.microsecond * 1e-6
+        lines.append(f"*  {now:%Y} {now.month:2d} {now.day:2d} {now.hour:2d} {now.minute:2d} {second:11.8f}")
         for name, scale_of in (("G01", 3.86), ("L51", 1.0)):
             lines.append(f"P{name}" + "".join(f"{x * scale_of:14.6f}" for x in r) + f"{999999.999999:14.6f}")
             if speeds:
@@ -190,7 +189,7 @@ def interior_and_bias() -> tuple[np.ndarray, float]:
 
 
 def measured_points(seed: int, count: int, wrong: float = 0.0) -> tuple[list[list[object]], list[list[object]]]:
-    """Rows of ground points and image points of th1's lines, with noise of 0.2 px and 1 m, camera and platform wrong."""
+    """Rows of ground points and image points of th1's lines, with noise of 0.2 px and 1 m, all a little wrong."""
     from optics.geometry.pose import rotation_matrix
     from scenes.specs.load import load_three_line_camera
     from twin.orbit.flight.line_camera import line_cameras

@@ -12,11 +12,10 @@ from typing import Any
 
 import typer
 
+from scenes.specs.measured.pass_files_setup import resolve_check, resolve_match
 from scenes.specs.orbit_setup import (
     resolve_angle,
     resolve_any_calibration,
-    resolve_check,
-    resolve_match,
     resolve_monitor,
     resolve_simulate,
 )
@@ -106,11 +105,10 @@ add_test(
     PROGRAM,
     "check",
     resolve_check,
-    resolve_match,
     ORBIT_TESTS["check"],
     """Conventions of a pass in files: every reading of what is mistaken for one another (order and sense of the
-    quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two at
-    once, is tried on the ground points and ranked.
+    quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two
+    at once, is tried on the ground points and ranked.
 
     check.json holds the readings with residuals and likelihoods, what the points tell of each convention and what they
     cannot, and where the first points would fall under each reading. Exit codes: 0 the stated reading stands, 3 another

@@ -21,12 +21,12 @@ from twin.run.procedure import Advance, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import CheckSetup
+    from scenes.specs.measured.pass_files_setup import CheckSetup
 
 Verdict = Literal["stands", "another", "none"]
 DECIDED = 20.0
-"""Two readings are told apart if one is exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that one
-in a hundred checks is wrong at most."""
+"""Two readings are told apart if one is exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that
+one in a hundred checks is wrong at most."""
 _FITS = 9.0
 """Chi-square over its freedom up to which a reading explains the points: sigmas three times too small."""
 _ROUGH_POINTS = 8
@@ -231,7 +231,7 @@ def _best(tried: Sequence[Tried]) -> Tried:
 
 
 def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
-    """Line -> which of its points are gross errors under a reading: far beyond their own noise and the others' scatter."""
+    """Line -> which of its points are gross errors under a reading: far beyond noise and the others' scatter."""
     square = np.einsum("ni,nij,nj->n", fit.left, np.linalg.inv(fit.noise), fit.left)
     scale = max(float(np.median(square)) / float(chi2.median(2)), 1.0)
     bad = square > scale * chi2.isf(_WRONG_SHARE, 2)

@@ -19,7 +19,7 @@ from twin.orbit.measured.platform_files import Conventions, PlatformReadings, re
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_check import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
+    from scenes.specs.measured.orbit_check import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
     from scenes.specs.three_line_camera import ThreeLineCameraSpec
 
 _LINES = (
@@ -182,7 +182,7 @@ def _clock(table: Table, spec: LineTimesFileSpec) -> Readings:
         raise InputError(spec.issue("times are not said once", ("file",), allowed="a column time [s] or date_time"))
     try:
         if "date_time" in table:
-            return Readings.of_texts(table["date_time"])
+            return Readings.of_texts(table["date_time"].tolist())
         if spec.epoch is None:
             raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
         return Readings.after(spec.epoch, table["time"])

@@ -1,10 +1,10 @@
 """How well a reading of a pass explains its ground points.
 
 Every image point is followed down to the height of its ground point, and what is left between the two in plan is the
-residual. It may come from the image point, from the ground point, and from camera and platform, which are wrong by what
-is stated of them: a turn and a shift of the platform and a shift of the times that all points share, a shift and a
-scale of each line. So the residuals have a covariance with large common parts; a convention whose mistake looks like one
-of those cannot be told by them, and one that no such error can make is told at once.
+residual. It may come from the image point, from the ground point, and from camera and platform, which are wrong by
+what is stated of them: a turn and a shift of the platform and a shift of the times that all points share, a shift and
+a scale of each line. So the residuals have a covariance with large common parts; a convention whose mistake looks like
+one of those cannot be told by them, and one that no such error can make is told at once.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from twin.orbit.measured.earth_orientation import constant_orientation
 from twin.orbit.measured.platform_files import Conventions, platform_table
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_check import UncertaintySpec
+    from scenes.specs.measured.orbit_check import UncertaintySpec
 
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
 """Steps of the derivatives: radians, metres, seconds, metres."""
@@ -297,7 +297,7 @@ def _plan(known: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 
 def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """(n, 2, 2) of residuals from the ground points' covariances; rise: (n, 2) by which a metre of height moves them."""
+    """(n, 2, 2) of residuals from ground points' covariances; rise: (n, 2) by which a metre of height moves them."""
     lon, lat, _ = Earth().geodetic(known.itrs[point])
     axes = east_north_up(lon, lat)
     level = axes @ known.covariance[point] @ np.swapaxes(axes, 1, 2)

@@ -13,7 +13,6 @@ import numpy as np
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 
-
 BEYOND = 0.1
 """Pixels: standard deviation added to what the matching claims, for what no fit shows: another season's light (RMS of
 matches 0.11 px where 0.06 is claimed), the attitude between its readings. A tie point has it where it was chosen."""

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.orbit_setup import MatchSetup, resolve_match
+from scenes.specs.measured.pass_files_setup import MatchSetup, resolve_match
 from twin.orbit.images.simulate_numbers import PointNumbers
 from twin.orbit.matching.match_run import Match, UserImage, run_match
 from twin.orbit.measured.map_part import MapPart
@@ -51,7 +51,8 @@ class MapNumbers:
     def of(cls, part: MapPart) -> Self:
         """Of one map."""
         missing = 0.0 if part.valid is None else 1.0 - float(np.mean(part.valid))
-        return cls(part.raster.crs.name, *part.first, *part.values.shape, part.spacing, missing)
+        rows, columns = part.values.shape
+        return cls(part.raster.crs.name, *part.first, rows, columns, part.spacing, missing)
 
 
 @dataclass(frozen=True)

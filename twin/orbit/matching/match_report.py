@@ -85,17 +85,17 @@ def _facts(run: Match) -> tuple[tuple[str, str], ...]:
 def _measured(run: Match) -> Section:
     spec = run.setup.test.points
     text = (
-        f"Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's image "
-        f"are brought into each line's geometry by camera and platform as they are known, templates of {spec.template} "
-        f"pixels, sought {spec.reach} pixels to each side, and fitted by least squares. Rejected is what fails a "
+        "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
+        f"image are brought into each line's geometry by camera and platform as they are known, templates of "
+        f"{spec.template} pixels, sought {spec.reach} pixels to each side, and fitted by least squares. Rejected is what fails a "
         "threshold of the matching, and what does not follow the smooth displacement of its neighbours.",
     )
     figures = [
         PngFigure(
             f"points-{sort}",
             f"From expected to found, {sort} points",
-            "Arrows as long as they are in the image, after the median displacement in the title was taken off, enlarged "
-            "as the title says; crosses: rejected by the neighbours; points: not matched.",
+            "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
+            "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
             points_png(run.ground, one),
         )
         for sort, one in run.points.sorts.items()

@@ -163,12 +163,10 @@ _TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1
 def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(Issue("XML with a document type", file, 1, (), None, "elements alone"))
-    parser = ElementTree.XMLPullParser(events=("start", "end"))
     try:
         root = ElementTree.fromstring(text.encode())
     except ElementTree.ParseError as error:
         raise InputError(Issue(f"not XML: {error.msg}", file, error.position[0])) from None
-    del parser
     for one in root.iter("segment"):
         segment = _Segment()
         for meta in one.iter("metadata"):

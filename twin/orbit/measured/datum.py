@@ -21,7 +21,8 @@ from scenes.yaml.errors import InputError, Issue, Problem, shown
 from twin.orbit.measured.geotiff import GeoRaster, open_raster
 
 _ALLOWED = "a code or a text that PROJ knows, as EPSG:4979 (WGS 84 with ellipsoidal height), EPSG:32650, OGC:CRS84"
-_CGCS2000 = "China 2000"
+CGCS2000 = "China 2000"
+"""As EPSG calls its datum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +83,10 @@ class Geoid:
         u, v = np.clip(row - r0, 0.0, 1.0), column - np.floor(column) if around else np.clip(column - c0, 0.0, 1.0)
         upper = (1.0 - v) * values[r0, c0] + v * values[r0, c1]
         lower = (1.0 - v) * values[r0 + 1, c0] + v * values[r0 + 1, c1]
-        found = (1.0 - u) * upper + u * lower
-        if not np.all(np.isfinite(found)):
+        height = (1.0 - u) * upper + u * lower
+        if not np.all(np.isfinite(height)):
             raise Problem("a place where the grid of the geoid holds nothing", None, self.raster.file)
-        return np.asarray(found)
+        return np.asarray(height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,13 +163,13 @@ class Datum:
         height = z
         if self.geoid is not None:
             height = z + self.geoid(*self.geographic.transform(x, y))
-        found = np.stack(self.forward.transform(x, y, height), axis=-1)
-        good = np.all(np.isfinite(found), axis=-1)
+        places = np.stack(self.forward.transform(x, y, height), axis=-1)
+        good = np.all(np.isfinite(places), axis=-1)
         if not np.all(good):
             k = int(np.argmin(np.ravel(good)))
             text = f"{np.ravel(x)[k]:g}, {np.ravel(y)[k]:g}"
             raise Problem(f"no place in {self.crs.name}", text, "coordinates of that system", within=(k,))
-        return found
+        return places
 
     @property
     def accuracy(self) -> float | None:
@@ -184,6 +185,6 @@ class Datum:
 
 def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
     geodetic, target = crs.geodetic_crs, pyproj.CRS("EPSG:4978")
-    if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == _CGCS2000:
+    if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
         target = GeocentricCRS(datum=geodetic.datum)
     return pyproj.Transformer.from_crs(crs, target, always_xy=True, allow_ballpark=False, only_best=True)

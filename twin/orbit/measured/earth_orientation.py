@@ -129,8 +129,8 @@ class TableRotation:
         return np.asarray(erfa.c2tcio(celestial, erfa.era00(self.julian, ut1), self._polar(t, pole)))
 
     def mean_equinox(self, seconds: Any) -> np.ndarray:
-        """Rotation TEME -> ITRS, (...) -> (..., 3, 3): by Greenwich mean sidereal time of 1982 and polar motion (Vallado
-        et al., AIAA 2006-6753, appendix C).
+        """Rotation TEME -> ITRS, (...) -> (..., 3, 3): by Greenwich mean sidereal time of 1982 and polar motion
+        (Vallado et al., AIAA 2006-6753, appendix C).
         """
         ut1, pole, _ = self.turn(seconds)
         return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ _about_z(erfa.gmst82(self.julian, ut1)))
@@ -204,11 +204,11 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
         found = f"{len(cells[short])} columns"
         raise InputError(Issue("a row of another length", file, lines[short], (), found, f"{len(cells[0])} columns"))
     heads = ("MJD", "x", "y", "UT1-UTC", "dX", "dY")
-    found = numbers(file, [[row[k] for k in place] for row in cells], lines, heads)
-    late = found[:, 0] >= FIRST_DAY
+    table = numbers(file, [[row[k] for k in place] for row in cells], lines, heads)
+    late = table[:, 0] >= FIRST_DAY
     lines = [k for k, one in zip(lines, late, strict=True) if one]
-    found = found[late]
-    return _checked(file, lines, found[:, 0], found[:, 3], found[:, 1:3] * _ARCSEC, found[:, 4:6] * _ARCSEC)
+    table = table[late]
+    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _ARCSEC)
 
 
 _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
@@ -226,8 +226,8 @@ def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
         if all(cut[1:4]):
             cells.append([text or "0" for text in cut])
             lines.append(k)
-    found = numbers(file, cells, lines, tuple(_FINALS))
-    return _checked(file, lines, found[:, 0], found[:, 3], found[:, 1:3] * _ARCSEC, found[:, 4:6] * _MAS)
+    table = numbers(file, cells, lines, tuple(_FINALS))
+    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _MAS)
 
 
 def _checked(

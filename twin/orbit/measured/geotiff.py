@@ -27,8 +27,8 @@ class GeoRaster:
     Attributes:
         file: its path.
         crs: of its coordinates.
-        transform: (a, b, c, d, e, f): x = a column + b row + c and y = d column + e row + f with (0, 0) the middle of the
-            first pixel.
+        transform: (a, b, c, d, e, f): x = a column + b row + c and y = d column + e row + f, (0, 0) being the middle of
+            the first pixel.
         shape: rows and columns.
         band: that is read, counted from 1.
         dtype: of its values.
@@ -123,6 +123,7 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
 
 @contextmanager
 def opened(file: str) -> Iterator[Any]:
+    """The file as rasterio's dataset. InputError if it is none that can be read, or becomes so while it is read."""
     import rasterio
     from rasterio.errors import RasterioError
 

@@ -20,7 +20,7 @@ from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
 from twin.orbit.measured.text_file import numbers, text_lines
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_files import GroundFileSpec
+    from scenes.specs.measured.pass_files import GroundFileSpec
 
 _SIGMAS = ("sigma_east", "sigma_north", "sigma_up")
 _PLACES = (("longitude", "latitude", "height"), ("east", "north", "height"), ("x", "y", "z"))
@@ -207,7 +207,7 @@ def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
             raise InputError(Issue("not a feature", file, None, key, shown(one), "a Feature of a Point"))
         geometry, properties = one.get("geometry"), one.get("properties") or {}
         kind = geometry.get("type") if isinstance(geometry, dict) else None
-        if kind != "Point" or not isinstance(properties, dict):
+        if not isinstance(geometry, dict) or kind != "Point" or not isinstance(properties, dict):
             raise InputError(Issue("not a point", file, None, (*key, "geometry"), shown(kind), "a Point"))
         place = geometry.get("coordinates")
         if not isinstance(place, list) or len(place) != 3 or not all(map(_finite, place)):
@@ -267,12 +267,12 @@ def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray]]:
     ids = [row[0] for row in rows]
     _unique(file, ids, lines)
     images: dict[str, list[np.ndarray]] = {}
-    for k, row in enumerate(rows):
-        for start in range(7, len(row), 5):
+    for k, cells in enumerate(rows):
+        for start in range(7, len(cells), 5):
             heads = ("column", "row", "sigma column", "sigma row")
-            column, line, sigma_column, sigma_row = numbers(file, [row[start + 1 : start + 5]], [lines[k]], heads)[0]
+            column, line, sigma_column, sigma_row = numbers(file, [cells[start + 1 : start + 5]], [lines[k]], heads)[0]
             if not (sigma_column > 0.0 and sigma_row > 0.0):
-                raise InputError(Issue("not a sigma", file, lines[k], ("image",), shown(row[start]), "above zero"))
-            images.setdefault(row[start], []).append(np.array([k, line, column, sigma_row, sigma_column]))
+                raise InputError(Issue("not a sigma", file, lines[k], ("image",), shown(cells[start]), "above zero"))
+            images.setdefault(cells[start], []).append(np.array([k, line, column, sigma_row, sigma_column]))
     measured = {name: np.array(values) for name, values in images.items()}
     return _Rows(ids, found[:, [1, 0, 2]], found[:, 3:], ["control"] * len(ids), lines), measured

@@ -12,11 +12,11 @@ from pyproj.exceptions import ProjError
 
 from scenes.yaml.errors import InputError, Issue, Problem
 from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.measured.datum import Geoid
+from twin.orbit.measured.datum import CGCS2000, Geoid
 from twin.orbit.measured.geotiff import GeoRaster, open_raster
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_files import RasterFileSpec
+    from scenes.specs.measured.pass_files import RasterFileSpec
 
 _SAMPLED = 512
 """Rows and columns at which a map is looked through for its extreme heights."""
@@ -111,9 +111,9 @@ class UserMap:
             raise spec.error(problem, ("heights",), allowed=allowed)
         geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
         try:
-            target = _WGS84
-            if flat.geodetic_crs is not None and flat.geodetic_crs.datum.name == "China 2000":
-                target = flat.geodetic_crs.to_2d()
+            geodetic, target = flat.geodetic_crs, pyproj.CRS(_WGS84)
+            if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
+                target = geodetic.to_2d()
             way = pyproj.Transformer.from_crs(
                 flat.to_2d(), target, always_xy=True, allow_ballpark=False, only_best=True
             )

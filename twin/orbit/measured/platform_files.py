@@ -6,7 +6,7 @@ Reading and understanding are two steps: `PlatformReadings` holds what the files
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.specs.orbit_measured import body_axes_matrix
+from scenes.specs.measured.orbit_data import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
@@ -34,7 +34,7 @@ from twin.orbit.measured.sp3 import is_sp3, read_sp3
 from twin.orbit.measured.text_file import first_lines, require_rising
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_files import AttitudeFileSpec, OrbitFileSpec, PlatformFilesSpec
+    from scenes.specs.measured.pass_files import AttitudeFileSpec, OrbitFileSpec, PlatformFilesSpec
 
 _ORBIT = tuple(Column(name, DISTANCE) for name in "xyz") + tuple(Column(f"v{n}", SPEED, needed=False) for n in "xyz")
 _CLOCK = (Column("time", TIME, needed=False), Column("date_time", text=True, needed=False))
@@ -51,7 +51,7 @@ _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 
 @dataclass(frozen=True)
 class Conventions:
-    """What the numbers of orbit and attitude files mean; names as in `scenes.specs.orbit_files`.
+    """What the numbers of orbit and attitude files mean; names as in `scenes.specs.measured.pass_files`.
 
     Attributes:
         orbit_frame, attitude_frame: axes.
@@ -74,7 +74,7 @@ class Conventions:
     turns: str = "body_to_frame"
     body_axes: tuple[str, str, str] = ("forward", "right", "down")
     sequence: str = "xyz"
-    law: Attitude = Attitude()
+    law: Attitude = field(default_factory=Attitude)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,13 +289,12 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
             raise spec.error("an epoch for times of the day", ("epoch",), allowed="no epoch, or a column time [s]")
         texts = table["date_time"]
         try:
-            clock = Readings.of_texts(texts)
+            clock = Readings.of_texts(texts.tolist())
         except Problem as problem:
             row = int(problem.within[0])
             raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
-        zoned = all(text.endswith("Z") for text in texts)
         require_rising(table.file, clock, lines)
-        return clock, "UTC" if zoned else None
+        return clock, "UTC" if all(text.endswith("Z") for text in texts) else None
     if spec.epoch is None:
         raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
     try:
@@ -306,8 +305,8 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
     except Problem as problem:
         raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
     if between and spec.leap_seconds is None:
-        problem = f"{between:g} leap seconds lie between the epoch and the times"
-        raise spec.error(problem, ("leap_seconds",), allowed="counted or skipped")
+        count = f"{between:g} leap seconds lie between the epoch and the times"
+        raise spec.error(count, ("leap_seconds",), allowed="counted or skipped")
     require_rising(table.file, clock, lines)
     return clock, zoned
 

@@ -1,5 +1,5 @@
-"""Orbit and attitude as a file holds them, before anything is read into them: clock readings and numbers, with the frame
-and the time scale that the file itself states.
+"""Orbit and attitude as a file holds them, before anything is read into them: clock readings and numbers, with the
+frame and the time scale that the file itself states.
 """
 
 from __future__ import annotations

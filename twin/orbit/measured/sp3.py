@@ -67,6 +67,8 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
             break
     if not ended:
         raise InputError(Issue("the file ends early", file, len(lines), (), None, "EOF as the last line"))
+    if not rows and satellite is not None:
+        raise _unknown(file, lines, satellite)
     if len(rows) < 2:
         raise InputError(Issue(f"fewer than two places of {which}", file, None, (), str(len(rows)), "two or more"))
     clock = readings(file, texts, where)
@@ -90,7 +92,7 @@ def _only_satellite(file: str, lines: list[str]) -> str:
     return names[0]
 
 
-def satellites_near(file: str, lines: list[str], wanted: str) -> InputError:
+def _unknown(file: str, lines: list[str], wanted: str) -> InputError:
     """What to say of a satellite that a file does not have."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
     issue = Issue(

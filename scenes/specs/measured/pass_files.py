@@ -1,4 +1,4 @@
-"""Files of other people's formats that tell of a pass in orbit, with what the files themselves do not say of their numbers."""
+"""Files of other people's formats that tell of a pass, with what the files themselves do not say of their numbers."""
 
 import os
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_measured import BodyAxes
+from scenes.specs.measured.orbit_data import BodyAxes
 from scenes.specs.orbit_spec import EarthSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity
@@ -37,7 +37,7 @@ ClockReading = Annotated[str, BeforeValidator(_reading)]
 
 
 class OrbitFileSpec(Spec):
-    """An orbit in a file: SP3-c or d, CCSDS OEM, or CSV. What a file says of itself may be left out here, and must agree.
+    """An orbit in a file: SP3-c or d, CCSDS OEM, or CSV. What a file says itself may be left out here; else both agree.
 
     Attributes:
         file: path.
@@ -45,7 +45,7 @@ class OrbitFileSpec(Spec):
         frame: axes of positions and velocities; inertial ones need Earth orientation.
         time_scale: what the clock shows.
         epoch: reading of that clock at 0 s, for tables with `time [s]`.
-        leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; only asked for where there are some.
+        leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
         offset: seconds to be added to the times.
     """
 
@@ -67,12 +67,12 @@ class AttitudeFileSpec(Spec):
         frame: that the body is turned against; `orbital` has X forward, Z down, Y = Z x X.
         time_scale: what the clock shows.
         epoch: reading of that clock at 0 s, for tables with `time [s]`.
-        leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; only asked for where there are some.
+        leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
         offset: seconds to be added to the times.
         scalar: where a quaternion's scalar part stands, the cosine of half the turn.
         turns: what the quaternion does to the components of a vector, v' = q v q*.
         body_axes: what x, y and z of the file's body point to in flight, as [forward, right, down].
-        sequence: of roll about X, pitch about Y and yaw about Z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
+        sequence: of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
         nadir, steering: of the orbital frame, as in `attitude` of a simulated pass.
     """
 

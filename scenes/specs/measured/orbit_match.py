@@ -4,8 +4,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from scenes.specs.orbit_check import LineTimesFileSpec
-from scenes.specs.orbit_files import PlatformFilesSpec, PointSigma, RasterFileSpec
+from scenes.specs.measured.orbit_check import LineTimesFileSpec
+from scenes.specs.measured.pass_files import PlatformFilesSpec, PointSigma, RasterFileSpec
 from scenes.specs.orbit_scene import ImagePointsSpec, LightEffectsSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.spec import Name, Named, Reference, Spec, Text, Whole

@@ -4,7 +4,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from scenes.specs.orbit_files import AngleSigma, ClockReading, GroundFileSpec, PlatformFilesSpec, PointSigma, TimeScale
+from scenes.specs.measured.pass_files import (
+    AngleSigma,
+    ClockReading,
+    GroundFileSpec,
+    PlatformFilesSpec,
+    PointSigma,
+    TimeScale,
+)
 from scenes.specs.orbit_scene import LightEffectsSpec
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Name, Number, Reference, Spec, Text, Whole
