@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -263,4 +264,48 @@ def check_files(
             "first_pixel": 0,
             "first_pixel_sees": "right",
         },
+    }
+
+
+def match_files(folder: Path, flown: Any) -> dict[str, object]:
+    """Files of a simulated pass as `match` reads them, and its specification as it stands in YAML."""
+    from twin.orbit.flight.platform_table import PlatformTable
+    from twin.orbit.images.simulate_report import map_facts
+    from twin.orbit.measured.measurement_files import _csv
+    from twin.run.data_files import FrameFacts, tiff
+
+    table = PlatformTable.sampled(flown.measured, 1.0, 0.125)
+    orbit = {"time [s]": table.orbit_time, **dict(zip(("x [m]", "y [m]", "z [m]"), table.position.T, strict=True))}
+    orbit |= dict(zip(("vx [m/s]", "vy [m/s]", "vz [m/s]"), table.velocity.T, strict=True))
+    attitude = {"time [s]": table.attitude_time, **dict(zip(("q1", "q2", "q3", "q4"), table.quaternion.T, strict=True))}
+    (folder / "orbit.csv").write_text(_csv(orbit))
+    (folder / "attitude.csv").write_text(_csv(attitude))
+    rows, images = [], {}
+    for name, image in flown.patch.images.items():
+        window = image.window
+        numbers = np.array([window.first_line, window.first_line + window.lines - 1])
+        rows += [(name, k, repr(float(t))) for k, t in zip((0, window.lines - 1), image.measured.time(numbers), strict=True)]
+        (folder / f"{name}.tiff").write_bytes(tiff(image.frame[None], FrameFacts()))
+        images[name] = {"file": f"{name}.tiff", "first_pixel": window.first_pixel, "first_pixel_sees": "right"}
+    csv(folder / "lines.csv", ("camera", "line", "time [s]"), *zip(*rows, strict=True))
+    control = flown.patch.control
+    (folder / "photo.tiff").write_bytes(tiff(control.orthophoto.values[None], map_facts(control.orthophoto, "")))
+    (folder / "dem.tiff").write_bytes(tiff(control.dem.values[None], map_facts(control.dem, "", heights=True)))
+    time = {"time_scale": "UTC", "epoch": flown.spec.orbit.epoch}
+    return {
+        "name": "pass",
+        "camera": "th1",
+        "platform": {
+            "orbit": {"file": "orbit.csv", "frame": "ITRS", **time},
+            "attitude": {
+                **{"file": "attitude.csv", "frame": "ITRS", **time},
+                **{"scalar": "last", "turns": "body_to_frame", "body_axes": AXES},
+            },
+        },
+        "lines": {"file": "lines.csv", "moment": "middle", **time},
+        "images": images,
+        "orthophoto": {"file": "photo.tiff"},
+        "dem": {"file": "dem.tiff"},
+        "control_sigma": ["1 m", "2 m"],
+        "points": {"control": 60, "check": 20, "tie": 40, "reach": 40, "template": 31},
     }

@@ -110,7 +110,8 @@ def _ranking(run: Check) -> Table:
         "ranking",
         "Readings, the likeliest first",
         f"Those that change one convention; check.json has all of {run.count}. Residuals in plan, as they are; "
-        "chi-square over its freedom with what camera and platform may be wrong by; cost: minus twice the log of the likelihood "
+        "chi-square over its freedom with what camera and platform may be wrong by; cost: minus twice the log "
+        "of the likelihood "
         "over the best one's.",
         ("reading", "rms [m]", "rms [px]", "chi-square", "cost", "verdict"),
         [_row(one, run) for one in (*first, *rest)],
@@ -127,8 +128,8 @@ def _questions(run: Check) -> Section:
             cost = max(one.excess, 0.0) if np.isfinite(one.excess) else None
             rows.append((question.title, question.text(one.value), "yes" if one.stated else "", one.moved, cost, told))
     text = (
-        "Each convention by itself, the others as in the best reading. A value cannot be told from the best if the "
-        "points would lie elsewhere by no more than camera and platform may be wrong by: give smaller uncertainties, after a "
+        "Each convention by itself, the others as in the best reading. A value cannot be told from the best if the"
+        " points would lie elsewhere by no more than camera and platform may be wrong by: give smaller uncertainties, after a "
         "calibration, or more points, if it matters.",
     )
     table = Table(

@@ -87,7 +87,8 @@ def _measured(run: Match) -> Section:
     text = (
         "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
         f"image are brought into each line's geometry by camera and platform as they are known, templates of "
-        f"{spec.template} pixels, sought {spec.reach} pixels to each side, and fitted by least squares. Rejected is what fails a "
+        f"{spec.template} pixels, sought {spec.reach} pixels to each side, and fitted by least squares. "
+        f"Rejected is what fails a "
         "threshold of the matching, and what does not follow the smooth displacement of its neighbours.",
     )
     figures = [

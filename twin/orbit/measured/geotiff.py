@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -125,14 +126,15 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
 def opened(file: str) -> Iterator[Any]:
     """The file as rasterio's dataset. InputError if it is none that can be read, or becomes so while it is read."""
     import rasterio
-    from rasterio.errors import RasterioError
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     try:
         # a file beside the raster, or one that its name or contents refer to, is not the raster
-        with (
-            rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", CPL_CURL_ENABLE="NO"),
-            rasterio.open(Path(file).resolve(), driver=None, sharing=False) as source,
-        ):
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", CPL_CURL_ENABLE="NO"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                source = rasterio.open(Path(file).resolve(), driver=list(_DRIVERS), sharing=False)
+        with source:
             if source.driver not in _DRIVERS:
                 raise InputError(Issue("a raster of another format", file, None, (), source.driver, "GeoTIFF or GTX"))
             yield source
