@@ -211,11 +211,13 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _ARCSEC)
 
 
+_FINAL = {"x": (134, 144), "y": (144, 154), "UT1-UTC": (154, 165), "dX": (165, 175), "dY": (175, 185)}
+"""Of Bulletin B, which is final; later days have Bulletin A alone."""
 _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
 
 
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Bulletin A of finals2000A; days without prediction of all that is needed are left out."""
+    """Bulletin B of finals2000A where it is given, else A; days without prediction of what is needed are left out."""
     cells, lines = [], []
     for k, line in rows:
         cut = [line[a:b].strip() for a, b in _FINALS.values()]
@@ -223,6 +225,8 @@ def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
             raise InputError(Issue("a line that ends early", file, k, (), f"{len(line)} characters", WHAT))
         if len(line) < 15:
             raise InputError(Issue("not a line of this table", file, k, (), repr(line[:40]), WHAT))
+        final = [line[a:b].strip() for a, b in _FINAL.values()]
+        cut[1:] = final if all(final) else cut[1:]
         if all(cut[1:4]):
             cells.append([text or "0" for text in cut])
             lines.append(k)

@@ -161,7 +161,7 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
         except ValueError as error:
             raise InputError(Issue(f"attitude against the orbit: {error}", attitude.file)) from None
     elif rotation is not None and meant.attitude_frame != "ITRS":
-        matrix = _to_itrs(meant.attitude_frame, rotation)(turn_time) @ matrix
+        matrix = to_itrs(meant.attitude_frame, rotation)(turn_time) @ matrix
     quaternion = Rotation.from_matrix(matrix).as_quat(canonical=False)
     try:
         return PlatformTable.of(epoch, time, position, velocity, turn_time, quaternion)
@@ -174,7 +174,7 @@ def _in_itrs(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     if frame == "ITRS" or rotation is None:
         return orbit.position, orbit.velocity
-    turn = _to_itrs(frame, rotation)
+    turn = to_itrs(frame, rotation)
     matrix = turn(time)
     position = np.einsum("nij,nj->ni", matrix, orbit.position)
     if orbit.velocity is None:
@@ -183,8 +183,8 @@ def _in_itrs(
     return position, np.einsum("nij,nj->ni", matrix, orbit.velocity) - carried
 
 
-def _to_itrs(frame: str, rotation: TableRotation) -> Any:
-    """Seconds (N,) -> rotation (N, 3, 3) from a frame to the ITRS."""
+def to_itrs(frame: str, rotation: TableRotation) -> Any:
+    """Seconds (N,) -> rotation (N, 3, 3) from an inertial frame to the ITRS, by the Earth's rotation."""
     if frame == "TEME":
         return rotation.mean_equinox
     if frame == "EME2000":
