@@ -65,7 +65,7 @@ def date(epoch: str, seconds: float) -> Any:
 def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) -> None:
     """With pole, UT1 and celestial pole offsets of the same table; 0.6 mm and 2 um/s: its nutation is interpolated."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D
-    from org.orekit.frames import FramesFactory
+    from org.orekit.frames import FramesFactory, StaticTransform
     from org.orekit.utils import IERSConventions, PVCoordinates
 
     from twin.orbit.measured.platform_files import to_itrs
@@ -138,7 +138,7 @@ def test_messages_against_orekit_s_own_readers(orekit: Path, tmp_path: Path) -> 
     from org.orekit.files.ccsds.ndm.adm.aem import Aem, AemSegment
     from org.orekit.files.ccsds.ndm.odm.oem import Oem, OemSegment
     from org.orekit.files.sp3 import SP3Coordinate, SP3Ephemeris, SP3Parser, SP3Segment
-    from org.orekit.frames import FramesFactory
+    from org.orekit.frames import FramesFactory, StaticTransform
     from org.orekit.utils import IERSConventions, TimeStampedAngularCoordinates, TimeStampedPVCoordinates
 
     itrf = FramesFactory.getITRF(IERSConventions.IERS_2010, True)
@@ -167,7 +167,8 @@ def test_messages_against_orekit_s_own_readers(orekit: Path, tmp_path: Path) -> 
         turn = state.getRotation()  # from the frame outside to the body, as their reader turns every direction
         for axis in np.eye(3):
             body = Vector3D(*axis.tolist())
-            seen = inertial.getTransformTo(itrf, when).transformVector(turn.applyInverseTo(body))
+            to_itrf = StaticTransform.cast_(inertial.getTransformTo(itrf, when))
+            seen = to_itrf.transformVector(turn.applyInverseTo(body))
             np.testing.assert_allclose(path.body_to_itrs(np.array([t]))[0] @ axis, seen.toArray(), rtol=0, atol=1e-9)
     theirs = SP3Parser().parse(DataSource(str(tmp_path / "a.sp3")))
     satellite = SP3Ephemeris.cast_(theirs.getSatellites().get("L51"))

@@ -156,7 +156,7 @@ def sp3(path: Path, scale: str = "GPS", step: float = 1.0, version: str = "d", s
     lines = [
         f"#{version}{mode}{first:%Y} {first.month:2d} {first.day:2d} {first.hour:2d} {first.minute:2d} "
         f"{first.second + first.microsecond * 1e-6:11.8f} {len(s.seconds):7d} ORBIT IGS20 HLM  IGS",
-        "## 1626 529500.00000000     1.00000000 55625 0.1284722222222",
+        f"## 1626 529500.00000000 {step:14.8f} 55625 0.1284722222222",
         "+    2   G01L51" + "  0" * 15,
         "++         0  0" + "  0" * 15,
         f"%c M  cc {scale:<3} ccc cccc cccc cccc cccc ccccc ccccc ccccc ccccc",

@@ -156,10 +156,10 @@ def epoch_before(instants: Instants) -> str:
     """UTC of the first of the instants, at its full second, ISO 8601 text ending in Z."""
     first = np.argmin(instants.day * DAY + instants.second)
     second = float(instants.second[first])
-    day = int(instants.day[first])
-    second -= tai_minus_utc(int(np.floor(day + second / DAY)))
-    whole = int(np.floor(second / DAY))
-    day, second = day + whole, second - whole * DAY
+    rough = int(instants.day[first]) + (second - tai_minus_utc(int(instants.day[first]))) / DAY
+    day = int(np.floor(rough))
+    # within a leap second it is the one before
+    second = min((int(instants.day[first]) - day) * DAY + second - tai_minus_utc(day), DAY - 1.0)
     return (datetime.fromordinal(day + _MJD_ZERO) + timedelta(seconds=int(second))).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 

@@ -40,11 +40,11 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     frame = known_frame(head[46:51], file, 1, "coordinate system") if head[46:51].strip() else None
     texts, where, places, rows, speeds, speed_rows = [], [], [], [], [], []
     epoch: str | None = None
-    ended = False
+    ended = last_used = False
     for k, line in enumerate(lines):
         mark = line[:1]
         if mark == "*":
-            epoch = _epoch(file, k + 1, line)
+            epoch, last_used = _epoch(file, k + 1, line), False
         elif mark in "PV" and line[1:4].strip() == which:
             if epoch is None:
                 raise InputError(Issue("a record before the first epoch", file, k + 1, (), shown(line[:20]), WHAT))
