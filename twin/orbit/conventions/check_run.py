@@ -30,7 +30,7 @@ one in a hundred checks is wrong at most."""
 _FITS = 9.0
 """Chi-square over its freedom up to which a reading explains the points: sigmas three times too small."""
 _ROUGH_POINTS = 8
-_CANDIDATES = 60
+_CANDIDATES = 40
 _ROUNDS = 3
 """Each adds two questions that may be wrong."""
 _WRONG_SHARE = 1e-6

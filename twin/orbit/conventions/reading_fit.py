@@ -43,20 +43,23 @@ class ImpossibleError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """A platform that is turned and shifted a little."""
+    """A platform that is turned and shifted a little, for each of some times by itself."""
 
     path: TabulatedTrajectory
-    turn: np.ndarray = field(default_factory=lambda: np.eye(3))
-    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    turn: np.ndarray | None = None
+    shift: np.ndarray | None = None
 
     def position(self, seconds: Any) -> np.ndarray:
-        return self.path.position(seconds) + self.shift
+        found = self.path.position(seconds)
+        # the sensor also asks for its first and last line
+        return found if self.shift is None or len(found) != len(self.shift) else found + self.shift
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
         return self.path.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        return self.path.body_to_itrs(seconds) @ self.turn
+        found = self.path.body_to_itrs(seconds)
+        return found if self.turn is None else found @ self.turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,19 +198,17 @@ class PassBench:
         self, name: str, meant: PassConventions, raw: RawPoints, path: TabulatedTrajectory
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Places as read, with turns, shifts, a delay, the next pixel and a height; pixels' steps and line times."""
-        start = _Turned(path)
-        base, line_time = self._ground(name, meant, raw, start)
-        found = [base]
-        for k in range(3):
-            found.append(self._ground(name, meant, raw, replace(start, turn=rotation_matrix(_TURN * np.eye(3)[k])))[0])
-        for k in range(3):
-            found.append(self._ground(name, meant, raw, replace(start, shift=_SHIFT * np.eye(3)[k]))[0])
-        found.append(self._ground(name, meant, raw, start, delay=_DELAY)[0])
-        pixels = self.cameras[name].pixels
-        step = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
-        found.append(self._ground(name, meant, raw, start, step=step)[0])
-        found.append(self._ground(name, meant, raw, start, rise=_RISE)[0])
-        return found, step, line_time
+        n, pixels = len(raw.line), self.cameras[name].pixels
+        turn, shift = np.broadcast_to(np.eye(3), (10, n, 3, 3)).copy(), np.zeros((10, n, 3))
+        turn[1:4] = rotation_matrix(_TURN * np.eye(3))[:, None]
+        shift[4:7] = _SHIFT * np.eye(3)[:, None]
+        delay, step, rise = np.zeros((10, n)), np.zeros((10, n)), np.zeros((10, n))
+        one = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
+        delay[7], step[8], rise[9] = _DELAY, one, _RISE
+        moved = _Turned(path, turn.reshape(-1, 3, 3), shift.reshape(-1, 3))
+        every = raw.taken(np.tile(np.arange(n), 10))
+        found, line_time = self._ground(name, meant, every, moved, delay.ravel(), step.ravel(), rise.ravel())
+        return list(found.reshape(10, n, 3)), one, line_time[:n]
 
     def _ground(
         self,
@@ -215,9 +216,9 @@ class PassBench:
         meant: PassConventions,
         raw: RawPoints,
         platform: _Turned,
-        delay: float = 0.0,
+        delay: np.ndarray | float = 0.0,
         step: np.ndarray | float = 0.0,
-        rise: float = 0.0,
+        rise: np.ndarray | float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Places (n, 3) at the heights of the ground points, ITRS, metres, and the line time at each, seconds."""
         clock = self.readings.lines[name]
