@@ -79,6 +79,7 @@ def test_one_wrong_convention_is_found(files, what: str) -> None:
     found = checked(files, change)
     assert found.verdict == "another"
     assert found.best.changes == ((question, right),)
+    assert found.alike == ()
     stated = found.stated_fit
     assert stated.fit is None or stated.cost - found.best.cost > 100.0 * DECIDED
 
@@ -105,11 +106,13 @@ def test_half_a_pixel_is_found_where_camera_and_platform_are_known_well_enough(t
     small = {"attitude": "0.02 arcsec", "position": "0.05 m", "interior": 0.02, "scale": 0.0, "time": "0 s"}
     data["uncertainty"] = small
     assert checked((tmp_path, data)).best.changes == ()
-    for key, question, right in ((("image_points", "centre"), "pixel_origin", 0.0),):
-        found = checked((tmp_path, data), (key, "half"))
-        assert found.verdict == "another"
-        # the file's half pixel is one of lines, too
-        assert dict(found.best.changes) == {question: right, "line_origin": 0.0}
+    found = checked((tmp_path, data), (("image_points", "centre"), "half"))
+    assert found.verdict == "another"
+    # the file's half pixel is one of lines, too, which is the same as a time of the line's begin: both are listed
+    both = [dict(found.best.changes), *map(dict, found.alike)]
+    assert {"pixel_origin": 0.0, "line_origin": 0.0} in both
+    assert {"pixel_origin": 0.0, "line_moment": "start"} in both
+    assert all(one["pixel_origin"] == 0.0 for one in both)
 
 
 @pytest.mark.slow

@@ -128,6 +128,7 @@ class CheckNumbers:
 
     result: str
     best: Mapping[str, Any]
+    alike: Sequence[Mapping[str, Any]]
     reading: Mapping[str, Any]
     readings_tried: int
     decided_by_cost: float
@@ -150,6 +151,7 @@ class CheckNumbers:
         return cls(
             result=run.verdict,
             best=changes_data(run.best.changes),
+            alike=[changes_data(one) for one in run.alike],
             reading={name: value_of(name, QUESTIONS[name].get(reading)) for name in run.answers},
             readings_tried=run.count,
             decided_by_cost=DECIDED,

@@ -64,7 +64,7 @@ def _metres(value: float) -> str:
 
 
 def _lead(run: Check) -> tuple[str, ...]:
-    lines = []
+    lines = [f"Fits alike: {changes_text(one)}." for one in run.alike]
     for name, answers in run.answers.items():
         question = QUESTIONS[name]
         stated = next(one for one in answers if one.stated)
@@ -104,7 +104,8 @@ def _row(one: Tried, run: Check) -> tuple[Cell, ...]:
 
 def _ranking(run: Check) -> Table:
     stated, single = run.stated_fit, [one for one in run.tried if len(one.changes) <= 1 and one is not run.best]
-    first = [run.best] + ([stated] if stated is not run.best else [])
+    first = [run.best, *(one for one in run.tried if one.changes in run.alike)]
+    first += [stated] if stated not in first else []
     rest = [one for one in single if one not in first][: _LISTED - len(first)]
     return Table(
         "ranking",

@@ -118,6 +118,17 @@ class Check:
     wrong: dict[str, int]
 
     @property
+    def alike(self) -> tuple[Changes, ...]:
+        """Other readings with no more changes than the best one, as likely as it: the points cannot tell which it is."""
+        return tuple(
+            one.changes
+            for one in self.tried
+            if one is not self.best
+            and len(one.changes) <= len(self.best.changes)
+            and (one.cost - self.best.cost) / self.factor < DECIDED
+        )
+
+    @property
     def stated_fit(self) -> Tried:
         """The stated reading."""
         return next(one for one in self.tried if not one.changes)

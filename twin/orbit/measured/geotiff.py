@@ -133,7 +133,7 @@ def opened(file: str) -> Iterator[Any]:
         with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", CPL_CURL_ENABLE="NO"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                source = rasterio.open(Path(file).resolve(), driver=list(_DRIVERS), sharing=False)
+                source = rasterio.open(Path(file).resolve(), sharing=False)
         with source:
             if source.driver not in _DRIVERS:
                 raise InputError(Issue("a raster of another format", file, None, (), source.driver, "GeoTIFF or GTX"))
