@@ -23,8 +23,8 @@ from rich.console import Console
 
 from optics.numerics.backend import BackendUnavailable
 from optics.numerics.llvm import LibraryMissing
+from scenes.kinds.file_kinds import FILE_KINDS
 from scenes.specs.course import DEFAULT_PIVOT
-from scenes.specs.file_kinds import FILE_KINDS
 from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
 from scenes.specs.load import INSTRUMENTS, library_names
 from scenes.specs.resolved import resolve_job

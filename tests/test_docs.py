@@ -32,9 +32,11 @@ from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
 from scenes.specs.resolved import resolve
+from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
+from twin.orbit.measured.measurement_tables import COLUMNS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -126,7 +128,15 @@ def test_every_block_is_of_a_sort_that_is_tested() -> None:
 
 def tables() -> list[Piece]:
     """Contents of CSV files: of a course's table."""
-    return blocks("csv")
+    return [block for block in blocks("csv") if block.page != MEASURED_ORBIT]
+
+
+def measured_tables() -> list[Piece]:
+    """Contents of CSV files: of measurements of a pass."""
+    return [block for block in blocks("csv") if block.page == MEASURED_ORBIT]
+
+
+MEASURED_ORBIT = "docs/measured_orbit.md"
 
 
 def models_of(text: str) -> list[type[Any]]:
@@ -162,6 +172,18 @@ def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path
     check_nodes(job, instrument("gf7_pair").nodes)
     assert job.course is not None
     assert len(job.course.times) == len(block.text.splitlines()) - 1
+
+
+@pytest.mark.parametrize("block", measured_tables(), ids=str)
+def test_a_table_of_measurements_can_be_read(block: Piece, tmp_path: Path) -> None:
+    file = tmp_path / "table.csv"
+    file.write_text(block.text, "utf-8")
+    found = []
+    for columns in COLUMNS.values():
+        with contextlib.suppress(InputError):
+            found.append(read_table(file, columns))
+    assert len(found) == 1
+    assert len(found[0]) == len(block.text.splitlines()) - 1
 
 
 def test_yaml_blocks_that_are_wrong_are_found() -> None:

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from optics.numerics.backend import load_backend
-from scenes.specs.file_kinds import read_for
+from scenes.kinds.file_kinds import read_for
 from scenes.specs.job import ACTIONS
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout

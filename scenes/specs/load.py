@@ -15,13 +15,11 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
-from scenes.specs.measured.orbit_check import OrbitCheckSpec
-from scenes.specs.measured.orbit_data import MeasuredTestSpec
-from scenes.specs.measured.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_scene import LineImageSpec
 from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.orbit_spec import PayloadTestSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
@@ -207,12 +205,7 @@ def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | N
     return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
 
 
-PayloadTest = (
-    OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | MeasuredTestSpec | OrbitCheckSpec | OrbitMatchSpec
-)
-
-
-def find_payload(test: PayloadTest) -> Path:
+def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | PayloadTestSpec) -> Path:
     """The file of the payload of a test in orbit. Raises InputError if there is none."""
     return _find(PAYLOADS, test.camera, test, ("camera",))
 

@@ -21,7 +21,6 @@ from scenes.specs.load import (
     load_three_line_camera,
     paths_of_cameras,
 )
-from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup, is_measured, resolve_measured_calibration
 from scenes.specs.orbit_angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
@@ -173,15 +172,6 @@ def resolve_calibration(path: str | Path) -> CalibrationSetup:
     if setup.test.images is not None:
         _require_detectors(setup, tuple(setup.camera.lines), setup.camera, setup.detectors)
     return setup
-
-
-AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
-"""On a simulation, or on measurements."""
-
-
-def resolve_any_calibration(path: str | Path) -> AnyCalibration:
-    """As `resolve_calibration`, or `resolve_measured_calibration` for a file that names measurements."""
-    return resolve_measured_calibration(path) if is_measured(path) else resolve_calibration(path)
 
 
 class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):

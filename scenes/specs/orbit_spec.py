@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, WithJsonSchema, model_validator
 
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Number, Spec
+from scenes.yaml.spec import Name, Number, Reference, Spec, Text
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, SPEED, TIME, format_quantity
 
 FIRST_YEAR, LAST_YEAR = 1972, 2099
@@ -263,3 +263,17 @@ class ErrorsSpec(Spec):
 
     gps: GpsErrorsSpec = GpsErrorsSpec()
     star_tracker: StarTrackerErrorsSpec = StarTrackerErrorsSpec()
+
+
+class PayloadTestSpec(Spec):
+    """A test of a payload.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file.
+    """
+
+    name: Name
+    description: Text = ""
+    camera: Reference

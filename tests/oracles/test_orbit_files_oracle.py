@@ -65,7 +65,7 @@ def date(epoch: str, seconds: float) -> Any:
 def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) -> None:
     """With pole, UT1 and celestial pole offsets of the same table; 0.6 mm and 2 um/s: its nutation is interpolated."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D
-    from org.orekit.frames import FramesFactory, StaticTransform
+    from org.orekit.frames import FramesFactory
     from org.orekit.utils import IERSConventions, PVCoordinates
 
     from twin.orbit.measured.platform_files import to_itrs
@@ -253,7 +253,7 @@ def test_rugged_sees_the_same_ground_points(orekit: Path, tmp_path: Path) -> Non
     assert 0.0 < worst < 5e-3
 
 
-class point:  # noqa: N801 (what pyRugged gives has changed between its versions)
+class point:
     """Longitude, latitude and altitude of a ground point, a tuple or an object."""
 
     def __init__(self, found: Any) -> None:

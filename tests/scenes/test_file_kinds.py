@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.specs.file_kinds import FILE_KINDS, kind_of, read_for
+from scenes.kinds.file_kinds import FILE_KINDS, kind_of, read_for
 from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
@@ -33,6 +33,9 @@ FOLDERS = {
     "library/instruments": "instrument",
     "library/payloads": "three_line_camera",
     "orbit/angle": "orbit_angle",
+    "orbit/measured/angle": "measured_angle",
+    "orbit/measured/calibrate": "measured_calibration",
+    "orbit/measured/data": "orbit_data",
     "orbit/calibrate": "orbit_calibration",
     "orbit/monitor": "orbit_monitor",
     "orbit/simulate": "orbit_simulate",

@@ -7,7 +7,7 @@ import shlex
 import pytest
 import typer
 
-from scenes.specs.file_kinds import kind_of
+from scenes.kinds.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.study_bench import ROOT
 from twin.validation.registry import GROUPS, select

@@ -143,7 +143,7 @@ def test_gross_errors_do_not_hide_a_convention(tmp_path: Path) -> None:
 def test_every_question_is_asked_with_every_other(files) -> None:
     folder, data = files
     del folder, data
-    others = {name: (1, 2) for name in list(QUESTIONS)[:4]}
+    others = dict.fromkeys(list(QUESTIONS)[:4], (1, 2))
     every = list(singles_and_pairs(others))
     assert every[0] == ()
     assert sum(len(one) == 1 for one in every) == 8

@@ -16,9 +16,9 @@ import typer
 from typer.core import TyperGroup
 
 from optics.numerics.threads import cores
+from scenes.kinds.file_kinds import kind_of
 from scenes.models.camera_design import resolve_design
 from scenes.models.monitor_layout import resolve_monitor_design
-from scenes.specs.file_kinds import kind_of
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml
 from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed

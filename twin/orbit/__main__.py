@@ -12,17 +12,20 @@ from typing import Any
 
 import typer
 
+from scenes.specs.measured.orbit_data_setup import resolve_any_angle, resolve_any_calibration
 from scenes.specs.measured.pass_files_setup import resolve_check, resolve_match
-from scenes.specs.orbit_setup import (
-    resolve_angle,
-    resolve_any_calibration,
-    resolve_monitor,
-    resolve_simulate,
-)
+from scenes.specs.orbit_setup import resolve_monitor, resolve_simulate
 from twin.orbit.orbit_tests import ORBIT_TESTS
 from twin.run.command import add_test
 
 PROGRAM = "twin.orbit"
+
+
+def simulation_export(run: Any) -> Mapping[str, str]:
+    """What was measured in simulated images, as files."""
+    from twin.orbit.calibration.calibration_export import simulation_exported
+
+    return simulation_exported(run)
 
 
 def calibration_export(run: Any) -> Mapping[str, str]:
@@ -68,10 +71,13 @@ add_test(
     app,
     PROGRAM,
     "angle",
-    resolve_angle,
+    resolve_any_angle,
     ORBIT_TESTS["angle"],
     """Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
     space resection as the second method.
+
+    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
+    against those of the laboratory.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points.
@@ -163,10 +169,12 @@ add_test(
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
 
     simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
-    truth knows is in artefacts/truth.json.
+    truth knows is in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
+    reads.
 
     Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
     """,
+    simulation_export,
 )
 
 

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from twin.run.command import Test
+
+if TYPE_CHECKING:
+    from twin.run.report import Report
 
 
 def _angle() -> Test[Any]:
     from twin.orbit.angle.angle_numbers import ANGLE
     from twin.orbit.angle.angle_report import angle_report
+    from twin.orbit.angle.measured_angle import MeasuredAngleRun
+    from twin.orbit.angle.measured_angle_report import measured_angle_report
 
-    return ANGLE, angle_report
+    def report(run: Any) -> Report:
+        return measured_angle_report(run) if isinstance(run, MeasuredAngleRun) else angle_report(run)
+
+    return ANGLE, report
 
 
 def _calibrate() -> Test[Any]:

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from optics.numerics.backend import Backend, load_backend
-from scenes.specs.file_kinds import read_for
+from scenes.kinds.file_kinds import read_for
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
     AsJson,

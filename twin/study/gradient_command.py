@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from scenes.kinds.file_kinds import read_for
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.specs.file_kinds import read_for
 from twin.run.cli import InputErrorText, Options, print_verdict, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings, run_command
 from twin.run.reference_frames import described

@@ -13,7 +13,7 @@ from typing import Any
 
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
-from scenes.specs.file_kinds import read_for
+from scenes.kinds.file_kinds import read_for
 from twin.run.cli import InputErrorText, check_backend, ending_signals
 from twin.run.run_folder import RunFolderError, chosen, write_manifest
 from twin.study.runs.chunk_store import ChunkStore

@@ -10,9 +10,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.orbit_angle import Angles, EffectsSpec, Flag, Moment
 from scenes.specs.orbit_calibration import LaunchSpec, MapLimitsSpec, checked_schemes
-from scenes.specs.orbit_spec import AngleSigmas, Interval, LengthSigmas, SlowErrorsSpec, UtcTime
+from scenes.specs.orbit_spec import AngleSigmas, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.spec import Name, Named, Reference, Spec, Text
+from scenes.yaml.spec import Name, Named, Reference, Spec
 
 Toward = Literal["forward", "back", "right", "left", "up", "down"]
 _TOWARD: Mapping[str, tuple[int, int, int]] = {
@@ -196,7 +196,7 @@ class ReadingErrorsSpec(Spec):
         return (0.0, 0.0, 0.0)
 
 
-class MeasuredTestSpec(Spec):
+class MeasuredTestSpec(PayloadTestSpec):
     """What all tests on measurements say.
 
     Attributes:
@@ -209,9 +209,6 @@ class MeasuredTestSpec(Spec):
         effects: on the light, that are in the image points; `corrected` takes them out.
     """
 
-    name: Name
-    description: Text = ""
-    camera: Reference
     data: Reference | None = None
     conventions: ConventionsSpec | None = None
     passes: Passes | None = None

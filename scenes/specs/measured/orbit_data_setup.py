@@ -14,6 +14,7 @@ from scenes.specs.measured.orbit_data import (
     OrbitDataSpec,
     PassFilesSpec,
 )
+from scenes.specs.orbit_setup import AngleSetup, CalibrationSetup, resolve_angle, resolve_calibration
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import Problem
@@ -91,6 +92,15 @@ def resolve_measured_calibration(path: str | Path) -> MeasuredCalibrationSetup:
     return setup
 
 
+AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
+"""On a simulation, or on measurements."""
+
+
+def resolve_any_calibration(path: str | Path) -> AnyCalibration:
+    """As `resolve_calibration`, or `resolve_measured_calibration` for a file that names measurements."""
+    return resolve_measured_calibration(path) if is_measured(path) else resolve_calibration(path)
+
+
 def resolve_measured_angle(path: str | Path) -> MeasuredAngleSetup:
     """Read intersection angles on measurements and what they refer to; a run's config.yaml can be given in its place.
 
@@ -98,6 +108,15 @@ def resolve_measured_angle(path: str | Path) -> MeasuredAngleSetup:
         InputError: a file cannot be read or is not valid.
     """
     return _resolved(MeasuredAngleSetup, MeasuredAngleSpec, path)
+
+
+AnyAngle = AngleSetup | MeasuredAngleSetup
+"""On a simulation, or on measurements."""
+
+
+def resolve_any_angle(path: str | Path) -> AnyAngle:
+    """As `resolve_angle`, or `resolve_measured_angle` for a file that names measurements."""
+    return resolve_measured_angle(path) if is_measured(path) else resolve_angle(path)
 
 
 def _resolved(model: type[Setup], kind: type[Any], path: str | Path) -> Setup:

@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from scipy.stats import chi2
 
 from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
+from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
 from scenes.specs.orbit_setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_run import AngleRun, Scatter, run_angle, values_of
+from twin.orbit.angle.measured_angle import MeasuredAngleRun, MeasuredAngles, run_measured_angle
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
+from twin.run.procedure import Advance, Procedure, silent
 
 ByAngle = Mapping[str, float | None]
 """A number for each angle of the test's file; what could not be computed is None."""
@@ -177,9 +181,62 @@ class AngleNumbers:
         )
 
 
-def angle_numbers(run: AngleRun) -> dict[str, Any]:
+@dataclass(frozen=True)
+class MeasuredPassNumbers:
+    """Angles of a measured pass; those of the laboratory's camera; time from the epoch."""
+
+    time_s: float
+    points: Mapping[str, int]
+    dihedral: ByAngle
+    along_track: ByAngle
+    resection: ByAngle
+    laboratory_dihedral: ByAngle
+    laboratory_along_track: ByAngle
+    change_arcsec: ByAngle
+    plane_p_value: Mapping[str, float]
+    resection_p_value: float
+
+    @classmethod
+    def of(cls, one: MeasuredAngles) -> Self:
+        """Of one pass."""
+        names, pairs, estimate = tuple(one.pairs), tuple(one.pairs.values()), one.estimate
+        section, tls, along = estimate.resection, estimate.angles["tls"], estimate.along
+        sigma = np.sqrt(np.diag(section.angle_covariance(pairs)))
+        return cls(
+            time_s=one.time,
+            points={name: len(pixel) for name, pixel in one.pixel.items()},
+            dihedral=_with_sigmas(names, tls.values, tls.sigma),
+            along_track=_with_sigmas(names, along.values, along.sigma),
+            resection=_with_sigmas(names, section.angles(pairs), sigma),
+            laboratory_dihedral=_degrees(names, one.dihedral),
+            laboratory_along_track=_degrees(names, one.along_track),
+            change_arcsec=_arcsec(names, along.values - one.along_track),
+            plane_p_value={
+                line: float(chi2.sf(fit.chi_square, len(fit.residual) - 2))
+                for line, fit in zip(one.lines, estimate.planes["tls"], strict=True)
+            },
+            resection_p_value=section.p_value,
+        )
+
+
+def run_any_angle(
+    setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent
+) -> AngleRun | MeasuredAngleRun:
+    """On measurements, or on a simulation: ``python -m twin.orbit angle``.
+
+    Raises:
+        InputError, BenchError: as `run_angle` and `run_measured_angle`.
+    """
+    if isinstance(setup, MeasuredAngleSetup):
+        return run_measured_angle(setup, backend, seed, advance)
+    return run_angle(setup, backend, seed, advance)
+
+
+def angle_numbers(run: AngleRun | MeasuredAngleRun) -> dict[str, Any]:
     """Contents of angle.json without its frames. Keys of angles begin with their names."""
+    if isinstance(run, MeasuredAngleRun):
+        return {"measured": plain_data({one.name: MeasuredPassNumbers.of(one) for one in run.passes})}
     return dict(plain_data(AngleNumbers.of(run)))
 
 
-ANGLE = Procedure("angle", AngleSetup, resolve_angle, run_angle, angle_numbers)
+ANGLE = Procedure("angle", AngleSetup, resolve_angle, run_any_angle, angle_numbers)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy.stats import chi2
@@ -43,6 +43,22 @@ EFFECTS = ("light_time", "aberration", "refraction")
 BEND = 0.01 * ARCSEC
 """How far the ends of a line may have bent since the laboratory, one sigma. A micrometre's shift of a mirror bends the
 line of `gf7` by 1e-5 arcsec, and a turn of its focal plane by 2 arcsec about the rear node by 1e-3 arcsec."""
+
+
+class TestedLines(Protocol):
+    """Lines whose angles are estimated, of a simulated or a measured pass."""
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """In the order of the camera's file."""
+
+    @property
+    def pairs(self) -> Mapping[str, tuple[str, str]]:
+        """Angle -> the two lines that it lies between."""
+
+    @property
+    def reference(self) -> str:
+        """The line whose look is zero in a resection."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +293,7 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         raise BenchError(str(error), ("strips",), "a longer strip, more points, or smaller errors") from error
 
 
-def resected(measurement: Measurement, flight: AnglePass) -> Resection:
+def resected(measurement: Measurement, flight: TestedLines) -> Resection:
     """Space resection. Raises ResectionError."""
     m = measurement
     lines = {
@@ -298,12 +314,12 @@ def centred(measurement: Measurement, section: Resection) -> Measurement:
     )
 
 
-def tls_angles(common: Measurement, flight: AnglePass) -> PlaneAngles:
+def tls_angles(common: Measurement, flight: TestedLines) -> PlaneAngles:
     """Angles between the planes by total least squares; of a measurement that is `centred`."""
     return angles_between([fit_plane(common.station, strip) for strip in common.strips.values()], _index(flight))
 
 
-def sighted(measurement: Measurement, section: Resection, flight: AnglePass) -> tuple[np.ndarray, AlongTrackAngles]:
+def sighted(measurement: Measurement, section: Resection, flight: TestedLines) -> tuple[np.ndarray, AlongTrackAngles]:
     """Angles between the lines of sight of the lines' centres, (m,), radians, and their part along the track."""
     common, frames = centred(measurement, section), []
     for name, strip in common.strips.items():
@@ -315,11 +331,11 @@ def sighted(measurement: Measurement, section: Resection, flight: AnglePass) -> 
     return look, along_track_angles(frames, index)
 
 
-def _index(flight: AnglePass) -> list[tuple[int, int]]:
+def _index(flight: TestedLines) -> list[tuple[int, int]]:
     return [(flight.lines.index(a), flight.lines.index(b)) for a, b in flight.pairs.values()]
 
 
-def estimated(measurement: Measurement, flight: AnglePass) -> Estimate:
+def estimated(measurement: Measurement, flight: TestedLines) -> Estimate:
     """All methods. Raises PlaneError, AngleError, ResectionError."""
     section = resected(measurement, flight)
     common = centred(measurement, section)

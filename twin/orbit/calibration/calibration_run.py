@@ -34,7 +34,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import AnyCalibration
+    from scenes.specs.measured.orbit_data_setup import AnyCalibration
 
 _EVEN = 1e-3
 """Of their interval, by which times of readings may be uneven."""
@@ -114,7 +114,8 @@ def run_calibration(
         return _run(setup, seed, advance)
     except RankError as error:
         remedy = "a field with width and length, and more points"
-        raise BenchError(str(error), ("points",), remedy) from error
+        key = "data" if isinstance(setup, MeasuredCalibrationSetup) else "points"
+        raise BenchError(str(error), (key,), remedy) from error
     except ValueError as error:  # a CalibrationError, or too few readings for third differences
         raise BenchError(str(error), ("errors",), "errors that an adjustment can take, and more points") from error
 

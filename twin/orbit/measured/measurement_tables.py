@@ -64,6 +64,10 @@ _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
 _SPEED_TOLERANCE = 0.02
 """Of a velocity: positions of 1 m noise 1 s apart differ by less; that against the stars differs by 6 % and more."""
 _UNIT_TOLERANCE = 1e-3
+_FALL, _JUMP = 12.0, 0.05
+"""Largest acceleration, m/s^2, and share of the speed by which readings one interval apart may change it by noise."""
+_LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
+"""Between two readings, radians, and radians for each second: more than agile satellites turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +198,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
         found = f"{radius[wrong[0]] / 1e3:.6g} km from the Earth's centre"
         allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
         raise orbit.error(int(order[wrong[0]]), "x", "no place of a satellite", found, allowed)
+    _check_jumps(orbit, order, time, place)
     speed = None
     given = [name for name in ("vx", "vy", "vz") if name in orbit]
     if given:
@@ -211,6 +216,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
         found = f"a norm of {norm[far[0]]:.6g}"
         raise attitude.error(int(looks[far[0]]), "q1", "no unit quaternion", found, "four numbers of norm 1")
     quaternion = quaternions_of(numbers, conventions)
+    _check_turns(attitude, looks, quaternion)
     return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
 
 
@@ -413,6 +419,31 @@ def _rising(table: Table) -> NDArray[np.intp]:
         row = int(order[twice[0] + 1])
         raise table.error(row, "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
     return np.asarray(order, np.intp)
+
+
+def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
+    """InputError for a place that no orbit passes between its neighbours."""
+    step = np.diff(time)
+    rate = np.diff(place, axis=0) / step[:, None]
+    change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
+    speed = np.median(np.linalg.norm(rate, axis=1))
+    jump = np.flatnonzero(change > _FALL * (step[1:] + step[:-1]) + _JUMP * speed)
+    if len(jump):
+        row = int(order[jump[0] + 1])
+        found = f"the velocity changes by {change[jump[0]]:.4g} m/s"
+        raise table.error(
+            row, "x", "a jump of the orbit", found, "one pass without manoeuvre; leave out wrong readings"
+        )
+
+
+def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
+    """InputError for a turn from one reading to the next that no satellite makes."""
+    step = np.diff(table["time"][order])
+    turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
+    jump = np.flatnonzero(turn > _LEAST_TURN + _FASTEST_TURN * step)
+    if len(jump):
+        row, found = int(order[jump[0] + 1]), f"{np.degrees(turn[jump[0]]):.4g} deg in {step[jump[0]]:.4g} s"
+        raise table.error(row, "q1", "a jump of the attitude", found, "leave out wrong readings")
 
 
 def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:

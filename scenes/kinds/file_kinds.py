@@ -13,6 +13,7 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.orbit_check import OrbitCheckSpec
+from scenes.specs.measured.orbit_data import MeasuredAngleSpec, MeasuredCalibrationSpec, OrbitDataSpec
 from scenes.specs.measured.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
@@ -88,6 +89,9 @@ FILE_KINDS = (
     FileKind("orbit_check", OrbitCheckSpec, "a check of the conventions of a pass", "twin.orbit check"),
     FileKind("orbit_match", OrbitMatchSpec, "points to be measured in line images", "twin.orbit match"),
     FileKind("orbit_monitor", OrbitMonitorSpec, "a test of monitoring in orbit", "twin.orbit monitor"),
+    FileKind("measured_calibration", MeasuredCalibrationSpec, "a calibration on measurements", "twin.orbit calibrate"),
+    FileKind("measured_angle", MeasuredAngleSpec, "intersection angles on measurements", "twin.orbit angle"),
+    FileKind("orbit_data", OrbitDataSpec, "measurements of passes", place="`data: DIR` of a test on measurements"),
     FileKind(
         "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"
     ),
