@@ -1,5 +1,5 @@
-"""Orbits, frames and ground points from files against other people's software on the same files: astropy, Skyfield, Orekit
-and the line-sensor model Rugged (pyRugged). The table of Earth orientation is the IERS's own, as astropy brings it.
+"""Orbits, frames and ground points from files against other people's software on the same files: astropy, Skyfield,
+Orekit and the line-sensor model Rugged (pyRugged). The table of Earth orientation is the IERS's own, as astropy brings it.
 """
 
 import shutil
@@ -223,7 +223,7 @@ def test_rugged_sees_the_same_ground_points(orekit: Path, tmp_path: Path) -> Non
     cameras = line_cameras(load_three_line_camera("th1"))
     for name, camera in ((name, cameras[name]) for name in ("forward", "nadir", "aft")):
         pixels = np.linspace(0.0, camera.pixels - 1.0, 7)
-        los = LOSBuilder([look for look in camera.look(pixels)]).build()
+        los = LOSBuilder(list(camera.look(pixels))).build()
         datation = LinearLineDatation(date(bench.EPOCH, 0.0), 0.0, 1.0)
         sensor = LineSensor(name, datation, np.zeros(3), los)
         builder = PyRuggedBuilder()

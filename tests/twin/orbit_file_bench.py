@@ -284,7 +284,8 @@ def match_files(folder: Path, flown: Any) -> dict[str, object]:
     for name, image in flown.patch.images.items():
         window = image.window
         numbers = np.array([window.first_line, window.first_line + window.lines - 1])
-        rows += [(name, k, repr(float(t))) for k, t in zip((0, window.lines - 1), image.measured.time(numbers), strict=True)]
+        first, last = map(float, image.measured.time(numbers))
+        rows += [(name, 0, repr(first)), (name, window.lines - 1, repr(last))]
         (folder / f"{name}.tiff").write_bytes(tiff(image.frame[None], FrameFacts()))
         images[name] = {"file": f"{name}.tiff", "first_pixel": window.first_pixel, "first_pixel_sees": "right"}
     csv(folder / "lines.csv", ("camera", "line", "time [s]"), *zip(*rows, strict=True))

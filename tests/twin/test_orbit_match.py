@@ -143,7 +143,7 @@ WRONG = [
     ({"dem": {"file": "photo.tiff"}}, "counted from is not said"),
     ({"images": {"front": {"file": "nadir.tiff", "first_pixel_sees": "right"}}}, "no such line"),
     ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "not a raster"),
-    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than its"),
+    ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_line": 50, "first_pixel_sees": "right"}}}, "longer than its"),
     ({"images": {"nadir": {"file": "nadir.tiff", "band": 2, "first_pixel_sees": "right"}}}, "no such band"),
 ]

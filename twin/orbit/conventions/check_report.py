@@ -130,8 +130,8 @@ def _questions(run: Check) -> Section:
             rows.append((question.title, question.text(one.value), "yes" if one.stated else "", one.moved, cost, told))
     text = (
         "Each convention by itself, the others as in the best reading. A value cannot be told from the best if the"
-        " points would lie elsewhere by no more than camera and platform may be wrong by: give smaller uncertainties, after a "
-        "calibration, or more points, if it matters.",
+        " points would lie elsewhere by no more than camera and platform may be wrong by: give smaller uncertainties, "
+        "after a calibration, or more points, if it matters.",
     )
     table = Table(
         "questions",

@@ -119,7 +119,7 @@ class Check:
 
     @property
     def alike(self) -> tuple[Changes, ...]:
-        """Other readings with no more changes than the best one, as likely as it: the points cannot tell which it is."""
+        """Other readings with no more changes than the best one, as likely: the points cannot tell which it is."""
         return tuple(
             one.changes
             for one in self.tried

@@ -28,7 +28,7 @@ _COLUMNS = (
     Column("point", text=True),
     *(Column(name, ANGLE, needed=False) for name in ("longitude", "latitude")),
     *(Column(name, DISTANCE, needed=False) for name in ("east", "north", "height", "x", "y", "z")),
-    *(Column(name, LENGTH, needed=False, least=0.0, most=1e4) for name in _SIGMAS),
+    *(Column(name, LENGTH, needed=False, least=0.0, most=1e4) for name in (*_SIGMAS, "sigma")),
     Column("role", text=True, needed=False),
 )
 _GEOGRAPHIC = "EPSG:4979"
@@ -162,7 +162,11 @@ def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
     have = [name for name in _SIGMAS if name in table]
     if have and len(have) < 3:
         raise InputError(Issue("sigmas are not complete", file, None, (), names_text(have), names_text(_SIGMAS)))
+    if have and "sigma" in table:
+        raise InputError(Issue("sigmas are given in two ways", file, None, (), names_text([*have, "sigma"])))
     sigmas = table.stacked(*_SIGMAS) if have else np.full((len(table), 3), np.nan)
+    if "sigma" in table:
+        sigmas = np.repeat(table["sigma"][:, None], 3, axis=1)
     ids = [str(v) for v in table["point"]]
     _unique(file, ids, lines)
     roles = [_role(file, str(r), k) for r, k in zip(table["role"], lines, strict=True)] if "role" in table else []
