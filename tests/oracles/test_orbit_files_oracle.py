@@ -1,5 +1,6 @@
 """Orbits, frames and ground points from files against other people's software on the same files: astropy, Skyfield,
-Orekit and the line-sensor model Rugged (pyRugged). The table of Earth orientation is the IERS's own, as astropy brings it.
+Orekit and the line-sensor model Rugged (pyRugged). The table of Earth orientation is the IERS's own, which astropy
+brings.
 """
 
 import shutil

@@ -166,9 +166,10 @@ def test_iers_tables_and_their_forms(tmp_path: Path) -> None:
     np.testing.assert_allclose(a[1], b[1], rtol=0, atol=3e-4 * ARCSEC)
     np.testing.assert_allclose(a[2], b[2], rtol=0, atol=5e-4 * ARCSEC)
     part = (finals.mjd > 55620) & (finals.mjd < 55632)
+    columns = [v[part] for v in (finals.mjd, finals.ut1_tai, finals.pole, finals.offsets)]
     rows = [
         (float(m), float(u + tai_minus_utc(int(m))), *map(float, p / ARCSEC), *map(float, 1e3 * d / ARCSEC))
-        for m, u, p, d in zip(*(v[part] for v in (finals.mjd, finals.ut1_tai, finals.pole, finals.offsets)), strict=True)
+        for m, u, p, d in zip(*columns, strict=True)
     ]
     heads = ("mjd", "ut1_utc [s]", "x_pole [arcsec]", "y_pole [arcsec]", "dx [mas]", "dy [mas]")
     table = read_earth_orientation(bench.csv(tmp_path / "eop.csv", heads, *zip(*rows, strict=True)))

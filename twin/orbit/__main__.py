@@ -121,7 +121,7 @@ add_test(
     one does, 4 none explains the points. With `--export DIR` a pass whose conventions stand goes into a folder that
     `twin.orbit calibrate` reads.
 
-    Example: `python -m twin.orbit check check.yaml`
+    Example: `python -m twin.orbit check scenes/orbit/measured/check.yaml`
     """,
     check_export,
 )
@@ -138,7 +138,7 @@ add_test(
     match.json holds for every line how many points were matched and what by. With `--export DIR` the points go with
     orbit, attitude and line times into a folder that `twin.orbit calibrate` reads.
 
-    Example: `python -m twin.orbit match match.yaml --export points`
+    Example: `python -m twin.orbit match scenes/orbit/measured/match.yaml`
     """,
     match_export,
 )

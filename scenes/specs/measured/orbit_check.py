@@ -13,8 +13,9 @@ from scenes.specs.measured.pass_files import (
     TimeScale,
 )
 from scenes.specs.orbit_scene import LightEffectsSpec
+from scenes.specs.orbit_spec import PayloadTestSpec
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Number, Reference, Spec, Text, Whole
+from scenes.yaml.spec import Number, Reference, Spec, Whole
 from scenes.yaml.units import TIME
 
 TimeSigma = Annotated[float, Quantity(TIME, smallest="0 s", largest="100 s")]
@@ -72,7 +73,7 @@ class UncertaintySpec(Spec):
     time: TimeSigma = 1e-3
 
 
-class OrbitCheckSpec(Spec):
+class OrbitCheckSpec(PayloadTestSpec):
     """A check of the conventions of a pass in files.
 
     Attributes:
@@ -89,9 +90,6 @@ class OrbitCheckSpec(Spec):
         shown: places of points that are printed for each reading.
     """
 
-    name: Name
-    description: Text = ""
-    camera: Reference
     platform: PlatformFilesSpec
     lines: LineTimesFileSpec
     ground: GroundFileSpec

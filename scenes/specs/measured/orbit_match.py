@@ -7,8 +7,9 @@ from pydantic import AfterValidator, Field
 from scenes.specs.measured.orbit_check import LineTimesFileSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec, PointSigma, RasterFileSpec
 from scenes.specs.orbit_scene import ImagePointsSpec, LightEffectsSpec
+from scenes.specs.orbit_spec import PayloadTestSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.spec import Name, Named, Reference, Spec, Text, Whole
+from scenes.yaml.spec import Named, Reference, Spec, Whole
 
 
 class ImageWindowSpec(Spec):
@@ -51,7 +52,7 @@ def _some_images(images: Named[LineImageFileSpec]) -> Named[LineImageFileSpec]:
     return images
 
 
-class OrbitMatchSpec(Spec):
+class OrbitMatchSpec(PayloadTestSpec):
     """Points of an orthophoto, and tie points, sought in line images.
 
     Attributes:
@@ -68,9 +69,6 @@ class OrbitMatchSpec(Spec):
         points: how many, and how they are matched.
     """
 
-    name: Name
-    description: Text = ""
-    camera: Reference
     platform: PlatformFilesSpec
     lines: LineTimesFileSpec
     images: Annotated[Named[LineImageFileSpec], AfterValidator(_some_images)]
