@@ -52,6 +52,7 @@ def test_the_printed_script_runs(installed: Path, tmp_path: Path) -> None:
     assert re.search(r"d_f_um +-1\.210", done.stdout)
 
 
+@pytest.mark.slow
 def test_commands_of_the_wheel_run(installed: Path, tmp_path: Path) -> None:
     """With every file of the library, every template, and the examples that their help names."""
     examples = [path.relative_to(ROOT) for path in (ROOT / "scenes").rglob("*.yaml")]

@@ -21,6 +21,7 @@ LIMIT = 900.0
 
 def _edge(folder: Path) -> None:
     """A slanted edge with even noise, in 16 bits. Rounded to whole numbers it is the same on every processor."""
+    (folder / "out").mkdir()  # where the command writes its curve; it makes no run folder
     rows, columns = np.mgrid[0:96, 0:96]
     across = columns - 47.6 - np.tan(np.radians(5.0)) * (rows - 48)
     light = 4000.0 + 20000.0 * (1.0 + np.tanh(across / 1.3))
@@ -30,10 +31,17 @@ def _edge(folder: Path) -> None:
 
 def _bars(folder: Path) -> None:
     """Bars of period 4 pixels, slightly tilted, beside an even dark and an even bright patch."""
+    (folder / "out").mkdir()
     rows, columns = np.mgrid[0:96, 0:128]
     wave = 0.5 + 0.3 * np.sin(2.0 * np.pi * (columns + 0.05 * rows) / 4.0)
     wave = np.where(columns >= 112, 1.0, np.where(columns >= 96, 0.0, wave))
     tifffile.imwrite(folder / "bars.tiff", np.rint(2000.0 + 40000.0 * wave).astype(np.uint16))
+
+
+def _pass(folder: Path) -> None:
+    """The run folder of a small simulated pass."""
+    words = ["twin.orbit", "simulate", f"{JOBS}/simulate.yaml", "--out", str(folder / "pass"), "--quiet"]
+    subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
 
 
 @dataclass(frozen=True)
@@ -94,6 +102,8 @@ ALL = (
     _job("orbit_calibrate_strip", f"twin.orbit calibrate {RUN % 'calibrate_strip'}"),
     _job("orbit_calibrate_images", f"twin.orbit calibrate {RUN % 'calibrate_images'}"),
     _job("orbit_monitor", f"twin.orbit monitor {RUN % 'monitor'}"),
+    _job("orbit_export", "twin.orbit export {here}/pass --out {out}", prepare=_pass),
+    _job("orbit_export_traced", f"twin.orbit export {RUN % 'angle_gf7'}"),
     _job("study_render", f"twin.study {RUN % 'study_render'} --workers 1"),
     _job("study_lab", f"twin.study {RUN % 'study_lab'} --workers 1 --quiet"),
     _job("study_orbit", f"twin.study {RUN % 'study_orbit'} --workers 2 --json"),
@@ -143,7 +153,6 @@ def run(job: Job, here: Path) -> Done:
     """
     out = here / "out"
     if job.prepare is not None:
-        out.mkdir()
         job.prepare(here)
     places = {"jobs": JOBS, "out": str(out), "here": str(here)}
     words = [word.format(**places) for word in job.words]

@@ -134,6 +134,7 @@ responses:
 """
 
 
+@pytest.mark.slow
 def test_readings_by_posterior_are_differentiated(tmp_path, backend):
     """By motions through the trace; by what is stated with differences, and so is all that depends on the noise."""
     # about a state that is moved: there a change of what is stated changes the reading

@@ -10,6 +10,8 @@ Mutations that nothing can see are not listed:
 - left and right swapped in (2), (3), (8), (12), their joint forms and (9): sums and products of both sides;
 - signs in (12) and in Table 5: squares;
 - the arctangent in (2), (3), (5): at 1.3 and 20 arcsec it differs from its argument by 1e-9 at most.
+
+They are marked slow: .ci/run runs them, the default does not.
 """
 
 import re
@@ -29,6 +31,8 @@ from twin.validation.checks.group import Context
 from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_images, joint, monitored_errors, table2
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
+
+pytestmark = pytest.mark.slow
 
 SEED = 2
 D_ALPHA, D_BETA, D_GAMMA, D_F = range(4)

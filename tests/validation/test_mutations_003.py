@@ -4,6 +4,8 @@ only what is made of them is broken. The paper's equations are lost: these are t
 Not listed, for nothing can be seen of them: the sign of all third differences (their RMS is taken), steps of the
 stepwise solution at half their length (they end at the same place, later), and the sign of pitch in the open
 combination (the rank is the same).
+
+They are marked slow: .ci/run runs them, the default does not.
 """
 
 from dataclasses import replace
@@ -27,6 +29,8 @@ from twin.validation.paper_003 import exact, flights, model, rendered, stability
 from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_light
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
+
+pytestmark = pytest.mark.slow
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix in ("003.model", "003.fields"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

@@ -3,6 +3,8 @@ them is broken.
 
 Not listed, for nothing can be seen of them: the two edges' vertices swapped (best focus is their mean), the sign of an
 MTF (it is a modulus), and in (4) the two sums swapped, which is its sign.
+
+They are marked slow: .ci/run runs them, the default does not.
 """
 
 import dataclasses
@@ -26,6 +28,8 @@ from twin.validation.checks.check import FAILED
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, orientation
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
+
+pytestmark = pytest.mark.slow
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix.startswith("004."))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

@@ -8,15 +8,23 @@ if __name__ == "__main__":
     end_quietly()
 
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from scenes.specs.measured.orbit_data_setup import resolve_any_angle, resolve_any_calibration
 from scenes.specs.measured.pass_files_setup import resolve_check, resolve_match
 from scenes.specs.orbit_setup import resolve_monitor, resolve_simulate
+from scenes.yaml.errors import Problem
+from scenes.yaml.units import DISTANCE, parse_quantity
 from twin.orbit.orbit_tests import ORBIT_TESTS
-from twin.run.command import add_test
+from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet, Seed
+from twin.run.command import Result, Session, add_test, print_report, run_command
+from twin.run.reference_frames import described
+
+if TYPE_CHECKING:
+    from twin.orbit.export.export_run import ExportSource
 
 PROGRAM = "twin.orbit"
 
@@ -176,6 +184,106 @@ add_test(
     """,
     simulation_export,
 )
+
+
+@app.command("export")
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            readable=False,
+            help="Run folder of a simulation, or the YAML file of a simulation or of a test of intersection angles.",
+        ),
+    ],
+    lowest: Annotated[
+        str | None,
+        typer.Option(
+            "--lowest",
+            help="Lowest ground above the ellipsoid, '-50 m'. Default: of the run's elevation model, or 0 m.",
+        ),
+    ] = None,
+    highest: Annotated[
+        str | None, typer.Option("--highest", help="Highest ground, '2500 m'. Default likewise, or 2000 m.")
+    ] = None,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Camera and orbit as they are, not as the user of the images knows them.")
+    ] = False,
+    out: Out = None,
+    seed: Seed = None,
+    backend: BackendName = "llvm",
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Line cameras for other photogrammetric software: image support data (ISD) of the community sensor model for Ames
+    Stereo Pipeline and ISIS, and rational polynomials (RPC00B).
+
+        python -m twin.orbit simulate scenes/orbit/simulate.yaml --out runs/patch
+
+        python -m twin.orbit export runs/patch
+
+    models/LINE.json and LINE_RPC.TXT describe each line; of a run folder LINE.tif is its image with the polynomials
+    inside. Of a YAML file the models are those of whole images. export.json says how far each model is from the
+    rigorous sensor, which neither can carry in full.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+
+    def resolve() -> tuple[ExportSource, tuple[float, float] | None]:
+        from twin.orbit.export.export_run import read_source
+
+        return read_source(source, seed), _ground(lowest, highest)
+
+    def work(given: tuple[ExportSource, tuple[float, float] | None], session: Session) -> Result:
+        from scenes.yaml.errors import InputError
+        from twin.orbit.export.export_report import export_files, export_numbers, export_report
+        from twin.orbit.export.export_run import run_export
+        from twin.run.page import RunFacts, reproduce, write_test
+        from twin.run.procedure import BenchError
+
+        read, heights = given
+        try:
+            run = run_export(read, session.backend, heights, truth, session.advance)
+        except BenchError as error:
+            raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
+        shown = export_report(run)
+        numbers = {**export_numbers(run), "verdict": shown.verdict}
+        for name, content in export_files(run).items():
+            session.folder.write_bytes(name, content)
+        ends = "" if heights is None else f"--lowest '{heights[0]!r} m' --highest '{heights[1]!r} m'"
+        again = reproduce(PROGRAM, "export", str(source), ends, "--truth" if truth else "", f"--seed {read.seed}")
+        name = session.backend.name
+        facts = RunFacts(
+            read.config, str(source), name, read.seed, session.started, session.seconds, PROGRAM, "", again
+        )
+        write_test("export", numbers, shown, facts, session.folder)
+        return Result(described("export", numbers), lambda console: print_report(shown, console))
+
+    stem = source.resolve().name if source.is_dir() else source.stem
+    run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)
+
+
+def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | None:
+    """Heights that were asked for, metres; None where none were.
+
+    Raises:
+        InputErrorText: they are no heights, or only one of them is given.
+    """
+    if lowest is None and highest is None:
+        return None
+    if lowest is None or highest is None:
+        raise InputErrorText("give both --lowest and --highest, or neither")
+    try:
+        low, high = (parse_quantity(text, DISTANCE) for text in (lowest, highest))
+    except Problem as problem:
+        raise InputErrorText(f"--lowest, --highest: {problem}; for example '0 m' and '2000 m'") from None
+    if not _DEEPEST <= low < high <= _TOP:
+        raise InputErrorText(f"--lowest must be below --highest, both within {_DEEPEST:g} and {_TOP:g} m")
+    return low, high
+
+
+_DEEPEST, _TOP = -500.0, 9000.0
+"""Metres: of land."""
 
 
 if __name__ == "__main__":

@@ -264,7 +264,7 @@ def print_report(report: Report, console: Console) -> None:
     table = result_table(report.title)
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
-        table.add_column(head, justify="left" if text else "right", no_wrap=text)
+        table.add_column(escape(head), justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
         table.add_row(*(escape(cell_text(cell)) for cell in row))  # [m] is a unit
     print_whole(console, table)

@@ -137,6 +137,12 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "orbit_s, attitude_s": _SECONDS,
         },
         "georeference": {"longitude, latitude": _GEODETIC, "rows, columns": "to the south, to the east"},
+        "export": {
+            "times": _SECONDS,
+            "heights_m": "above the ellipsoid",
+            "models/*.json": f"{_ITRS}; lines and samples count from the image's corner, pixel centres are at halves",
+            "models/*_RPC.TXT, models/*.tif": f"{_GEODETIC}; line 0 and sample 0 are the centres of the first pixel",
+        },
         "simulate-truth": {
             "itrs_m": _ITRS,
             "camera, trajectory": "each states its own",

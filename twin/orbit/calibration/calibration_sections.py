@@ -356,17 +356,18 @@ def _parameters(run: CalibrationRun) -> Section:
         + " z is the error in sigmas of this adjustment." * (truth is not None),
     ]
     known = 0 if truth is None else 2
+    apart = f"up to {run.campaign.passes[0].seconds_apart:.0f} s apart"
     if any(name in RATE for name in found.names):
         text.append(
-            "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
-            "before and after the nadir line. The fit of the biases against latitude tells the drift, with its sigma, "
-            "and the outer lines' principal points share that sigma."
+            f"A bias that varies with latitude also varies during a pass, while the lines see the field {apart}. "
+            "The fit of the biases against latitude tells the drift, with its sigma, and the outer lines' principal "
+            "points share that sigma."
         )
     else:
         text.append(
-            "A bias that varies with latitude also varies during a pass, while the outer lines see the field 33 s "
-            "before and after the nadir line. With so few fields nothing tells the drift: the outer lines' principal "
-            "points take it up, and no sigma contains it."
+            f"A bias that varies with latitude also varies during a pass, while the lines see the field {apart}. "
+            "With so few fields nothing tells the drift: the outer lines' principal points take it up, and no sigma "
+            "contains it."
         )
     tables = (
         Table(

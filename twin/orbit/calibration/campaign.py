@@ -147,6 +147,14 @@ class FieldPass:
         return float(np.mean(np.concatenate([sensors[k].time(r.line) for k, r in self.control_images.items()])))
 
     @property
+    def seconds_apart(self) -> float:
+        """From when the first line sees the control points, in the mean, to when the last does."""
+        times = [
+            float(np.mean(self.data.sensors[k].time(r.line))) for k, r in self.control_images.items() if len(r.line)
+        ]
+        return max(times) - min(times)
+
+    @property
     def altitude(self) -> float:
         """Of the satellite above the ellipsoid in the middle of the pass, metres."""
         path = self.measured

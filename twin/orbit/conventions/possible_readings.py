@@ -86,9 +86,11 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
         "line_time_scale": _of_pass("time scale of the lines", "line_scale", _SCALES),
         "line_time_offset": _of_pass("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
         "line_moment": _of_pass("moment of a line's time", "moment", ("start", "middle", "end")),
-        "line_origin": _of_pass("middle of line 0 at", "line_origin", (0.0, 0.5, 1.0), lambda v: f"{v:g}"),
+        "line_origin": _of_pass(
+            "coordinate of the middle of line 0", "line_origin", (0.0, 0.5, 1.0), lambda v: f"{v:g}"
+        ),
         "pixel_origin": _of_pass(
-            "middle of the first pixel at", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"
+            "coordinate of the middle of the first pixel", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"
         ),
         "first_pixel_sees": _of_pass("first pixel sees", "sees", ("right", "left")),
         "line_axis": _of_pass(

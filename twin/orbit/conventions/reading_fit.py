@@ -247,7 +247,7 @@ class PassBench:
         except ValueError as error:
             raise ImpossibleError(str(error)) from None
         if not np.all(np.isfinite(found)):
-            raise ImpossibleError(f"{int(np.sum(~np.isfinite(found[:, 0])))} looks of {name} miss the Earth")
+            raise ImpossibleError(f"looks of {name} miss the Earth")
         return found, line_time
 
 

@@ -76,13 +76,33 @@ class Simulation:
         return self.setup.camera
 
 
-def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Simulation:
-    """Fly the pass: ``python -m twin.orbit simulate``; nothing is traced, so that the backend is not used.
+@dataclass(frozen=True, eq=False)
+class SimulatedFlight:
+    """A pass without its images.
+
+    Attributes:
+        earth: below it.
+        truth: the camera as it is.
+        trajectory: the true one.
+        measured: what the satellite says of it.
+        sensors: line -> as it is, over the whole orbit.
+        users: line -> as the user knows it: the laboratory's camera on the measured trajectory.
+    """
+
+    earth: Earth
+    truth: ThreeLineCameraSpec
+    trajectory: Trajectory
+    measured: Trajectory
+    sensors: Mapping[str, Sensor]
+    users: Mapping[str, Sensor]
+
+
+def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
+    """Orbit and cameras of a pass; the same for the same seed as those of `run_simulation`.
 
     Raises:
-        BenchError: no such orbit, a patch that a line cannot image, points that cannot be measured.
+        BenchError: no such orbit.
     """
-    advance("images", 0, 1)
     spec, root = setup.test, np.random.SeedSequence(seed)
     earth = Earth.from_spec(spec.earth)
     try:
@@ -94,9 +114,23 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     true, known = line_cameras(truth), line_cameras(setup.camera)
     sensors = {name: sensor_of(true[name], trajectory, earth, spec) for name in spec.lines}
     users = {name: sensor_of(known[name], measured, earth, spec) for name in spec.lines}
+    return SimulatedFlight(earth, truth, trajectory, measured, FrozenMap(sensors), FrozenMap(users))
+
+
+def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Simulation:
+    """Fly the pass: ``python -m twin.orbit simulate``; nothing is traced, so that the backend is not used.
+
+    Raises:
+        BenchError: no such orbit, a patch that a line cannot image, points that cannot be measured.
+    """
+    advance("images", 0, 1)
+    spec, root = setup.test, np.random.SeedSequence(seed)
+    flight = fly_simulation(setup, seed)
+    truth, trajectory, measured = flight.truth, flight.trajectory, flight.measured
+    sensors, users = flight.sensors, flight.users
     optics = optics_of(setup.camera, spec.lines, spec.line_time, setup.detectors)
     lines = imaged_lines(sensors, users, optics, stream(root, 1))
-    looking = sensor_of(true[spec.patch.line], trajectory, earth, spec)
+    looking = sensor_of(line_cameras(truth)[spec.patch.line], trajectory, flight.earth, spec)
     place = _place(looking, spec)
     patch = spec.patch
     try:

@@ -1,0 +1,1 @@
+"""Line cameras for other photogrammetric software: USGS CSM line scanners and rational polynomials."""

@@ -1,0 +1,290 @@
+"""What is exported: lines of a camera on their way, from a simulated pass or a test in orbit, as models for other
+software, with their images where there are any.
+
+The camera is the laboratory's and the way the measured one, as the user of the images knows them; or, where asked for,
+both as they truly are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tifffile
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.kinds.file_kinds import kind_of
+from scenes.specs.orbit_setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
+from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.yaml_file import read_yaml
+from twin.orbit.angle.angle_flight import angle_camera, fly
+from twin.orbit.export.line_scanner import LineScanner, line_scanner
+from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.flight.line_camera import LineCamera
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.trajectory import Trajectory
+from twin.orbit.images.simulate_run import fly_simulation
+from twin.run.procedure import Advance, BenchError, silent
+from twin.run.run_folder import read_manifest
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+
+READS = ("orbit_simulate", "orbit_angle")
+"""Kinds of files that say a camera and its way."""
+_PAYLOAD_HINT = "a payload has no orbit: the YAML file of a simulation or of a test of angles that names it"
+
+
+@dataclass(frozen=True, eq=False)
+class ExportSource:
+    """What was read.
+
+    Attributes:
+        setup: of the test.
+        config: it, as YAML with all that it refers to.
+        folder: of a simulation's run, None for a file.
+        seed: of the measured orbit and attitude.
+        windows: line -> its first line, first pixel, lines and pixels, of the images of a run.
+    """
+
+    setup: SimulateSetup | AngleSetup
+    config: str
+    folder: Path | None
+    seed: int
+    windows: Mapping[str, tuple[int, int, int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class ImagedWindow:
+    """A line's image, or where it would be.
+
+    Attributes:
+        name: of the line.
+        sensor: its lines are those of the window.
+        first_pixel, pixels: of the window on the line.
+        pitch: of the pixels, metres.
+        frame: grey values, (lines, pixels); None where nothing was rendered.
+    """
+
+    name: str
+    sensor: Sensor
+    first_pixel: int
+    pixels: int
+    pitch: float
+    frame: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedLine:
+    """A line as other software gets it.
+
+    Attributes:
+        window: of it.
+        scanner: community sensor model.
+        polynomial: rational polynomials; None where they cannot be, and why.
+        refused: why there are no polynomials, empty where there are.
+    """
+
+    window: ImagedWindow
+    scanner: LineScanner
+    polynomial: RationalPolynomial | None
+    refused: str
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """All that is written.
+
+    Attributes:
+        source: what was read.
+        epoch: UTC of second 0 of the orbit.
+        truth: whether camera and orbit are the true ones.
+        heights: of the ground above the ellipsoid that models were fitted to: lowest, middle, highest, metres.
+        lines: by name.
+    """
+
+    source: ExportSource
+    epoch: str
+    truth: bool
+    heights: tuple[float, float, float]
+    lines: Mapping[str, ExportedLine]
+
+
+def read_source(path: Path, seed: int | None = None) -> ExportSource:
+    """The run folder of a simulation, or the YAML file of one or of a test of angles.
+
+    Args:
+        path: of it.
+        seed: in place of the file's.
+
+    Raises:
+        InputError: it is neither, or cannot be read.
+    """
+    if path.is_dir():
+        return _of_run(path)
+    kind = kind_of(read_yaml(path).data)
+    if kind is None or kind.name not in READS:
+        found = None if kind is None else kind.what
+        allowed = "a simulation, a test of intersection angles, or the run folder of a simulation"
+        hint = _PAYLOAD_HINT if kind is not None and kind.name in ("three_line_camera", "instrument") else allowed
+        raise InputError(Issue("twin.orbit export does not read this", str(path), found=found, allowed=hint))
+    resolve: Callable[[Path], SimulateSetup | AngleSetup] = (
+        resolve_simulate if kind.name == "orbit_simulate" else resolve_angle
+    )
+    setup = resolve(path)
+    return ExportSource(setup, setup.to_yaml(), None, setup.test.seed if seed is None else seed, FrozenMap())
+
+
+def _of_run(folder: Path) -> ExportSource:
+    manifest = read_manifest(folder)
+    if manifest is None or (manifest.program, manifest.test) != ("twin.orbit", "simulate"):
+        found = None if manifest is None else f"a run of {' '.join(filter(None, (manifest.program, manifest.test)))}"
+        raise InputError(Issue("not the run folder of twin.orbit simulate", str(folder), found=found))
+    setup = resolve_simulate(folder / "config.yaml")
+    numbers = read_yaml(folder / "simulate.json").data
+    try:
+        windows = {}
+        for name in setup.test.lines:
+            one = numbers["lines"][name]
+            windows[name] = int(one["first_line"]), int(one["first_pixel"]), int(one["lines"]), int(one["pixels"])
+    except (KeyError, TypeError, ValueError):
+        where = str(folder / "simulate.json")
+        raise InputError(Issue("does not say where the images lie", where, allowed="as the run wrote it")) from None
+    return ExportSource(setup, setup.to_yaml(), folder, manifest.seed, FrozenMap(windows))
+
+
+def run_export(
+    source: ExportSource,
+    backend: Backend,
+    heights: tuple[float, float] | None,
+    truth: bool = False,
+    advance: Advance = silent,
+) -> Export:
+    """Fit the models of all lines.
+
+    Args:
+        source: what was read.
+        backend: where the lines of an instrument are traced.
+        heights: lowest and highest ground above the ellipsoid, metres; None for those of a run's elevation model, else
+            for 0 to 2 000 m.
+        truth: camera and orbit as they are in place of those that the user knows.
+        advance: told how far it is.
+
+    Raises:
+        InputError: an image of the run is missing or another one.
+        BenchError: no such orbit, or ground that cannot be modelled.
+    """
+    chosen = _heights(source, heights)
+    epoch, windows = _windows(source, backend, truth)
+    lines = {}
+    for k, (name, window) in enumerate(windows.items()):
+        advance("models", k, len(windows))
+        lines[name] = _exported(window, epoch, chosen)
+    advance("models", len(windows), len(windows))
+    return Export(source, epoch, truth, chosen, FrozenMap(lines))
+
+
+USUAL_HEIGHTS = (0.0, 2000.0)
+"""Metres above the ellipsoid."""
+_ROOM = 100.0
+"""Metres about the heights of an elevation model, which has errors."""
+
+
+def _heights(source: ExportSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
+    if heights is not None:
+        return heights[0], 0.5 * (heights[0] + heights[1]), heights[1]
+    if source.folder is None:
+        return USUAL_HEIGHTS[0], 0.5 * sum(USUAL_HEIGHTS), USUAL_HEIGHTS[1]
+    ground = _image(source.folder, "dem")
+    low, high = float(np.min(ground)) - _ROOM, float(np.max(ground)) + _ROOM
+    return low, float(np.mean(ground)), high
+
+
+def _windows(source: ExportSource, backend: Backend, truth: bool) -> tuple[str, dict[str, ImagedWindow]]:
+    """Epoch, and the images by line."""
+    setup = source.setup
+    if isinstance(setup, AngleSetup):
+        return str(setup.test.orbit.epoch), _of_angle(setup, backend, source.seed, truth)
+    flight = fly_simulation(setup, source.seed)
+    windows = {}
+    for name, sensor in (flight.sensors if truth else flight.users).items():
+        pixels, frame = sensor.camera.pixels, None
+        first_line, first_pixel, lines = 0, 0, sensor.lines
+        if source.folder is not None:
+            first_line, first_pixel, lines, pixels = source.windows[name]
+            frame = _image(source.folder, name)
+            if frame.shape != (lines, pixels):
+                found = f"{frame.shape[0]} lines of {frame.shape[1]} pixels"
+                where = str(_file(source.folder, name))
+                raise InputError(Issue("another image", where, found=found, allowed=f"{lines} lines of {pixels}"))
+        part = replace(sensor, first_line_time=float(sensor.time(np.array([first_line]))[0]), lines=lines)
+        windows[name] = ImagedWindow(name, part, first_pixel, pixels, setup.camera.pitch_of(name), frame)
+    return str(setup.test.orbit.epoch), windows
+
+
+def _of_angle(setup: AngleSetup, backend: Backend, seed: int, truth: bool) -> dict[str, ImagedWindow]:
+    """Images as long as they are wide, their lines spaced as their pixels are, about the moment of the test."""
+    camera = angle_camera(setup, backend)
+    flown = fly(setup, camera, np.random.SeedSequence(seed))
+    windows = {}
+    for name, line in (camera.cameras if truth else camera.laboratory).items():
+        pitch = _pitch(setup, name)
+        time = setup.test.time
+        step = _line_time(line, flown.trajectory, flown.earth, time)
+        room = min(time - flown.trajectory.first, flown.trajectory.last - time)
+        lines = min(line.pixels, int(2.0 * room / step) - 1)
+        if lines < 2:
+            raise BenchError("the orbit ends at the moment of the test", ("time",), "a longer orbit")
+        first = time - 0.5 * (lines - 1) * step
+        sensor = Sensor(line, flown.trajectory, flown.earth, step, first, lines, flown.effects)
+        windows[name] = ImagedWindow(name, sensor, 0, line.pixels, pitch, None)
+    return windows
+
+
+def _pitch(setup: AngleSetup, name: str) -> float:
+    """Of a line's pixels, metres."""
+    if setup.camera is not None:
+        return setup.camera.pitch_of(name)
+    assert setup.instrument is not None
+    return float(setup.cameras[setup.instrument.cameras[name].camera].line.pitch)
+
+
+def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float) -> float:
+    """Seconds in which the image of the line's middle moves by a pixel along the track."""
+    middle = np.array([0.5 * (line.pixels - 1)])
+    probe = Sensor(line, trajectory, earth, 1e-3, time, 1)
+    ground = probe.ground(np.array([0.0, 0.0]), middle + np.array([-0.5, 0.5]), 0.0)
+    after = replace(probe, first_line_time=time + 1e-3).ground(np.array([0.0]), middle, 0.0)
+    before = probe.ground(np.array([0.0]), middle, 0.0)
+    return 1e-3 * float(np.linalg.norm(ground[1] - ground[0]) / np.linalg.norm(after[0] - before[0]))
+
+
+def _exported(window: ImagedWindow, epoch: str, heights: tuple[float, float, float]) -> ExportedLine:
+    try:
+        place = window.first_pixel, window.pixels
+        scanner = line_scanner(window.sensor, window.name, epoch, window.pitch, heights, place)
+    except ValueError as error:
+        raise BenchError(f"{window.name}: {error}", ("orbit",), "an orbit over ground that every line sees") from error
+    try:
+        ends = heights[0], heights[2]
+        polynomial = RationalPolynomial.fit(window.sensor, window.first_pixel, window.pixels, ends)
+    except ValueError as error:
+        return ExportedLine(window, scanner, None, str(error))
+    return ExportedLine(window, scanner, polynomial, "")
+
+
+def _file(folder: Path, name: str) -> Path:
+    return folder / "images" / f"{name}.tiff"
+
+
+def _image(folder: Path, name: str) -> np.ndarray:
+    """(rows, columns) of a run's image."""
+    path = _file(folder, name)
+    try:
+        return np.asarray(tifffile.imread(path)).squeeze()
+    # readers of spoilt files fail in ways that cannot be foreseen
+    except Exception as error:
+        raise InputError(Issue(f"cannot be read: {error}", str(path), allowed="as the run wrote it")) from None

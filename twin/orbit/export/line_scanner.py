@@ -1,0 +1,465 @@
+"""A line sensor as an image support data file (ISD) of the community sensor model, for Ames Stereo Pipeline and ISIS.
+
+The model is USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL: a station and a rotation over time, both interpolated by Lagrange
+polynomials through eight nodes, and one camera with a distortion cubic in its coordinates, which does not change with
+time. It knows nothing of what happens to light. So the file gets the camera and the attitude that the light seems to
+come to: at every node the directions from the station to where the rigorous sensor really sees the ground, at one
+height, are held against one common camera, and the rotation that fits them best is the attitude. Aberration and light
+time are alike at all heights and go in nearly whole; of refraction only what it is at that height.
+
+Of its conventions: image coordinates count from the corner, the centre of the first pixel is (0.5, 0.5); quaternions
+are w, x, y, z and turn Earth-fixed axes into the camera's; the focal plane is in millimetres, x along the flight and y
+along the line; the distortion takes ideal coordinates to real ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import erfa
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from twin.orbit.flight.earth import EQUATORIAL_RADIUS, FLATTENING, tai_of
+from twin.orbit.flight.sensor import Sensor
+
+Array = NDArray[np.float64]
+
+MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
+_TICK = 2.0**-20
+"""Seconds. Times of nodes are whole multiples of it: of ephemeris times, seconds since the year 2000, a float64 holds
+these exactly, but decimal fractions only to 6e-8 s, a thousandth of a line.
+"""
+_SPARE = 6
+"""Nodes beyond either end of the image."""
+_FEWEST, _MOST = 64, 8192
+_PIXELS = 33
+"""Places along the line where looks are compared; they are smooth to 1e-10 of a pixel."""
+_ROUNDS = 4
+_CUBIC = (0, 2, 5, 9)
+"""Terms 1, y, y^2 and y^3 of the distortion's ten; a line has no width in x for the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class EffectiveCamera:
+    """A camera and its way that see, with straight light, what a sensor sees at one height.
+
+    Attributes:
+        seconds: of the nodes, evenly spaced, (N,), of the trajectory.
+        station: projection centre, ITRS, (N, 3), metres.
+        velocity: of it, (N, 3), m/s.
+        rotation: from the camera's axes to the ITRS; X along the flight, Y along the line, Z toward the scene.
+        focal_length: metres.
+        pitch: of the pixels, metres.
+        pixels: of the line.
+        along: (4,) coefficients of the real y by powers of the ideal one, both in millimetres.
+        across: (4,) likewise, what is added to the ideal x of a point on the line to make it 0.
+    """
+
+    seconds: Array
+    station: Array
+    velocity: Array
+    rotation: Rotation
+    focal_length: float
+    pitch: float
+    pixels: int
+    along: Array
+    across: Array
+
+    def looks(self, pixel: Array) -> Array:
+        """Unit looks (K, 3) of places on the line (K,), camera axes."""
+        real = 1e3 * self.pitch * (np.asarray(pixel) - 0.5 * (self.pixels - 1))
+        ideal = real.copy()
+        slope = self.along[1:] * np.arange(1.0, len(self.along))
+        for _ in range(_NEWTON):
+            ideal = ideal - (_power(self.along, ideal) - real) / _power(slope, ideal)
+        vector = np.stack([-_power(self.across, ideal), ideal, np.full_like(ideal, 1e3 * self.focal_length)], axis=-1)
+        return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+
+
+_NEWTON = 12
+
+
+def _power(coefficients: Array, at: Array) -> Array:
+    return np.asarray(np.polynomial.polynomial.polyval(at, coefficients))
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """How far a model sees from where the rigorous sensor does, pixels: largest over an image, along its lines and
+    along the track, at one height (metres above the ellipsoid).
+    """
+
+    height_m: float
+    sample_px: float
+    line_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class LineScanner:
+    """An ISD, and how well it agrees.
+
+    Attributes:
+        isd: contents of the file, plain data.
+        camera: that it describes.
+        errors: at the heights that were asked for.
+    """
+
+    isd: Mapping[str, Any]
+    camera: EffectiveCamera
+    errors: tuple[ModelError, ...]
+
+
+def line_scanner(
+    sensor: Sensor,
+    name: str,
+    epoch: str,
+    pitch: float,
+    heights: tuple[float, float, float],
+    window: tuple[int, int] | None = None,
+) -> LineScanner:
+    """The ISD of an image, or of a window of it.
+
+    Args:
+        sensor: the line on its trajectory; its lines are those of the window, its camera is the whole line.
+        name: of the line.
+        epoch: UTC of the trajectory's second 0, ISO 8601.
+        pitch: of the pixels, metres.
+        heights: of the ground above the ellipsoid, lowest, middle, highest, metres; it is right at the middle one.
+        window: its first pixel on the line, and how many; None for the whole line.
+
+    Raises:
+        ValueError: a look misses the Earth, or the trajectory is too rough for `_MOST` nodes.
+    """
+    camera = effective_camera(sensor, pitch, heights[1], epoch)
+    first, pixels = (0, camera.pixels) if window is None else window
+    errors = tuple(_error(sensor, camera, height, (first, pixels)) for height in heights)
+    return LineScanner(_isd(sensor, camera, name, epoch, heights, (first, pixels), errors), camera, errors)
+
+
+def effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:
+    """The camera with straight light that sees what a sensor sees at a height above the ellipsoid, metres.
+
+    Args:
+        sensor: the line on its trajectory.
+        pitch: of its pixels, metres.
+        height: metres.
+        epoch: UTC of the trajectory's second 0; only its fraction of a second matters.
+
+    Raises:
+        ValueError: as `line_scanner`.
+    """
+    count = _FEWEST
+    while True:
+        camera = _fitted(sensor, pitch, height, _nodes(sensor, count, epoch))
+        if _smooth(camera):
+            return camera
+        count *= 2
+        if count > _MOST:
+            raise ValueError(f"{_MOST} nodes of the orbit and the attitude do not follow the trajectory")
+
+
+def _ephemeris_time(epoch: str) -> tuple[int, float]:
+    """Ephemeris time of an epoch (UTC), seconds since the noon of 2000-01-01: whole ones, and the rest.
+
+    It is terrestrial time, from which that of the barycentre differs by 2 ms at most; only the place of the Sun depends
+    on it.
+    """
+    one, two = tai_of(epoch)
+    days = one - erfa.DJ00
+    seconds = (days - np.floor(days)) * erfa.DAYSEC + two * erfa.DAYSEC + erfa.TTMTAI
+    whole = int(np.floor(seconds))
+    return int(np.floor(days)) * int(erfa.DAYSEC) + whole, float(seconds) - whole
+
+
+def _nodes(sensor: Sensor, count: int, epoch: str) -> Array:
+    """Times of nodes (N,), seconds of the trajectory: even, whole ticks of ephemeris time."""
+    ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
+    step = max(np.ceil((ends[1] - ends[0]) / count / _TICK), 1.0) * _TICK
+    rest = _ephemeris_time(epoch)[1]
+    first = np.floor((ends[0] + rest) / _TICK) * _TICK - rest - _SPARE * step
+    times = first + step * np.arange(np.ceil((ends[1] - first) / step) + _SPARE + 1.0)
+    return np.asarray(times[_known(sensor, times)])
+
+
+def _known(sensor: Sensor, times: Array) -> NDArray[np.bool_]:
+    """Whether the trajectory knows these times."""
+
+    def known(time: float) -> bool:
+        try:
+            sensor.trajectory.position(np.array([time]))
+        except ValueError:
+            return False
+        return True
+
+    # only those beyond the image can be unknown
+    first, last = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
+    return np.array([first <= time <= last or known(time) for time in times])
+
+
+def _fitted(sensor: Sensor, pitch: float, height: float, seconds: Array) -> EffectiveCamera:
+    line = sensor.camera
+    middle = np.array([0.5 * (line.pixels - 1)])
+    pixel = 0.5 * (line.pixels - 1) * (1.0 - np.cos(np.pi * np.arange(_PIXELS) / (_PIXELS - 1.0)))
+    station, directions = _directions(sensor, seconds, pixel, height)
+    look, slope = line.look_and_slope(middle)
+    z = look[0]
+    y = slope[0] / np.linalg.norm(slope[0])
+    axes = np.stack([np.cross(y, z), y, z], axis=-1)
+    looks = line.look(pixel) @ axes
+    turn = np.empty((len(seconds), 3, 3))
+    for _ in range(_ROUNDS):
+        # the rotation that takes the looks to the directions best (Wahba's problem, by singular values)
+        u, _, vt = np.linalg.svd(np.einsum("nki,kj->nij", directions, looks))
+        u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+        turn = u @ vt
+        looks = np.mean(np.einsum("nij,nki->nkj", turn, directions), axis=0)
+        looks = looks / np.linalg.norm(looks, axis=-1, keepdims=True)
+    focal = pitch / float(np.linalg.norm(slope[0]))
+    ideal = 1e3 * focal * looks[:, :2] / looks[:, 2:]
+    real = 1e3 * pitch * (pixel - middle)
+    basis = np.vander(ideal[:, 1], 4, increasing=True)
+    scale = np.max(np.abs(basis), axis=0)
+    along, across = (np.linalg.lstsq(basis / scale, side, rcond=None)[0] / scale for side in (real, -ideal[:, 0]))
+    step = seconds[1] - seconds[0]
+    velocity = np.gradient(station, step, axis=0, edge_order=2)
+    rotation = Rotation.from_matrix(turn)
+    return EffectiveCamera(seconds, station, velocity, rotation, focal, pitch, line.pixels, along, across)
+
+
+def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> tuple[Array, Array]:
+    """Stations (N, 3), and unit directions (N, K, 3) from them to what the pixels (K,) see at a height, ITRS."""
+    count = len(seconds)
+    step = float(seconds[1] - seconds[0])
+    way = _AtNodes(sensor, seconds)
+    nodes = replace(sensor, trajectory=way, line_time=step, first_line_time=float(seconds[0]), lines=count)
+    at, which = (v.ravel() for v in np.meshgrid(np.arange(float(count)), pixel, indexing="ij"))
+    ground = nodes.ground(at, which, height).reshape(count, len(pixel), 3)
+    if not np.all(np.isfinite(ground)):
+        raise ValueError("a look misses the Earth")
+    middle = np.array([0.5 * (sensor.camera.pixels - 1)])
+    to_itrs = sensor.trajectory.body_to_itrs(seconds)
+    station = sensor.trajectory.position(seconds) + to_itrs @ sensor.camera.origin(middle)[0]
+    away = ground - station[:, None]
+    return station, away / np.linalg.norm(away, axis=-1, keepdims=True)
+
+
+def _lagrange(times: Array, values: Array, at: Array) -> Array:
+    """Values (M, K) at times (M,) from those at even nodes (N, K), as the community's model does it: through eight
+    nodes, and through fewer near the ends.
+    """
+    place = (np.asarray(at) - times[0]) / (times[1] - times[0])
+    before = np.clip(np.floor(place).astype(int), 0, len(times) - 2)
+    half = np.minimum(np.minimum(before + 1, len(times) - 1 - before), 4)
+    share = place - before
+    offsets = np.arange(-3, 5)
+    used = (offsets > -half[:, None]) & (offsets <= half[:, None])
+    found = np.zeros((len(place), values.shape[1]))
+    for k, offset in enumerate(offsets):
+        others = np.delete(np.arange(8), k)
+        factors = np.where(used[:, others], (share[:, None] - offsets[others]) / (offset - offsets[others]), 1.0)
+        weight = np.where(used[:, k], np.prod(factors, axis=1), 0.0)
+        found += weight[:, None] * values[np.clip(before + offset, 0, len(times) - 1)]
+    return found
+
+
+def _joined(rotation: Rotation) -> Array:
+    """Quaternions (N, 4) x, y, z, w of the way from the ITRS to the camera; neighbours on one side."""
+    quaternion = rotation.inv().as_quat(canonical=False)
+    flip = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=-1) < 0.0, -1.0, 1.0))
+    quaternion[1:] *= flip[:, None]
+    return np.asarray(quaternion)
+
+
+def _smooth(camera: EffectiveCamera) -> bool:
+    """Whether every other node tells those between, to `_FOLLOWED` pixels; all of them tell what is between better."""
+    coarse, between = camera.seconds[::2], camera.seconds[1:-1:2]
+    inner = slice(_SPARE, -_SPARE) if len(between) > 4 * _SPARE else slice(None)
+    station = _lagrange(coarse, camera.station[::2], between) - camera.station[1:-1:2]
+    turned = _lagrange(coarse, _joined(camera.rotation)[::2], between) - _joined(camera.rotation)[1:-1:2]
+    angle = 2.0 * np.max(np.linalg.norm(turned[inner], axis=-1))
+    shift = np.max(np.linalg.norm(station[inner], axis=-1)) / _NEAREST
+    return bool(angle + shift < _FOLLOWED * camera.pitch / camera.focal_length)
+
+
+_FOLLOWED = 0.01
+_NEAREST = 2e5
+"""Metres to the ground, no more than which a satellite is high; a shift of the station is an angle there."""
+
+
+def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple[int, int]) -> ModelError:
+    """Against the rigorous sensor on a grid of its image that is not the one that was fitted."""
+    line = np.linspace(-0.5, sensor.lines - 0.5, _GRID[0])
+    pixel = window[0] + np.linspace(-0.5, window[1] - 0.5, _GRID[1])
+    at, which = (v.ravel() for v in np.meshgrid(line, pixel, indexing="ij"))
+    ground = sensor.ground(at, which, height)
+    if not np.all(np.isfinite(ground)):
+        raise ValueError("a look misses the Earth")
+    seconds = sensor.time(at)
+    here = _image(camera, seconds, ground)
+    later = _image(camera, seconds + sensor.line_time, ground)
+    # the line on which the model sees the point, and what of its pixel the image moves by until then
+    lines = here[:, 0] / (here[:, 0] - later[:, 0])
+    sample = here[:, 1] + lines * (later[:, 1] - here[:, 1]) - (which - 0.5 * (camera.pixels - 1))
+    return ModelError(height, float(np.max(np.abs(sample))), float(np.max(np.abs(lines))))
+
+
+_GRID = (37, 41)
+
+
+def _image(camera: EffectiveCamera, seconds: Array, ground: Array) -> Array:
+    """Image (N, 2) at given times, pixels from the line and along it."""
+    turn = Rotation.from_quat(_lagrange(camera.seconds, _joined(camera.rotation), seconds))
+    look = turn.apply(ground - _lagrange(camera.seconds, camera.station, seconds))
+    ideal = 1e3 * camera.focal_length * look[:, :2] / look[:, 2:]
+    real = np.stack([ideal[:, 0] + _power(camera.across, ideal[:, 1]), _power(camera.along, ideal[:, 1])], axis=-1)
+    return real / (1e3 * camera.pitch)
+
+
+class _AtNodes:
+    """A trajectory that is asked at its nodes alone: a sensor looks half a line beyond them, where it may end."""
+
+    def __init__(self, sensor: Sensor, seconds: Array) -> None:
+        self._known, self._first, self._last = sensor.trajectory, seconds[0], seconds[-1]
+
+    def position(self, seconds: Array) -> Array:
+        return self._known.position(np.clip(seconds, self._first, self._last))
+
+    def inertial_velocity(self, seconds: Array) -> Array:
+        return self._known.inertial_velocity(np.clip(seconds, self._first, self._last))
+
+    def body_to_itrs(self, seconds: Array) -> Array:
+        return self._known.body_to_itrs(np.clip(seconds, self._first, self._last))
+
+
+def _isd(
+    sensor: Sensor,
+    camera: EffectiveCamera,
+    name: str,
+    epoch: str,
+    heights: tuple[float, float, float],
+    window: tuple[int, int],
+    errors: tuple[ModelError, ...],
+) -> dict[str, Any]:
+    """Contents of the file."""
+    whole, rest = _ephemeris_time(epoch)
+    ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
+    # in whole ticks from a whole second, ephemeris times are exact
+    middle = round(0.5 * float(ends[0] + ends[1]) + rest)
+    center = float(whole + middle)
+    start = float(ends[0]) + rest - middle
+    nodes = (center + np.round((camera.seconds + rest - middle) / _TICK) * _TICK).tolist()
+    first = np.zeros(10)
+    first[list(_CUBIC)] = camera.across
+    first[1] = 1.0
+    second = np.zeros(10)
+    second[list(_CUBIC)] = camera.along
+    quaternion = np.roll(_joined(camera.rotation), 1, axis=1)
+    rate = _turning(camera)
+    still = [[1.0, 0.0, 0.0, 0.0]] * len(nodes)
+    zero = [[0.0, 0.0, 0.0]] * len(nodes)
+    unit = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    per_mm = 1e-3 / camera.pitch
+    return {
+        "isis_camera_version": 1,
+        "image_identifier": f"{name} {epoch}",
+        "name_model": MODEL,
+        "name_platform": "space-camera-twin",
+        "name_sensor": name,
+        "image_lines": sensor.lines,
+        "image_samples": window[1],
+        "center_ephemeris_time": center,
+        "starting_ephemeris_time": center + start,
+        "line_scan_rate": [[0.5, start, sensor.line_time]],
+        "detector_sample_summing": 1,
+        "detector_line_summing": 1,
+        "starting_detector_line": 0,
+        "starting_detector_sample": window[0],
+        "detector_center": {"line": 0.0, "sample": 0.5 * camera.pixels},
+        "focal2pixel_lines": [0.0, per_mm, 0.0],
+        "focal2pixel_samples": [0.0, 0.0, per_mm],
+        "focal_length_model": {"focal_length": 1e3 * camera.focal_length},
+        "interpolation_method": "lagrange",
+        "optical_distortion": {"transverse": {"x": first.tolist(), "y": second.tolist()}},
+        "radii": {
+            "semimajor": 1e-3 * EQUATORIAL_RADIUS,
+            "semiminor": 1e-3 * EQUATORIAL_RADIUS * (1.0 - FLATTENING),
+            "unit": "km",
+        },
+        "reference_height": {"maxheight": heights[2], "minheight": heights[0], "unit": "m"},
+        "instrument_position": {
+            "unit": "km",
+            "positions": (1e-3 * camera.station).tolist(),
+            "velocities": (1e-3 * camera.velocity).tolist(),
+            "ephemeris_times": nodes,
+            "reference_frame": 1,
+        },
+        "instrument_pointing": {
+            "quaternions": quaternion.tolist(),
+            "ephemeris_times": nodes,
+            "angular_velocities": rate.tolist(),
+            "reference_frame": 1,
+            "time_dependent_frames": [-1, 1],
+            "constant_frames": [-1],
+            "constant_rotation": unit,
+        },
+        "body_rotation": {
+            "quaternions": still,
+            "ephemeris_times": nodes,
+            "angular_velocities": zero,
+            "reference_frame": 1,
+            "time_dependent_frames": [-2, 1],
+            "constant_frames": [-2],
+            "constant_rotation": unit,
+        },
+        "sun_position": {
+            "unit": "km",
+            "positions": [_sun(sensor, epoch, center).tolist()],
+            "velocities": [[0, 0, 0]],
+            "ephemeris_times": [center],
+            "reference_frame": 1,
+        },
+        "notes": _notes(sensor, heights, errors),
+    }
+
+
+def _turning(camera: EffectiveCamera) -> Array:
+    """Angular velocity of the camera's axes against the Earth-fixed ones, in the latter, rad/s, (N, 3)."""
+    step = camera.seconds[1] - camera.seconds[0]
+    turn = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step
+    return np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])
+
+
+def _sun(sensor: Sensor, epoch: str, center: float) -> Array:
+    """Place of the Sun, ITRS, kilometres, at an ephemeris time."""
+    whole, rest = _ephemeris_time(epoch)
+    seconds = center - whole - rest
+    heliocentric = erfa.epv00(erfa.DJ00, center / erfa.DAYSEC)[0]["p"]
+    turn = sensor.earth.rotation(epoch, seconds, seconds).matrix(seconds)
+    return np.asarray(turn @ (-1e-3 * erfa.DAU * heliocentric))
+
+
+def _notes(sensor: Sensor, heights: tuple[float, float, float], errors: tuple[ModelError, ...]) -> list[str]:
+    """What the model cannot carry, and how much that is."""
+    effects = sensor.effects
+    names = {"light_time": "light time", "aberration": "aberration", "refraction": "refraction"}
+    on = [text for name, text in names.items() if getattr(effects, name)]
+    carried = (
+        f"{', '.join(on)} stand in the attitude and the distortion as they are at {heights[1]:g} m above the ellipsoid"
+        if on
+        else "nothing happens to the light"
+    )
+    notes = [
+        "Earth-fixed axes are those of the ITRS (WGS84), ephemeris times are terrestrial time; lines and samples count "
+        "from the corner of the image, the centre of its first pixel is 0.5, 0.5.",
+        f"Light: {carried}.",
+    ]
+    for one in errors:
+        notes.append(
+            f"Against the rigorous sensor, largest over the image at {one.height_m:g} m: {one.sample_px:.2g} samples, "
+            f"{one.line_px:.2g} lines."
+        )
+    return notes

@@ -1,0 +1,180 @@
+"""A line sensor as rational polynomials (RPC00B, NIMA STDI-0002): line and sample as ratios of cubics in latitude,
+longitude and height, the one model that all photogrammetric software reads.
+
+Coordinates are scaled to -1 .. 1 over the ground that the fit covers; beyond it the polynomials say nothing. Image
+coordinates count from the centre of the first pixel, heights are above the ellipsoid (WGS84).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from optics.numerics.threads import one_blas_thread
+from twin.orbit.flight.sensor import Sensor
+
+Array = NDArray[np.float64]
+
+TERMS = 20
+_POWERS = np.array(
+    [
+        *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
+        *((1, 1, 1), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 1, 0), (0, 3, 0), (0, 1, 2), (2, 0, 1), (0, 2, 1), (0, 0, 3)),
+    ]
+)
+"""Powers of longitude, latitude and height in the order of RPC00B."""
+_GRID = (24, 24, 9)
+"""Lines, pixels and heights that are fitted; the checks lie between them."""
+_ROUNDS = 6
+_RANK = 1e-11
+"""Of singular values. A cubic ratio has more coefficients than an image has shape: the rest stay small."""
+_DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
+"""Of the denominators; the last leaves polynomials."""
+
+
+@dataclass(frozen=True, eq=False)
+class RationalPolynomial:
+    """The model, and how well it agrees.
+
+    Attributes:
+        offset: of line, sample, latitude, longitude (degrees) and height (metres), (5,).
+        scale: likewise.
+        line_numerator, line_denominator, sample_numerator, sample_denominator: (20,) each.
+        error_px: largest difference from the rigorous sensor at places that were not fitted, lines and samples.
+        rms_px: root mean square of them.
+    """
+
+    offset: Array
+    scale: Array
+    line_numerator: Array
+    line_denominator: Array
+    sample_numerator: Array
+    sample_denominator: Array
+    error_px: tuple[float, float]
+    rms_px: tuple[float, float]
+
+    @classmethod
+    def fit(cls, sensor: Sensor, first_pixel: int, pixels: int, heights: tuple[float, float]) -> RationalPolynomial:
+        """Rational polynomials of an image, or of a window of it.
+
+        Args:
+            sensor: the line on its trajectory; its lines are those of the window.
+            first_pixel: of the window on the line.
+            pixels: of the window.
+            heights: lowest and highest ground above the ellipsoid, metres.
+
+        Raises:
+            ValueError: a look misses the Earth, or the ground crosses a pole or the 180th meridian.
+        """
+        fitted = _seen(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
+        ends = np.stack([np.min(fitted, axis=0), np.max(fitted, axis=0)])
+        if ends[1, 3] - ends[0, 3] > _WIDEST:
+            raise ValueError("the ground lies on the 180th meridian or a pole, where longitudes jump")
+        offset, scale = np.mean(ends, axis=0), 0.5 * (ends[1] - ends[0])
+        others = tuple(count - 1 for count in _GRID)
+        checked = _seen(sensor, first_pixel, pixels, heights, others, at_ends=False)
+        sides = [(_monomials((seen[:, 2:] - offset[2:]) / scale[2:]), seen) for seen in (fitted, checked)]
+        best = [_best(sides, k, offset[k], scale[k]) for k in range(2)]
+        (line, line_most, line_rms), (sample, sample_most, sample_rms) = best
+        return cls(offset, scale, *line, *sample, (line_most, sample_most), (line_rms, sample_rms))
+
+    def image(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
+        """Line and sample (N,) of ground points: degrees (N,), degrees, metres above the ellipsoid."""
+        unit = (np.stack([latitude, longitude, height], axis=-1) - self.offset[2:]) / self.scale[2:]
+        basis = _monomials(unit)
+        line = basis @ self.line_numerator / (basis @ self.line_denominator)
+        sample = basis @ self.sample_numerator / (basis @ self.sample_denominator)
+        return self.offset[0] + self.scale[0] * line, self.offset[1] + self.scale[1] * sample
+
+    def text(self) -> str:
+        """Contents of NAME_RPC.TXT, as GDAL reads it beside NAME.tif."""
+        names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
+        rows = [
+            f"{name}_{what}: {value!r} {unit}"
+            for what, values in (("OFF", self.offset), ("SCALE", self.scale))
+            for (name, unit), value in zip(names, values.tolist(), strict=True)
+        ]
+        parts = {
+            "LINE_NUM": self.line_numerator,
+            "LINE_DEN": self.line_denominator,
+            "SAMP_NUM": self.sample_numerator,
+            "SAMP_DEN": self.sample_denominator,
+        }
+        rows += [f"{name}_COEFF_{k + 1}: {v!r}" for name, part in parts.items() for k, v in enumerate(part.tolist())]
+        return "\n".join(rows) + "\n"
+
+
+_WIDEST = 90.0
+"""Degrees of longitude."""
+
+
+def _seen(
+    sensor: Sensor,
+    first_pixel: int,
+    pixels: int,
+    heights: tuple[float, float],
+    counts: tuple[int, ...],
+    *,
+    at_ends: bool,
+) -> Array:
+    """Line, sample, latitude, longitude (degrees) and height (metres) over an image, (N, 5); image coordinates from the
+    window's first pixel.
+    """
+    spans = ((-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights)
+    axes = []
+    for count, (low, high) in zip(counts, spans, strict=True):
+        step = np.linspace(0.0, np.pi, count) if at_ends else (np.arange(count) + 0.5) * np.pi / count
+        axes.append(0.5 * (low + high) - 0.5 * (high - low) * np.cos(step))
+    line, sample, height = (v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
+    ground = sensor.ground(line, first_pixel + sample, height)
+    if not np.all(np.isfinite(ground)):
+        raise ValueError("a look misses the Earth")
+    longitude, latitude, _ = sensor.earth.geodetic(ground)
+    return np.stack([line, sample, np.degrees(latitude), np.degrees(longitude), height], axis=-1)
+
+
+def _monomials(unit: Array) -> Array:
+    """(N, 20) terms of latitude, longitude and height (N, 3), scaled."""
+    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in (unit[:, 1], unit[:, 0], unit[:, 2])]
+    return np.stack([powers[0][a] * powers[1][b] * powers[2][c] for a, b, c in _POWERS], axis=-1)
+
+
+def _best(
+    sides: list[tuple[Array, Array]], k: int, offset: float, scale: float
+) -> tuple[tuple[Array, Array], float, float]:
+    """Numerator and denominator of one image coordinate, largest and root mean square error where it was not fitted.
+
+    Attitudes that jitter are no cubics: coefficients that follow the jitter at the fitted places go astray between
+    them. Of several degrees of smoothness the one with the least error there is taken.
+    """
+    (basis, fitted), (others, checked) = sides
+    found: list[tuple[float, float, tuple[Array, Array]]] = []
+    for damping in _DAMPING:
+        ratio = _ratio(basis, (fitted[:, k] - offset) / scale, damping)
+        below = others @ ratio[1]
+        if not np.all(below > 0.0):  # a pole on the ground
+            continue
+        away = offset + scale * (others @ ratio[0]) / below - checked[:, k]
+        found.append((float(np.sqrt(np.mean(away**2))), float(np.max(np.abs(away))), ratio))
+    rms, most, ratio = min(found, key=lambda one: one[0])
+    return ratio, most, rms
+
+
+@one_blas_thread()
+def _ratio(basis: Array, value: Array, damping: float) -> tuple[Array, Array]:
+    """Coefficients (20,) and (20,), the second's first being 1, whose ratio is a value (N,): least squares of the
+    ratio itself, by weights from the denominator of the round before; ``damping`` of the denominator's coefficients.
+    """
+    weight = np.ones(len(value))
+    held = np.concatenate([np.zeros(TERMS), np.full(TERMS - 1, damping * np.sqrt(len(value)))])
+    found = np.zeros(2 * TERMS - 1)
+    for _ in range(_ROUNDS):
+        rows = np.concatenate([basis, -value[:, None] * basis[:, 1:]], axis=1) * weight[:, None]
+        rows, right = np.concatenate([rows, np.diag(held)]), np.concatenate([value * weight, np.zeros(len(held))])
+        found = np.linalg.lstsq(rows, right, rcond=_RANK)[0]
+        weight = 1.0 / (1.0 + basis[:, 1:] @ found[TERMS:])
+        if not np.all(np.isfinite(weight) & (weight > 0.0)):
+            break
+    return found[:TERMS], np.concatenate([[1.0], found[TERMS:]])
