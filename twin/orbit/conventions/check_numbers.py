@@ -135,7 +135,7 @@ class CheckNumbers:
     factor_of_variance: float
     ground_accuracy_m: float | None
     image_points: Mapping[str, int]
-    gross_errors: Mapping[str, int]
+    gross_errors: Mapping[str, Sequence[str]]
     questions: Mapping[str, QuestionNumbers]
     ranking: Sequence[ReadingNumbers]
     places: Sequence[PlaceNumbers]
@@ -158,7 +158,7 @@ class CheckNumbers:
             factor_of_variance=run.factor,
             ground_accuracy_m=run.readings.ground.accuracy,
             image_points={name: len(raw.line) for name, raw in run.readings.images.items()},
-            gross_errors=run.wrong,
+            gross_errors={name: list(points) for name, points in run.wrong.items()},
             questions={name: QuestionNumbers.of(name, answers) for name, answers in run.answers.items()},
             ranking=[ReadingNumbers.of(one, run) for one in run.tried],
             places=places,

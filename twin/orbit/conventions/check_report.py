@@ -13,6 +13,8 @@ from twin.run.report import Report, Section, one_sentence
 ANOTHER, NONE = 3, 4
 """Exit codes: another reading than the stated one stands; none explains the points."""
 _LISTED = 12
+_NAMED = 6
+"""Gross errors of a line that are named in a warning; check.json has all."""
 
 
 def check_report(run: Check) -> Report:
@@ -170,8 +172,10 @@ def _reading(changes: Changes) -> str:
 
 def _warnings(run: Check) -> tuple[str, ...]:
     found = []
-    if gross := sum(run.wrong.values()):
-        found.append(f"{gross} image points were left out as gross errors")
+    for name, points in run.wrong.items():
+        if points:
+            more = f" and {len(points) - _NAMED} more" if len(points) > _NAMED else ""
+            found.append(f"left out as gross errors in {name}: {', '.join(points[:_NAMED])}{more}")
     if run.factor > 2.0:
         found.append(f"residuals are {np.sqrt(run.factor):.1f} times as large as the sigmas and uncertainties say")
     accuracy = run.readings.ground.accuracy

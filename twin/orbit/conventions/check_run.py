@@ -101,7 +101,7 @@ class Check:
         first_points: line -> rows of the ground points whose places are listed.
         places: changes of one question -> where the first points of each line fall, ITRS, metres, or why nowhere.
         count: how many readings were tried.
-        wrong: points that were left out as gross errors, by line.
+        wrong: line -> names of points that were left out as gross errors.
     """
 
     setup: CheckSetup
@@ -115,7 +115,7 @@ class Check:
     first_points: dict[str, np.ndarray]
     places: dict[Changes, dict[str, np.ndarray] | str]
     count: int
-    wrong: dict[str, int]
+    wrong: dict[str, tuple[str, ...]]
 
     @property
     def alike(self) -> tuple[Changes, ...]:
@@ -146,12 +146,13 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     others = asked(stated, readings.platform.attitude.quaternion is not None)
     best, tried, count = _searched(bench, stated, others)
     advance("readings", 1, 3)
-    wrong = dict.fromkeys(readings.images, 0)
+    wrong: dict[str, tuple[str, ...]] = dict.fromkeys(readings.images, ())
     if best.fit is not None:
         masks = _wrong(bench, best.fit)
         share = float(np.mean(np.concatenate(list(masks.values()))))
         if 0.0 < share <= _MOST_WRONG:
-            wrong = {name: int(mask.sum()) for name, mask in masks.items()}
+            ids, images = readings.ground.points.ids, bench.readings.images
+            wrong = {name: tuple(map(str, ids[images[name].point[mask]])) for name, mask in masks.items()}
             bench = bench.without(masks)
             tried = [_tried(bench, stated, one.changes) for one in tried]
             best = _best(tried)
