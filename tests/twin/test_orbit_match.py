@@ -123,6 +123,7 @@ def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> 
     from scenes.specs.measured.orbit_data import OrbitDataSpec
     from scenes.yaml.translate import validate
     from scenes.yaml.yaml_file import read_yaml
+    from twin.orbit.measured.measurement_tables import PassTables
 
     folder, data = files
     path = folder / "match.yaml"
@@ -134,6 +135,11 @@ def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> 
     assert numbers["orthophoto"]["rows"] > 100
     found = validate(OrbitDataSpec, read_yaml(tmp_path / "data/data.yaml"))
     assert list(found.passes) == ["pass"]
+    files_of = {key: str(tmp_path / "data" / name) for key, name in found.passes["pass"].files.items()}
+    there = found.passes["pass"].model_copy(update=files_of)
+    read = PassTables.read("pass", there).measurements(found.conventions, load_three_line_camera("th1"))
+    assert int(np.sum(read.ground.role == "control")) == numbers["control_points"]
+    assert int(np.sum(read.ground.role == "tie")) == numbers["tie_points"]
     assert (tmp_path / "run/artefacts/points.csv").is_file()
 
 
@@ -142,7 +148,7 @@ WRONG = [
     ({"orthophoto": {"file": "nadir.tiff"}}, "without a place"),
     ({"dem": {"file": "photo.tiff"}}, "counted from is not said"),
     ({"images": {"front": {"file": "nadir.tiff", "first_pixel_sees": "right"}}}, "no such line"),
-    ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "not a raster"),
+    ({"images": {"nadir": {"file": "none.tiff", "first_pixel_sees": "right"}}}, "no such file"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_pixel": 11_900, "first_pixel_sees": "right"}}}, "wider than"),
     ({"images": {"nadir": {"file": "nadir.tiff", "first_line": 50, "first_pixel_sees": "right"}}}, "longer than its"),
     ({"images": {"nadir": {"file": "nadir.tiff", "band": 2, "first_pixel_sees": "right"}}}, "no such band"),

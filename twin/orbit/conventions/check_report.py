@@ -49,7 +49,7 @@ def _verdict(run: Check) -> str:
     cannot = f"the points cannot tell: {', '.join(open_ones)}" if open_ones else "the points tell every convention"
     if run.verdict == "stands":
         return one_sentence(f"The stated conventions explain the points, leaving {size}", cannot)
-    was = stated.why if stated.fit is None else f"it leaves {_metres(stated.fit.rms)}"
+    was = f"under them {stated.why}" if stated.fit is None else f"which leave {_metres(stated.fit.rms)}"
     return one_sentence(
         f"The stated conventions are wrong, {was}",
         f"right is {changes_text(run.best.changes)}, leaving {size}",

@@ -92,8 +92,6 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
         InputError: no such file, none that GDAL reads as a plain grid, without a place, with complex or no values.
     """
     file = str(path)
-    if not is_file(Path(path)):
-        raise InputError(Issue("no such file", file, allowed="a GeoTIFF"))
     with opened(file) as source:
         affine, tags = source.transform, source.crs
         shape, count, dtypes = (source.height, source.width), source.count, source.dtypes
@@ -128,9 +126,12 @@ def opened(file: str) -> Iterator[Any]:
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
+    # names that GDAL takes for addresses or archives are none of files
+    if not is_file(Path(file)):
+        raise InputError(Issue("no such file", file, allowed="a GeoTIFF"))
     try:
-        # a file beside the raster, or one that its name or contents refer to, is not the raster
-        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", CPL_CURL_ENABLE="NO"):
+        # a file beside the raster is not the raster
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
                 source = rasterio.open(Path(file).resolve(), sharing=False)

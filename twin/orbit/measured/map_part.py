@@ -13,7 +13,7 @@ from pyproj.exceptions import ProjError
 from scenes.yaml.errors import InputError, Issue, Problem
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.measured.datum import CGCS2000, Geoid
-from twin.orbit.measured.geotiff import GeoRaster, open_raster
+from twin.orbit.measured.geotiff import GeoRaster, open_raster, opened
 
 if TYPE_CHECKING:
     from scenes.specs.measured.pass_files import RasterFileSpec
@@ -123,10 +123,8 @@ class UserMap:
 
     def limits(self) -> tuple[float, float]:
         """Least and largest value of some thousand places over the whole map."""
-        import rasterio
-
         shape = tuple(min(n, _SAMPLED) for n in self.raster.shape)
-        with rasterio.open(self.raster.file) as source:
+        with opened(self.raster.file) as source:
             some = source.read(self.raster.band, out_shape=shape, masked=True)
         values = np.asarray(some.compressed(), float)
         values = values[np.isfinite(values)]

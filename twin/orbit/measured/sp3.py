@@ -37,7 +37,8 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         raise InputError(Issue("another version of SP3", file, 1, (), shown(head[:2]), "#c or #d"))
     which = satellite or _only_satellite(file, lines)
     scale = _scale(file, lines)
-    frame = known_frame(head[46:51], file, 1, "coordinate system") if head[46:51].strip() else None
+    system = head[46:51].strip()
+    frame = known_frame(system, file, 1, "coordinate system") if system not in ("", "UNDEF") else None
     texts, where, places, rows, speeds, speed_rows = [], [], [], [], [], []
     epoch: str | None = None
     ended = last_used = False
