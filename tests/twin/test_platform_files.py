@@ -404,7 +404,7 @@ def test_no_text_breaks_a_clock(text: str) -> None:
 
 @pytest.mark.slow
 def test_a_million_rows_are_read_in_seconds(tmp_path: Path) -> None:
-    """1e6 rows of an OEM and of a table of quaternions: less than half a minute together on any machine of today."""
+    """1e6 rows of an OEM and of a table of quaternions: less than half a minute of a processor together."""
     rows = 1_000_000
     t = np.arange(rows) * 1e-3
     texts = [f"2011-03-05T03:{int(s) // 60:02d}:{s % 60:09.6f}" for s in t]
@@ -413,10 +413,10 @@ def test_a_million_rows_are_read_in_seconds(tmp_path: Path) -> None:
     (tmp_path / "a.oem").write_text("\n".join([*head, "TIME_SYSTEM = UTC", "META_STOP", *body]))
     lines = ["time [s],q1,q2,q3,q4", *(f"{s:.3f},0,0,0,1" for s in t)]
     (tmp_path / "attitude.csv").write_text("\n".join(lines))
-    started = time.perf_counter()
+    started = time.process_time()
     attitude = {**CSV_ATTITUDE, "epoch": "2011-03-05T03:00:00"}
     table = read(tmp_path, {"file": "a.oem"}, attitude)
-    assert time.perf_counter() - started < 30.0
+    assert time.process_time() - started < 30.0
     assert len(table.orbit_time) == len(table.attitude_time) == rows
 
 
