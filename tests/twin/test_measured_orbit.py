@@ -16,7 +16,7 @@ import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import body_axes_matrix
-from scenes.specs.measured.orbit_data_setup import resolve_measured_angle
+from scenes.specs.measured.orbit_data_setup import is_measured, resolve_any_angle, resolve_measured_angle
 from scenes.specs.orbit_angle import EffectsSpec
 from scenes.specs.orbit_setup import resolve_calibration
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
@@ -265,10 +265,14 @@ def _other_quaternion(heads, rows):
     return heads, found
 
 
-def test_conventions_units_and_order_do_not_matter(campaign, files) -> None:
+def test_conventions_units_and_order_do_not_matter(files) -> None:
     """All of them changed at once, rows and columns shuffled. Quaternions go through other rotations, whose rounding of
     1e-16 rad is 1e-10 m: a 1e-7 of a sigma at most."""
     random = np.random.default_rng(5)
+    for name in FIELDS:
+        place = files.parent / name / "image_points.csv"
+        edit(place, lambda heads, rows: ([*heads, "correlation"], [[*row, "0.4"] for row in rows]))
+    before = simultaneous(read_back(files)[1])
 
     def shuffled(heads, rows):
         order = random.permutation(len(heads))
@@ -281,6 +285,7 @@ def test_conventions_units_and_order_do_not_matter(campaign, files) -> None:
             cells = list(row)
             cells[where["line"]] = repr(float(row[where["line"]]) + 1000.5)
             cells[where["pixel"]] = repr(11999.0 - float(row[where["pixel"]]) + 1.5)
+            cells[heads.index("correlation")] = "-0.4"
             found.append(cells)
         return heads, found
 
@@ -309,7 +314,7 @@ def test_conventions_units_and_order_do_not_matter(campaign, files) -> None:
     }
     set_keys(files.parent / "data.yaml", conventions=said)
     _, again = read_back(files)
-    same(simultaneous(campaign), simultaneous(again), 1e-7)
+    same(before, simultaneous(again), 1e-7)
 
 
 @pytest.mark.parametrize(
@@ -547,3 +552,41 @@ def test_the_angle_command_on_measurements(files) -> None:
     refused = run("angle", angle_file(folder, angles={"wide": ["forward", "multispectral"]}), "--out", folder / "no")
     assert refused.exit_code == 2
     assert "angles.wide" in refused.stderr
+    refused = run("angle", angle_file(folder, time="10 min"), "--out", folder / "no")
+    assert refused.exit_code == 2
+    assert "time: orbit or attitude are not known then" in " ".join(refused.stderr.split())
+
+
+def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(campaign, files) -> None:
+    """Aberration by the derivative of noisy positions, 0.1 m/s or 3e-10 rad off; orbit and attitude at the same times
+    in one table."""
+    folder = files.parent / "Beijing"
+    edit(folder / "orbit.csv", lambda heads, rows: (heads[:4], [row[:4] for row in rows]))
+    _, again = read_back(files)
+    assert again.passes[0].measurements.platform.velocity is None
+    same(simultaneous(campaign), simultaneous(again), 0.01)
+    data = dict(read_yaml(files.parent / "data.yaml").data)
+    one = dict(data["passes"]["Beijing"])
+    with (folder / "attitude.csv").open() as stream:
+        attitude = np.loadtxt(stream, delimiter=",", skiprows=1)
+    with (folder / "orbit.csv").open() as stream:
+        orbit = np.loadtxt(stream, delimiter=",", skiprows=1)
+    place = CubicSpline(orbit[:, 0], orbit[:, 1:])(attitude[:, 0])
+    rows = np.column_stack([attitude[:, 0], place, attitude[:, 1:]])
+    text = "time [s],x [m],y [m],z [m],q1,q2,q3,q4\n" + "\n".join(",".join(map(repr, r)) for r in rows.tolist())
+    (folder / "platform.csv").write_text(text)
+    del one["orbit"], one["attitude"]
+    data["passes"] = {**data["passes"], "Beijing": {**one, "platform": "Beijing/platform.csv"}}
+    (files.parent / "data.yaml").write_text(dump_yaml(data))
+    # the orbit's readings are now told as 8 a second: their noise is stated by an interval
+    same(simultaneous(campaign), simultaneous(read_back(files)[1]), 0.01)
+
+
+def test_files_of_simulations_and_of_measurements_are_told_apart() -> None:
+    """All shipped ones; a simulation of angles has a key `passes`, too."""
+    folder = SCENES / ORBIT
+    assert not any(is_measured(file) for file in folder.glob("*.yaml"))
+    assert is_measured(folder / "measured/angle.yaml")
+    assert is_measured(folder / "measured/calibrate.yaml")
+    assert not is_measured("angle")
+    assert resolve_any_angle(folder / "angle.yaml").test.name == "angle"

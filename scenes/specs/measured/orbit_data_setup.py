@@ -23,8 +23,6 @@ from scenes.yaml.yaml_file import read_yaml
 
 DATA_FILE = "data.yaml"
 """Of a folder of measurements."""
-MEASURED_KEYS = {"data", "passes"}
-"""A test with one of these keys runs on measurements."""
 
 
 class MeasuredCalibrationSetup(ExperimentSetup[MeasuredCalibrationSpec]):
@@ -68,8 +66,9 @@ def is_measured(path: str | Path) -> bool:
         return False
     data = read_yaml(path).data
     if isinstance(data, dict) and isinstance(data.get("test"), dict):
-        return bool(MEASURED_KEYS & set(data["test"]))
-    return isinstance(data, dict) and bool(MEASURED_KEYS & set(data))
+        data = data["test"]
+    # `passes` of a simulation is a number
+    return isinstance(data, dict) and ("data" in data or "conventions" in data or isinstance(data.get("passes"), dict))
 
 
 def resolve_measured_calibration(path: str | Path) -> MeasuredCalibrationSetup:

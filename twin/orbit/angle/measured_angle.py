@@ -165,6 +165,9 @@ def measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> Measure
     path = TabulatedTrajectory(one.platform)
     seconds = {name: one.line_times[name].at(points[name].line) for name in used}
     moment = float(np.mean(seconds[tested.reference])) if test.time is None else test.time
+    if not path.known(moment):
+        allowed = f"a moment within the readings of {one.name}, {path.first:.9g} s to {path.last:.9g} s, and in no gap"
+        raise test.error("orbit or attitude are not known then", ("time",), found=f"{moment:g} s", allowed=allowed)
     e = test.effects
     removed = LightEffects(e.light_time, e.aberration, e.refraction, e.wavelength) if e.corrected else NO_EFFECTS
     laboratory = {name: camera for name, camera in line_cameras(setup.camera).items() if name in used}
