@@ -134,6 +134,20 @@ def test_two_wrong_conventions_at_once_are_found(files, one: str, other: str) ->
 
 
 @pytest.mark.slow
+def test_a_platform_that_is_late_as_a_whole_is_the_same_as_lines_that_are_early(files) -> None:
+    """In Earth-fixed data the two cannot be told; the one that changes less is named."""
+    late = [(("platform", name, "time_scale"), "GPS") for name in ("orbit", "attitude")]
+    assert checked(files, *late).best.changes == (("line_time_scale", "GPS"),)
+
+
+@pytest.mark.slow
+def test_what_no_reading_explains_is_said(files) -> None:
+    """The platform is wrong by 40 arcsec, and stated to be good to a tenth of one."""
+    small = {"attitude": "0.1 arcsec", "position": "0.1 m", "interior": 0.1, "scale": 0.0, "time": "0 s"}
+    assert checked(files, (("uncertainty",), small)).verdict == "none"
+
+
+@pytest.mark.slow
 def test_gross_errors_do_not_hide_a_convention(tmp_path: Path) -> None:
     data = bench.check_files(tmp_path, count=25, seed=4, wrong=0.1)
     found = checked((tmp_path, data), FOUND["conjugate quaternion"][0])
