@@ -31,6 +31,7 @@ CUTS = (
     "twin.laboratory.distortion_bench.DistortionBench.record",
     "twin.laboratory.turntable_run.choose",
     "twin.orbit.angle.angle_run.estimated",
+    "twin.orbit.angle.measured_angle.estimated",
     "twin.orbit.calibration.flown_campaign._simulated_points",
     "twin.orbit.calibration.calibration_run.campaign_of",
     "twin.orbit.calibration.field_images.Imager.measured",
@@ -132,7 +133,7 @@ def _config(name: str, app: typer.Typer, words: str, resolve: Callable, file: st
 
 def cases() -> dict[str, Case]:
     """All cases by name."""
-    return {case.name: case for case in (*_renders(), *_labs(), *_orbits(), *_studies(), *_rest())}
+    return {case.name: case for case in (*_renders(), *_labs(), *_orbits(), *_measured(), *_studies(), *_rest())}
 
 
 def _renders() -> Iterator[Case]:
@@ -220,6 +221,20 @@ def _orbits() -> Iterator[Case]:
         test = {"test.yaml": _with(_text(f"orbit/{command}.yaml"), ("camera: th1", "camera: ./th1.yaml"))}
         for target in own if command == "simulate" else ("th1.yaml",):
             yield Case(f"orbit-{command}-own-{Path(target).stem}", orbit, (command,), {**test, **own}, target)
+
+
+def _measured() -> Iterator[Case]:
+    """Tests on measurements, their tables and what says how to read these; one pass."""
+    folder = "orbit/measured"
+    data = _text(f"{folder}/data.yaml")
+    data = data[: data.index("  Anhui:")].replace("Beijing/", "")
+    tables = {f"{k}.csv": _text(f"{folder}/Beijing/{k}.csv") for k in ("orbit", "attitude", "lines", "ground")}
+    tables["image_points.csv"] = _text(f"{folder}/Beijing/image_points.csv")
+    calibrate = _with(_text(f"{folder}/calibrate.yaml"), ("  - [Beijing, Anhui]\n", ""))
+    for command, text in (("calibrate", calibrate), ("angle", _text(f"{folder}/angle.yaml"))):
+        own = {"test.yaml": text, "data.yaml": data, **tables}
+        for target in own if command == "calibrate" else ("test.yaml",):
+            yield Case(f"measured-{command}-{Path(target).stem}", orbit, (command,), own, target, weight=0.5)
 
 
 def _studies() -> Iterator[Case]:

@@ -3,6 +3,7 @@
 import csv
 import json
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,17 +17,29 @@ import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_data import body_axes_matrix
-from scenes.specs.measured.orbit_data_setup import is_measured, resolve_any_angle, resolve_measured_angle
+from scenes.specs.measured.orbit_data_setup import (
+    is_measured,
+    resolve_any_angle,
+    resolve_measured_angle,
+    resolve_measured_calibration,
+)
 from scenes.specs.orbit_angle import EffectsSpec
-from scenes.specs.orbit_setup import resolve_calibration
+from scenes.specs.orbit_setup import resolve_calibration, resolve_simulate
+from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
 from twin.orbit.angle.measured_angle import run_measured_angle
+from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import schemes_tested
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import along_track_angle, line_cameras
 from twin.orbit.flight.payload_changes import changed_payload
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.images.simulate_run import run_simulation
+from twin.orbit.measured.measurement_tables import read_measurements
 
 run = partial(invoke, command.app)
 TIGHT = 1e-9
@@ -408,8 +421,6 @@ def test_gross_errors_are_left_out_and_named(campaign, files) -> None:
 
 
 def test_points_in_a_gap_of_the_readings_are_refused(files) -> None:
-    from scenes.yaml.errors import InputError
-
     edit(
         files.parent / "Beijing/attitude.csv",
         lambda heads, rows: (heads, [r for r in rows if not -1.0 < float(r[0]) < 1.0]),
@@ -590,3 +601,33 @@ def test_files_of_simulations_and_of_measurements_are_told_apart() -> None:
     assert is_measured(folder / "measured/calibrate.yaml")
     assert not is_measured("angle")
     assert resolve_any_angle(folder / "angle.yaml").test.name == "angle"
+
+
+@pytest.mark.slow
+def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path) -> None:
+    """A patch of 400 pixels: control points lie where the true camera sees their given coordinates, but for the errors
+    of matching (0.1 px), of the orthophoto and of the elevation model (0.5 m and 2 m of 5 m pixels)."""
+    setup = resolve_simulate(SCENES / ORBIT / "simulate.yaml")
+    test = setup.test
+    small_patch = {"patch": test.patch.model_copy(update={"lines": 400, "pixels": 400})}
+    setup = setup.model_copy(update={"test": test.model_copy(update=small_patch)})
+    done = run_simulation(setup, None, 1)
+    for name, text in simulation_exported(done).items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    said = resolve_measured_calibration(tmp_path / "calibrate.yaml")
+    (one,) = read_measurements(said.data, said.camera)
+    assert set(one.images) == {"forward", "nadir", "aft"}
+    assert set(one.ground.role.tolist()) == {"control", "check", "tie"}
+    given = one.ground.role == "control"
+    for name, row in one.images.items():
+        camera = line_cameras(done.truth)[name]
+        sensor = Sensor.of_lines(camera, done.trajectory, Earth(), one.line_times[name], LightEffects())
+        some = row.taken(given[row.point])
+        assert len(some.point) > 20
+        line, pixel = sensor.image(one.ground.itrs[some.point])
+        off = np.median(np.abs([some.line - line, some.pixel - pixel]), axis=1)
+        assert off.max() < 0.6
+    nothing = done.setup.model_copy(update={"test": done.setup.test.model_copy(update={"points": None})})
+    with pytest.raises(InputError, match="images alone give no tables"):
+        simulation_exported(replace(done, setup=nothing, points=None))

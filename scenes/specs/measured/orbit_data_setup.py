@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import find_payload, load_orbit_test, load_three_line_camera
 from scenes.specs.measured.orbit_data import (
-    FILE_KEYS,
     MeasuredAngleSpec,
     MeasuredCalibrationSpec,
     MeasuredTestSpec,
@@ -17,7 +16,8 @@ from scenes.specs.measured.orbit_data import (
 from scenes.specs.orbit_setup import AngleSetup, CalibrationSetup, resolve_angle, resolve_calibration
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import Problem, nearest
+from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml
 
@@ -136,19 +136,44 @@ def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
     if test.data is None:
         assert test.conventions is not None
         assert test.passes is not None
-        return OrbitDataSpec.model_construct(conventions=test.conventions, passes=_placed(test.passes, folder))
+        return OrbitDataSpec.model_construct(conventions=test.conventions, passes=_placed(test, test.passes, folder))
     place = folder / test.data
     file = place / DATA_FILE if place.is_dir() else place
     if not file.is_file():
         allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
         raise test.error("no such measurements", ("data",), found=str(place), allowed=allowed)
     data = validate(OrbitDataSpec, read_yaml(file))
-    return data.model_copy(update={"passes": _placed(data.passes, file.parent)})
+    return data.model_copy(update={"passes": _placed(data, data.passes, file.parent)})
 
 
-def _placed(passes: Mapping[str, PassFilesSpec], folder: Path) -> FrozenMap[str, PassFilesSpec]:
+def _placed(owner: Spec, passes: Mapping[str, PassFilesSpec], folder: Path) -> FrozenMap[str, PassFilesSpec]:
+    """The passes with absolute paths. InputError, at the key of the owner, for a file that is not there."""
     found = {}
     for name, one in passes.items():
-        files = {key: str((folder / value).absolute()) for key, value in one.files.items() if key in FILE_KEYS}
+        files = {}
+        for key, value in one.files.items():
+            place = folder / value
+            if not _is_there(place):
+                beside = [place.with_name(other.name) for other in _beside(place)]
+                meant = nearest(str(place), [str(other) for other in beside])
+                told = None if meant is None else str(Path(value).with_name(Path(meant).name))
+                allowed = "a CSV file, its path relative to this one"
+                raise owner.error("no such file", ("passes", name, key), found=value, allowed=allowed, suggestion=told)
+            files[key] = str(place.absolute())
         found[name] = one.model_copy(update=files)
     return FrozenMap(found)
+
+
+def _is_there(place: Path) -> bool:
+    try:
+        return place.exists()
+    except (OSError, ValueError):  # no name that a file can have
+        return False
+
+
+def _beside(place: Path) -> list[Path]:
+    """Files in the same folder."""
+    try:
+        return sorted(other for other in place.parent.iterdir() if other.is_file())
+    except (OSError, ValueError):
+        return []

@@ -17,7 +17,7 @@ from analysis.orbit.calibration_parameters import level_covariance
 from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec, body_axes_matrix
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.units import LENGTH, SPEED, TIME
 from twin.orbit.flight.line_times import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
@@ -26,29 +26,33 @@ from twin.run.procedure import Advance, silent
 
 Array = NDArray[np.float64]
 
-_TIME = Column("time", TIME)
-_PLACE = tuple(Column(axis, LENGTH) for axis in "xyz")
-_SPEED = tuple(Column(f"v{axis}", SPEED, needed=False) for axis in "xyz")
+_FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
+"""Metres, m/s, seconds and lines beyond which nothing is meant; below them sums of squares do not overflow."""
+_TIME = Column("time", TIME, least=-_LATE, most=_LATE)
+_PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
+_SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
 _QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
+_LARGE = 1e6
+"""Metres: sigma of a coordinate."""
 _CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
 COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
     "orbit": (_TIME, *_PLACE, *_SPEED),
     "attitude": (_TIME, *_QUATERNION),
-    "lines": (Column("camera", text=True), Column("line"), _TIME),
+    "lines": (Column("camera", text=True), Column("line", least=-_MANY, most=_MANY), _TIME),
     "ground": (
         Column("point", text=True),
         Column("role", text=True),
         *_PLACE,
-        Column("sigma", LENGTH, needed=False, least=0.0),
-        *(Column(f"sigma_{axis}", LENGTH, needed=False, least=0.0) for axis in ("plan", "height", *"xyz")),
+        Column("sigma", LENGTH, needed=False, least=0.0, most=_LARGE),
+        *(Column(f"sigma_{axis}", LENGTH, needed=False, least=0.0, most=_LARGE) for axis in ("plan", "height", *"xyz")),
         *(Column(name, needed=False, least=-1.0, most=1.0) for name in _CORRELATIONS),
     ),
     "image_points": (
         Column("point", text=True),
         Column("camera", text=True),
-        Column("line"),
-        Column("pixel"),
+        Column("line", least=-_MANY, most=_MANY),
+        Column("pixel", least=-_MANY, most=_MANY),
         Column("sigma_line", least=1e-6, most=1e3),
         Column("sigma_pixel", least=1e-6, most=1e3),
         Column("correlation", needed=False, least=-0.999999, most=0.999999),
@@ -373,7 +377,7 @@ def image_points_of(
         meant = nearest(str(table["point"][row]), names)
         problem = "this point has no coordinates"
         allowed = "a point of the ground table; points without coordinates belong into `tie_points`"
-        raise table.error(row, "point", problem, repr(str(table["point"][row])), allowed, meant)
+        raise table.error(row, "point", problem, shown(str(table["point"][row])), allowed, meant)
     found = {}
     half = 0.5 if conventions.centre == "half" else 0.0
     for name in times:
@@ -382,7 +386,7 @@ def image_points_of(
         twice = np.flatnonzero(np.diff(number[order]) == 0)
         if len(twice):
             row = int(order[twice[0] + 1])
-            raise table.error(row, "point", f"this point stands twice in {name}", repr(str(table["point"][row])))
+            raise table.error(row, "point", f"this point stands twice in {name}", shown(str(table["point"][row])))
         pixels, last = camera.pixels_of(name), times[name].line[-1]
         line = table["line"][order] - half - origins[name]
         pixel = table["pixel"][order] - half - conventions.first_pixel
@@ -463,7 +467,7 @@ def _known(table: Table, column: str, names: tuple[str, ...]) -> None:
     """InputError unless every cell is one of these names."""
     for row in np.flatnonzero(~np.isin(table[column].astype(str), names))[:1]:
         cell = str(table[column][row])
-        raise table.error(int(row), column, f"no such {column}", repr(cell), names_text(names), nearest(cell, names))
+        raise table.error(int(row), column, f"no such {column}", shown(cell), names_text(names), nearest(cell, names))
 
 
 def _once(table: Table, column: str) -> None:
@@ -472,7 +476,7 @@ def _once(table: Table, column: str) -> None:
     for row, name in enumerate(table[column].tolist()):
         if name in seen:
             problem = f"stands twice, first on line {int(table.lines[seen[name]])}"
-            raise table.error(row, column, problem, repr(name), "each once")
+            raise table.error(row, column, problem, shown(name), "each once")
         seen[name] = row
 
 
