@@ -222,7 +222,7 @@ def test_a_right_arrow_is_not_complained_about(tmp_path: Path, monkeypatch: pyte
 def test_what_computes_neither_draws_nor_fills_templates() -> None:
     """Nor does anything that it imports: a study needs no figures, and a run can be shown in any way."""
     # those of the laboratory and of the orbit, by the modules that make their procedures
-    assert len([name for name in computing() if re.match(r"twin\.(laboratory|orbit)\..*_numbers$", name)]) == 7
+    assert len([name for name in computing() if re.match(r"twin\.(laboratory|orbit)\..*_numbers$", name)]) == 9
     assert set(computing()) >= {*RUNS, "twin.design.design_run"}
     ways = {module: way_to(SHOWS, module, every_import()) for module in computing()}
     assert [" imports ".join(way) for way in ways.values() if way] == []

@@ -35,6 +35,8 @@ READ_BY = {
     "orbit_calibration": "`python -m twin.orbit calibrate FILE`",
     "orbit_simulate": "`python -m twin.orbit simulate FILE`",
     "orbit_monitor": "`python -m twin.orbit monitor FILE`",
+    "orbit_check": "`python -m twin.orbit check FILE`",
+    "orbit_match": "`python -m twin.orbit match FILE`",
     "three_line_camera": "tests in orbit, which name it: `camera: th1`",
     "study": "`python -m twin.study FILE`",
 }

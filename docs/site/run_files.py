@@ -303,6 +303,8 @@ FOLDERS = {
     "twin.orbit angle": "twin/orbit/angle",
     "twin.orbit calibrate": "twin/orbit/calibration",
     "twin.orbit monitor": "twin/orbit/monitoring",
+    "twin.orbit check": "twin/orbit/conventions",
+    "twin.orbit match": "twin/orbit/matching",
     "twin.study --gradient": "twin/study/gradient",
     "twin.study": "twin/study/report",
 }

@@ -13,7 +13,9 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import MeasurementSpec
+from scenes.specs.measured.orbit_check import OrbitCheckSpec
 from scenes.specs.measured.orbit_data import MeasuredAngleSpec, MeasuredCalibrationSpec, OrbitDataSpec
+from scenes.specs.measured.orbit_match import OrbitMatchSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_monitor import OrbitMonitorSpec
@@ -89,6 +91,8 @@ FILE_KINDS = (
     FileKind("orbit_angle", OrbitAngleSpec, "a test of intersection angles", "twin.orbit angle"),
     FileKind("orbit_calibration", OrbitCalibrationSpec, "an in-orbit calibration", "twin.orbit calibrate"),
     FileKind("orbit_simulate", OrbitSimulateSpec, "a simulation of images of the ground", "twin.orbit simulate"),
+    FileKind("orbit_check", OrbitCheckSpec, "a check of the conventions of a pass", "twin.orbit check"),
+    FileKind("orbit_match", OrbitMatchSpec, "points to be measured in line images", "twin.orbit match"),
     FileKind("orbit_monitor", OrbitMonitorSpec, "a test of monitoring in orbit", "twin.orbit monitor"),
     FileKind("measured_calibration", MeasuredCalibrationSpec, "a calibration on measurements", "twin.orbit calibrate"),
     FileKind("measured_angle", MeasuredAngleSpec, "intersection angles on measurements", "twin.orbit angle"),

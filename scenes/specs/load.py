@@ -15,7 +15,6 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
-from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_scene import LineImageSpec
@@ -158,9 +157,9 @@ def path_of_detector(instrument: InstrumentSpec) -> Path:
     return _find(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
 
 
-def find_area_detector(measurement: MeasurementSpec) -> Path:
-    """The file of the data sheet that a measurement names for its area CCDs. Raises InputError if there is none."""
-    return _find(DETECTORS, measurement.detector or "", measurement, ("detector",))
+def find_detector(name_or_path: str, named_by: Spec, key: KeyPath) -> Path:
+    """The file of a data sheet that another file names. Raises InputError, at that file's key, if there is none."""
+    return _find(DETECTORS, name_or_path, named_by, key)
 
 
 def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> CameraSpec:

@@ -110,7 +110,7 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
             allowed; with the line and the head of the column.
     """
     file = str(path)
-    lines, rows = _rows(file, _text(path))
+    lines, rows = _rows(file, table_text(path))
     allowed = ", ".join(repr(c.head) + ("" if c.needed else " (may be missing)") for c in columns)
     if not rows:
         raise InputError(Issue("an empty table", file, 1, allowed=f"a row of heads: {allowed}"))
@@ -133,11 +133,20 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
     return Table(file, numbers, FrozenMap(heads), FrozenMap(values))
 
 
-def _text(path: str | Path) -> str:
+def table_text(path: str | Path, what: str = "a CSV file") -> str:
+    """The text of a file of measured numbers.
+
+    Args:
+        path: of the file, UTF-8 text.
+        what: it should be, for messages.
+
+    Raises:
+        InputError: there is none, it cannot be read, is too large or holds other than UTF-8 text.
+    """
     file = str(path)
     try:
         if not stat.S_ISREG(Path(path).stat().st_mode):
-            raise InputError(Issue("is not a regular file", file, allowed="a CSV file"))
+            raise InputError(Issue("is not a regular file", file, allowed=what))
         with Path(path).open("rb") as stream:
             content = stream.read(LARGEST_TABLE + 1)
     except FileNotFoundError:

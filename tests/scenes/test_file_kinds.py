@@ -40,6 +40,8 @@ FOLDERS = {
     "orbit/measured/angle": "measured_angle",
     "orbit/measured/calibrate": "measured_calibration",
     "orbit/measured/data": "orbit_data",
+    "orbit/measured/check": "orbit_check",
+    "orbit/measured/match": "orbit_match",
     "orbit/calibrate": "orbit_calibration",
     "orbit/monitor": "orbit_monitor",
     "orbit/simulate": "orbit_simulate",

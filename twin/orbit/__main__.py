@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from scenes.specs.measured.orbit_data_setup import resolve_any_angle, resolve_any_calibration
+from scenes.specs.measured.pass_files_setup import resolve_check, resolve_match
 from scenes.specs.orbit_setup import resolve_monitor, resolve_simulate
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import DISTANCE, parse_quantity
@@ -38,6 +39,20 @@ def simulation_export(run: Any) -> Mapping[str, str]:
 def calibration_export(run: Any) -> Mapping[str, str]:
     """What a calibration measured, as files."""
     from twin.orbit.calibration.calibration_export import exported
+
+    return exported(run)
+
+
+def match_export(run: Any) -> Mapping[str, str]:
+    """Points that were matched, with the pass, as files."""
+    from twin.orbit.matching.match_numbers import exported
+
+    return exported(run)
+
+
+def check_export(run: Any) -> Mapping[str, str]:
+    """A pass whose conventions stand, in the project's own."""
+    from twin.orbit.conventions.check_export import exported
 
     return exported(run)
 
@@ -97,6 +112,43 @@ add_test(
     Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
     """,
     calibration_export,
+)
+
+add_test(
+    app,
+    PROGRAM,
+    "check",
+    resolve_check,
+    ORBIT_TESTS["check"],
+    """Conventions of a pass in files: every reading of what is mistaken for one another (order and sense of the
+    quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two
+    at once, is tried on the ground points and ranked.
+
+    check.json holds the readings with residuals and likelihoods, what the points tell of each convention and what they
+    cannot, and where the first points would fall under each reading. Exit codes: 0 the stated reading stands, 3 another
+    one does, 4 none explains the points. With `--export DIR` a pass whose conventions stand goes into a folder that
+    `twin.orbit calibrate` reads.
+
+    Example: `python -m twin.orbit check scenes/orbit/measured/check.yaml`
+    """,
+    check_export,
+)
+
+add_test(
+    app,
+    PROGRAM,
+    "match",
+    resolve_match,
+    ORBIT_TESTS["match"],
+    """Points measured in a user's line images: distinct places of an orthophoto with heights of an elevation model, and
+    tie points, are sought in every image by least squares matching, as in a simulated patch.
+
+    match.json holds for every line how many points were matched and what by. With `--export DIR` the points go with
+    orbit, attitude and line times into a folder that `twin.orbit calibrate` reads.
+
+    Example: `python -m twin.orbit match scenes/orbit/measured/match.yaml`
+    """,
+    match_export,
 )
 
 add_test(

@@ -30,6 +30,20 @@ def _calibrate() -> Test[Any]:
     return CALIBRATION, calibration_report
 
 
+def _check() -> Test[Any]:
+    from twin.orbit.conventions.check_numbers import CHECK
+    from twin.orbit.conventions.check_report import check_report
+
+    return CHECK, check_report
+
+
+def _match() -> Test[Any]:
+    from twin.orbit.matching.match_numbers import MATCH
+    from twin.orbit.matching.match_report import match_report
+
+    return MATCH, match_report
+
+
 def _monitor() -> Test[Any]:
     from twin.orbit.monitoring.monitoring_numbers import MONITOR
     from twin.orbit.monitoring.monitoring_report import monitor_report
@@ -47,6 +61,8 @@ def _simulate() -> Test[Any]:
 ORBIT_TESTS: dict[str, Callable[[], Test[Any]]] = {
     "angle": _angle,
     "calibrate": _calibrate,
+    "check": _check,
+    "match": _match,
     "monitor": _monitor,
     "simulate": _simulate,
 }

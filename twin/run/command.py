@@ -250,7 +250,7 @@ def run_test(
         drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
         facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
         write_test(procedure.kind, numbers, shown, facts, session.folder)
-        return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console))
+        return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console), code=shown.code)
 
     run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
 

@@ -46,6 +46,31 @@ LARGEST_ENLARGED = 600
 
 
 @dataclass(frozen=True)
+class MapPlace:
+    """Where the pixels of a map lie: longitude and latitude are linear in column and row.
+
+    Attributes:
+        longitude, latitude: of the middle of the first pixel, degrees.
+        per_column, per_row: degrees of longitude and of latitude, the latter below zero where rows go south.
+        heights: whether the values are heights above the ellipsoid of WGS 84.
+    """
+
+    longitude: float
+    latitude: float
+    per_column: float
+    per_row: float
+    heights: bool = False
+
+    def tags(self) -> list[tuple[Any, ...]]:
+        """Tags of a GeoTIFF (OGC 19-008r4): pixels are areas, the corner of the first is the tie point."""
+        scale = (self.per_column, -self.per_row, 0.0)
+        tie = (0.0, 0.0, 0.0, self.longitude - 0.5 * self.per_column, self.latitude - 0.5 * self.per_row, 0.0)
+        system = 4979 if self.heights else 4326
+        keys = (1, 1, 1, 3, 1024, 0, 1, 2, 1025, 0, 1, 1, 2048, 0, 1, system)
+        return [(33550, "d", 3, scale, True), (33922, "d", 6, tie, True), (34735, "H", len(keys), keys, True)]
+
+
+@dataclass(frozen=True)
 class FrameFacts:
     """What recorded frames are, for whoever has nothing but their file.
 
@@ -55,6 +80,7 @@ class FrameFacts:
         exposure: of each frame, seconds.
         times: of each frame in the course, seconds.
         note: what else is to be known.
+        place: of a map; the TIFF then is a GeoTIFF.
     """
 
     camera: str = ""
@@ -62,6 +88,7 @@ class FrameFacts:
     exposure: float | None = None
     times: tuple[float, ...] | None = None
     note: str = ""
+    place: MapPlace | None = None
 
     def page(self, k: int) -> dict[str, Any]:
         """What is known of frame number ``k``, as plain data."""
@@ -95,6 +122,8 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
         tags.append((_MODEL, "s", 0, facts.camera, True))
     if facts.exposure is not None:
         tags.append((_EXPOSURE_TIME, "2I", 1, (round(_RATIONAL * facts.exposure), _RATIONAL), True))
+    if facts.place is not None:
+        tags += facts.place.tags()
     scale: dict[str, Any] = {}
     if facts.pitch is not None:
         scale = {"resolution": (1e-2 / facts.pitch,) * 2, "resolutionunit": "CENTIMETER"}

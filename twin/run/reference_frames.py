@@ -149,6 +149,21 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "line, pixel": "of the line CCD: the centre of the first is 0",
             "east_m, north_m": "local horizon at the middle of the patch",
         },
+        "check": {
+            "rms_m, moves_points_by_m": "in plan, at the heights of the ground points",
+            "rms_px": "along the line and along the track together, of each line's own image",
+            "longitude_deg, latitude_deg": _GEODETIC,
+            "east_m, north_m": "local horizon of each ground point: where the reading puts it minus where it is",
+            "line_origin, pixel_origin": "image coordinates of the middle of line 0 of the table of times, "
+            "and of the first pixel",
+            "body_axes": "what x, y and z of the attitude's body point to in flight",
+        },
+        "match": {
+            "line, pixel": "of each line CCD's image; pixel 0 is the one that sees farthest to the right of the track",
+            "displacement": "from where camera and platform have a point to where it is found",
+            "longitude_deg, latitude_deg": _GEODETIC,
+            "artefacts/points.csv": f"degrees, height: {_GEODETIC}; x, y, z: {_ITRS}; line and pixel as here",
+        },
         "study": {"truth, recovered": f"{_CAMERA}; {_ANGLE}", "responses": "as in the base's file that the key names"},
         "compare": {"numbers, arrays": "as in the compared files, each of which states its own"},
         "gradient": {"responses": f"{_CAMERA}; {_ANGLE}", "factors": "motions in the moved body's own nominal axes"},

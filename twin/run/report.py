@@ -52,6 +52,7 @@ class Report:
         images: name -> recorded frames, uint16 (frames, rows, columns).
         warnings: what the user should know before using the numbers.
         image_facts: name of images -> what is known of these frames; of some or all.
+        code: exit code of the command, of a test whose answer it is.
     """
 
     title: str
@@ -63,6 +64,7 @@ class Report:
     images: Mapping[str, np.ndarray] = field(default_factory=FrozenMap)
     warnings: tuple[str, ...] = ()
     image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
+    code: int = 0
 
     def __post_init__(self) -> None:
         """Refuse a verdict that is not one sentence, and two artefacts of one name: they would be one file."""

@@ -13,7 +13,7 @@ from scenes.specs.channel import SIDES
 from scenes.specs.course import moment
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.job import JobSpec
-from scenes.specs.load import find_area_detector, load_detector
+from scenes.specs.load import find_detector, load_detector
 from scenes.specs.measured.monitor_frames import (
     ALL,
     MOST_TIMES,
@@ -62,7 +62,7 @@ def resolve_measurement(path: str | Path) -> MeasurementSetup:
     spec = validate(MeasurementSpec, read_yaml(path))
     model = _model(spec)
     if spec.detector is not None:
-        detector = load_detector(find_area_detector(spec))
+        detector = load_detector(find_detector(spec.detector or "", spec, ("detector",)))
     else:
         assert model is not None
         detector = model.detector

@@ -18,6 +18,7 @@ from twin.orbit.calibration.observations import FieldPoints, PassData
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
+from twin.orbit.images.imaged_ground import BEYOND
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import Patch, PatchError, fly_patch, imaged_lines
 from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
     from scenes.specs.orbit_scene import GroundSpec
     from scenes.specs.orbit_setup import CalibrationSetup
 
-BEYOND = 0.1
-"""Pixels: standard deviation added to what the matching claims, for what no fit shows: another season's light (RMS of
-matches 0.11 px where 0.06 is claimed), the attitude between its readings. A tie point has it where it was chosen."""
 _OFFSET = 9000.0
 """Metres. As far from the middle of the real terrain model, east and north, a patch may lie; 30 km x 32 km are real."""
 _LEAST_CONTROL = 6

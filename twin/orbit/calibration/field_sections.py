@@ -11,10 +11,11 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
-from twin.orbit.calibration.field_images import BEYOND, FieldImages
+from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.influences import SURPRISE, LightRow
 from twin.orbit.calibration.repeatability import repeatability
+from twin.orbit.images.imaged_ground import BEYOND
 from twin.orbit.images.point_judgement import WRONG
 from twin.orbit.images.point_report import points_png
 from twin.run.artefact import Cell, PngFigure, SvgFigure, Table

@@ -41,7 +41,8 @@ _DIFFERENCE_STEP = 600.0
 
 
 @contextmanager
-def _years_without_announced_leap_seconds() -> Iterator[None]:
+def years_without_announced_leap_seconds() -> Iterator[None]:
+    """Around calls of ERFA that convert UTC."""
     # ERFA calls a year dubious for which leap seconds have not been announced yet; it then takes none, and so do we.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
@@ -62,7 +63,7 @@ def tai_of(epoch: str) -> tuple[float, float]:
         raise ValueError(f"{epoch!r} does not say its zone; UTC ends in Z")
     time = time.astimezone(UTC)
     second = time.second + 1e-6 * time.microsecond
-    with _years_without_announced_leap_seconds():
+    with years_without_announced_leap_seconds():
         utc = erfa.dtf2d("UTC", time.year, time.month, time.day, time.hour, time.minute, second)
         one, two = erfa.utctai(*utc)
     return float(one), float(two)
@@ -75,7 +76,7 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
         epoch: as for `tai_of`.
         dut1: UT1 - UTC, seconds.
     """
-    with _years_without_announced_leap_seconds():
+    with years_without_announced_leap_seconds():
         one, two = erfa.utcut1(*erfa.taiutc(*tai_of(epoch)), dut1)
     return float(one), float(two)
 

@@ -45,6 +45,10 @@ class Raster:
     north: float
     spacing: float
 
+    @property
+    def valid(self) -> None:
+        """Every value is there."""
+
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates of places (row, column), whole or not, metres, broadcast."""
         return self.west + self.spacing * np.asarray(column), self.north - self.spacing * np.asarray(row)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter, zoom
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter, zoom
 
 from analysis.matching.consensus import DisplacementField, consensus
 from analysis.matching.correlation import distinct_points
@@ -27,8 +27,7 @@ from analysis.matching.options import Reason
 from analysis.matching.spline import resampled
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.ground.orthophoto import Raster
-from twin.orbit.images.patch import LineImage, Patch
+from twin.orbit.images.imaged_ground import Frame, ImagedGround, Map
 
 if TYPE_CHECKING:
     from scenes.specs.orbit_scene import ImagePointsSpec
@@ -52,36 +51,52 @@ class ReferenceHeights:
         coefficients: of the spline.
     """
 
-    raster: Raster
+    raster: Map
     coefficients: np.ndarray
 
     @classmethod
-    def of(cls, dem: Raster) -> ReferenceHeights:
-        """Through a raster of heights, metres."""
-        return cls(dem, spline_filter(dem.values.astype(np.float64), order=3, mode="mirror"))
+    def of(cls, dem: Map) -> ReferenceHeights:
+        """Through a raster of heights, metres; where it has none, about those of the nearest posts."""
+        values = dem.values.astype(np.float64)
+        if dem.valid is not None and not dem.valid.all():
+            nearest = distance_transform_edt(~dem.valid, return_distances=False, return_indices=True)
+            values = values[tuple(nearest)]
+        return cls(dem, spline_filter(values, order=3, mode="mirror"))
 
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Heights at places, metres; NaN beyond the posts."""
+        """Heights at places, metres; NaN beyond the posts, and where one of the next four is missing."""
         place = np.stack(self.raster.row_column(east, north))
         found = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
         last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
-        return np.asarray(np.where(np.all((place >= 0.0) & (place <= last), axis=0), found, np.nan))
+        known = np.all((place >= 0.0) & (place <= last), axis=0)
+        valid = self.raster.valid
+        if valid is not None:
+            cell = np.clip(np.floor(np.nan_to_num(place)).astype(np.intp), 0, np.maximum(last - 1, 0))
+            for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                known &= valid[np.minimum(cell[0] + down, last[0]), np.minimum(cell[1] + across, last[1])]
+        return np.asarray(np.where(known, found, np.nan))
+
+    @property
+    def mean(self) -> float:
+        """Of all posts, metres."""
+        valid = self.raster.valid
+        return float(np.mean(self.raster.values if valid is None else self.raster.values[valid]))
 
 
-def predicted(image: LineImage, points: np.ndarray) -> np.ndarray:
+def predicted(image: Frame, points: np.ndarray) -> np.ndarray:
     """Row and column (n, 2) of the frame at which the measured sensor has points (n, 3), ITRS; NaN beyond its image."""
     line, pixel = image.measured.image(points)
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
-def fits(image: LineImage, place: np.ndarray, border: float) -> np.ndarray:
+def fits(image: Frame, place: np.ndarray, border: float) -> np.ndarray:
     """Which places (..., 2) lie in a frame, so far from its border; not a place that is NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
     return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
 
 
 def ground_of_samples(
-    image: LineImage, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
+    image: Frame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """East, north and height (n, side, side) each, metres, of what the pixels about places see.
 
@@ -116,14 +131,14 @@ def ground_of_samples(
     return e, n, height + above
 
 
-def templates_of_map(photo: Raster, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
+def templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
     """Templates (n, k, k) from an orthophoto; sample: distance of the image's pixels on the ground, metres."""
     rows, columns = photo.row_column(samples[0], samples[1])
     return resampled(photo.values, rows, columns, smoothing=SOFTENING * sample / photo.spacing)
 
 
 def templates_of_image(
-    source: LineImage,
+    source: Frame,
     frame: GroundFrame,
     samples: tuple[np.ndarray, np.ndarray, np.ndarray],
     points: np.ndarray,
@@ -263,7 +278,7 @@ class PatchPoints:
         return {name: points for name, points in both.items() if points is not None}
 
 
-def measure_points(patch: Patch, spec: ImagePointsSpec) -> PatchPoints:
+def measure_points(patch: ImagedGround, spec: ImagePointsSpec) -> PatchPoints:
     """Control, check and tie points.
 
     Raises:
@@ -282,7 +297,7 @@ def status_text(code: int) -> str:
     return extra.get(code) or Reason(code).text
 
 
-def map_points(patch: Patch, spec: ImagePointsSpec) -> MatchedPoints:
+def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
     """Control and check points.
 
     Raises:
@@ -309,7 +324,7 @@ def map_points(patch: Patch, spec: ImagePointsSpec) -> MatchedPoints:
 
 
 def tie_points(
-    patch: Patch, spec: ImagePointsSpec, control: MatchedPoints | None = None, source: str = "nadir"
+    patch: ImagedGround, spec: ImagePointsSpec, control: MatchedPoints | None = None, source: str = "nadir"
 ) -> MatchedPoints:
     """Points of one line's frame, sought in the others.
 
@@ -362,7 +377,7 @@ def tie_points(
     return MatchedPoints("tie", east, north, height, ground, none.astype(bool), FrozenMap(ordered))
 
 
-def _require_room(patch: Patch, spec: ImagePointsSpec) -> None:
+def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
     least = 2 * (spec.template // 2 + spec.reach) + 1
     for name, image in patch.images.items():
         if min(image.frame.shape) <= least:
@@ -374,7 +389,7 @@ def _require_room(patch: Patch, spec: ImagePointsSpec) -> None:
 
 
 def _distinct_map(
-    patch: Patch, heights: ReferenceHeights, count: int, border: int, spec: ImagePointsSpec
+    patch: ImagedGround, heights: ReferenceHeights, count: int, border: int, spec: ImagePointsSpec
 ) -> tuple[np.ndarray, np.ndarray]:
     """East and north of distinct places of the orthophoto that every line sees within its border."""
     photo = patch.control.orthophoto
@@ -404,13 +419,13 @@ def _distinct_map(
 
 
 def _followed(
-    patch: Patch, image: LineImage, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
+    patch: ImagedGround, image: Frame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
     """Where the measured sensor's looks meet the reference heights, ITRS, (n, 3), metres; NaN beyond them.
 
     known: matches that tell where the measured sensor has what the frame has at a place.
     """
-    height = np.full(len(place), float(np.mean(heights.raster.values)))
+    height = np.full(len(place), heights.mean)
     at = place
     for _ in range(_GROUND_TURNS):
         if known is not None:
@@ -422,7 +437,7 @@ def _followed(
     return np.asarray(points)
 
 
-def _rise(patch: Patch, image: LineImage, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _rise(patch: ImagedGround, image: Frame, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
     """(n, 2) lines and pixels by which points that lie a metre higher have their image displaced."""
     east, north, height = patch.frame.local(ground)
     return (predicted(image, patch.frame.itrs(east, north, height + _RISE)) - at) / _RISE
@@ -430,7 +445,7 @@ def _rise(patch: Patch, image: LineImage, ground: np.ndarray, at: np.ndarray) ->
 
 def _matched(
     name: str,
-    image: LineImage,
+    image: Frame,
     patterns: np.ndarray,
     at: np.ndarray,
     rise: np.ndarray,

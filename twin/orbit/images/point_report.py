@@ -13,7 +13,8 @@ from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit_scene import ImagePointsSpec
 from twin.orbit.images.image_points import CONSENSUS, MatchedPoints, PatchPoints, status_text
-from twin.orbit.images.patch import LineImage, Patch
+from twin.orbit.images.imaged_ground import Frame, ImagedGround
+from twin.orbit.images.patch import Patch
 from twin.orbit.images.point_judgement import WRONG, judged
 from twin.orbit.images.simulate_numbers import median_sigma, median_way, reasons
 from twin.run.artefact import Cell, Data, PngFigure, Table
@@ -73,7 +74,7 @@ class PointListing(Data):
         return csv_table([HEADS, *self.data])
 
 
-def listing(patch: Patch, points: PatchPoints) -> list[list[Any]]:
+def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
     """A row for each point and line."""
     rows: list[list[Any]] = []
     for sort, one in points.sorts.items():
@@ -93,7 +94,7 @@ def listing(patch: Patch, points: PatchPoints) -> list[list[Any]]:
     return rows
 
 
-def _degrees(patch: Patch, points: MatchedPoints) -> np.ndarray:
+def _degrees(patch: ImagedGround, points: MatchedPoints) -> np.ndarray:
     """Longitude and latitude, degrees, and height, metres, (n, 3)."""
     per_longitude, per_latitude = patch.frame.scale
     longitude = np.degrees(patch.frame.longitude + points.east / per_longitude)
@@ -137,11 +138,12 @@ def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> 
         "Every point in every line: ground coordinates as given, image coordinates, sigmas, verdict.",
         listing(patch, points),
     )
-    tables = _found(points), _true(patch, points)
-    return Section("Measured points", tuple(text), (*tables, *figures, _why(points), listed))
+    tables = found_table(points), _true(patch, points)
+    return Section("Measured points", tuple(text), (*tables, *figures, lost_table(points), listed))
 
 
-def _found(points: PatchPoints) -> Table:
+def found_table(points: PatchPoints) -> Table:
+    """How many points were matched, and what by."""
     rows: list[tuple[Cell, ...]] = []
     for sort, one in points.sorts.items():
         for name, line in one.lines.items():
@@ -191,7 +193,8 @@ def _true(patch: Patch, points: PatchPoints) -> Table:
     )
 
 
-def _why(points: PatchPoints) -> Table:
+def lost_table(points: PatchPoints) -> Table:
+    """Why points were not accepted."""
     rows: list[tuple[Cell, ...]] = []
     for sort, one in points.sorts.items():
         count = {name: reasons(line) for name, line in one.lines.items() if name != one.source}
@@ -207,7 +210,7 @@ def _floats(pair: np.ndarray) -> tuple[float, float]:
     return float(pair[0]), float(pair[1])
 
 
-def points_png(patch: Patch, points: MatchedPoints) -> bytes:
+def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
     """PNG: every line's frame with its points and their displacements."""
     with look(f"points-{points.kind}"):
         names = [n for n in points.lines if n != points.source]
@@ -224,7 +227,7 @@ def points_png(patch: Patch, points: MatchedPoints) -> bytes:
         return to_png(figure, _DPI)
 
 
-def _panel(axes: Axes, name: str, image: LineImage, points: MatchedPoints) -> None:
+def _panel(axes: Axes, name: str, image: Frame, points: MatchedPoints) -> None:
     line = points.lines[name]
     low, high = np.percentile(image.frame, (0.5, 99.5))
     row, column = line.first

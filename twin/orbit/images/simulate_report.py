@@ -14,8 +14,10 @@ from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_report import pixel_axes, points_section
 from twin.orbit.images.simulate_files import camera_data, georeference_data, trajectory_data, truth_data
+from twin.orbit.images.simulate_numbers import Georeference
 from twin.orbit.images.simulate_run import Simulation
 from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
+from twin.run.data_files import FrameFacts, MapPlace
 from twin.run.reference_frames import described
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
@@ -199,7 +201,7 @@ def _data(run: Simulation) -> Section:
     )
     text = (
         "For other software: the images as TIFF, orthophoto (10 000 for a reflectance of 1) and elevation model "
-        "(metres, 32-bit floating point) as TIFF with their georeference, the laboratory's camera, the measured orbit "
+        "(metres, 32-bit floating point) as GeoTIFF, the laboratory's camera, the measured orbit "
         "and attitude. What only the truth knows is kept apart in truth.json.",
     )
     return Section("Data", text, parts)
@@ -231,7 +233,18 @@ def simulation_report(run: Simulation) -> Report:
         sections(run),
         files,
         warnings=_warnings(run),
+        image_facts={
+            "orthophoto": map_facts(run.patch.control.orthophoto, "10 000 for a reflectance of 1"),
+            "dem": map_facts(run.patch.control.dem, "metres above the ellipsoid", heights=True),
+        },
     )
+
+
+def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
+    """What the TIFF of a map says of itself: a GeoTIFF."""
+    at = Georeference.of(raster)
+    step = (at.longitude_per_column_deg, at.latitude_per_row_deg)
+    return FrameFacts(note=note, place=MapPlace(at.first_longitude_deg, at.first_latitude_deg, *step, heights))
 
 
 def _summary(run: Simulation) -> Table:

@@ -1,0 +1,290 @@
+"""Which readings of a pass explain its ground points: ``python -m twin.orbit check``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from scipy.stats import chi2
+
+from scenes.yaml.errors import InputError, Issue
+from twin.orbit.conventions.pass_readings import PassConventions, PassReadings, read_pass
+from twin.orbit.conventions.possible_readings import QUESTIONS, Changes, asked, changed, singles_and_pairs
+from twin.orbit.conventions.reading_fit import Fit, ImpossibleError, PassBench, spread
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.measured.clock import epoch_before
+from twin.run.procedure import Advance, silent
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.specs.measured.pass_files_setup import CheckSetup
+
+Verdict = Literal["stands", "another", "none"]
+DECIDED = 20.0
+"""Two readings are told apart if one is exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that
+one in a hundred checks is wrong at most."""
+_FITS = 9.0
+"""Chi-square over its freedom up to which a reading explains the points: sigmas three times too small."""
+_ROUGH_POINTS = 8
+_CANDIDATES = 40
+_ROUNDS = 3
+"""Each adds two questions that may be wrong."""
+_WRONG_SHARE = 1e-6
+"""False alarm for a point that is taken for a gross error."""
+_MOST_WRONG = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A reading and what came of it.
+
+    Attributes:
+        changes: from the stated one.
+        fit: None if the points cannot have been imaged so.
+        why: that is.
+    """
+
+    changes: Changes
+    fit: Fit | None
+    why: str = ""
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the log likelihood; infinite for one that is impossible."""
+        return np.inf if self.fit is None else self.fit.cost
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the points say of one value of a question, the others as in the best reading.
+
+    Attributes:
+        value: of the question.
+        stated, best: whether it is the stated one, and that of the best reading.
+        excess: cost beyond that of the best reading, over the factor of the sigmas.
+        moved: by how much the points lie elsewhere than in the best reading, root mean square, metres; None if they lie
+            nowhere.
+        why: it is impossible; empty if it is not.
+    """
+
+    value: Any
+    stated: bool
+    best: bool
+    excess: float
+    moved: float | None
+    why: str
+
+    @property
+    def possible(self) -> bool:
+        """Whether the points leave it open."""
+        return self.excess < DECIDED
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What a check found.
+
+    Attributes:
+        setup: what its file says.
+        readings: of the files.
+        stated: reading.
+        tried: readings with a fit, the likeliest first, then those that are impossible.
+        best: of those that explain the points as well as any, the one with the fewest changes.
+        verdict: the stated reading stands, another one does, or none explains the points.
+        factor: chi-square of the best reading over its freedom, at least 1: by how much the sigmas' squares are too
+            small.
+        answers: question -> its values.
+        first_points: line -> rows of the ground points whose places are listed.
+        places: changes of one question -> where the first points of each line fall, ITRS, metres, or why nowhere.
+        count: how many readings were tried.
+        wrong: line -> names of points that were left out as gross errors.
+    """
+
+    setup: CheckSetup
+    readings: PassReadings
+    stated: PassConventions
+    tried: tuple[Tried, ...]
+    best: Tried
+    verdict: Verdict
+    factor: float
+    answers: dict[str, tuple[Answer, ...]]
+    first_points: dict[str, np.ndarray]
+    places: dict[Changes, dict[str, np.ndarray] | str]
+    count: int
+    wrong: dict[str, tuple[str, ...]]
+
+    @property
+    def alike(self) -> tuple[Changes, ...]:
+        """Other readings with no more changes than the best one, as likely: the points cannot tell which it is."""
+        return tuple(
+            one.changes
+            for one in self.tried
+            if one is not self.best
+            and len(one.changes) <= len(self.best.changes)
+            and (one.cost - self.best.cost) / self.factor < DECIDED
+        )
+
+    @property
+    def stated_fit(self) -> Tried:
+        """The stated reading."""
+        return next(one for one in self.tried if not one.changes)
+
+
+def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Check:
+    """Try every reading; nothing is traced or drawn.
+
+    Raises:
+        InputError: files that cannot be read, or fewer than three points.
+    """
+    advance("readings", 0, 3)
+    readings, stated = read_pass(setup.test, setup.camera, Path())
+    bench = _bench(setup, readings, stated)
+    others = asked(stated, readings.platform.attitude.quaternion is not None)
+    best, tried, count = _searched(bench, stated, others)
+    advance("readings", 1, 3)
+    wrong: dict[str, tuple[str, ...]] = dict.fromkeys(readings.images, ())
+    if best.fit is not None:
+        masks = _wrong(bench, best.fit)
+        share = float(np.mean(np.concatenate(list(masks.values()))))
+        if 0.0 < share <= _MOST_WRONG:
+            ids, images = readings.ground.points.ids, bench.readings.images
+            wrong = {name: tuple(map(str, ids[images[name].point[mask]])) for name, mask in masks.items()}
+            bench = bench.without(masks)
+            tried = [_tried(bench, stated, one.changes) for one in tried]
+            best = _best(tried)
+    advance("readings", 2, 3)
+    ratio = np.inf if best.fit is None else best.fit.chi_square / best.fit.freedom
+    verdict: Verdict = "none" if ratio > _FITS else "another" if best.changes else "stands"
+    factor = max(float(ratio), 1.0) if np.isfinite(ratio) else 1.0
+    answers = {name: _answers(bench, stated, best, name, values, factor) for name, values in others.items()}
+    places = {one: _first_places(bench, stated, one, setup.test.shown) for one in _shown(others, best)}
+    tried.sort(key=lambda one: (one.cost, len(one.changes)))
+    advance("readings", 3, 3)
+    first = {name: raw.point[: setup.test.shown] for name, raw in bench.readings.images.items()}
+    return Check(setup, readings, stated, tuple(tried), best, verdict, factor, answers, first, places, count, wrong)
+
+
+def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
+    cameras = line_cameras(setup.camera)
+    effects = setup.test.effects
+    light = LightEffects(effects.light_time, effects.aberration, effects.refraction, effects.wavelength)
+    images = {}
+    for name, raw in readings.images.items():
+        order = np.lexsort((raw.line, raw.pixel))
+        images[name] = raw.taken(order[spread(len(order), setup.test.points)])
+    total = sum(len(raw.line) for raw in images.values())
+    if total < 3:
+        file = setup.test.image_points.file
+        raise InputError(Issue("too few image points to tell anything", file, None, (), str(total), "three or more"))
+    clock = next(iter(readings.lines.values())).clock
+    epoch = epoch_before(clock.instants("TAI"))
+    part = PassReadings(readings.platform, readings.lines, readings.ground, images)
+    return PassBench(part, cameras, setup.test.uncertainty, light, epoch)
+
+
+def _searched(
+    bench: PassBench, stated: PassConventions, others: dict[str, tuple[Any, ...]]
+) -> tuple[Tried, list[Tried], int]:
+    """The best reading, those that were fitted, and how many were looked at."""
+    start: Changes = ()
+    fitted: dict[frozenset[str], Tried] = {}
+    seen: set[frozenset[str]] = set()
+    for _ in range(_ROUNDS):
+        rough = []
+        for changes in singles_and_pairs(others, start):
+            key = _key(changes)
+            if key in seen:
+                continue
+            seen.add(key)
+            size = _rough(bench, changed(stated, changes))
+            if len(changes) <= 1 or np.isfinite(size):
+                rough.append((size, len(changes), changes))
+        rough.sort(key=lambda one: one[:2])
+        chosen = [one[2] for k, one in enumerate(rough) if k < _CANDIDATES or one[1] <= 1]
+        fitted |= {_key(changes): _tried(bench, stated, changes) for changes in chosen}
+        best = _best(list(fitted.values()))
+        if best.fit is None or best.fit.chi_square / best.fit.freedom <= _FITS or best.changes == start:
+            break
+        start = best.changes
+    return best, list(fitted.values()), len(seen)
+
+
+def _key(changes: Changes) -> frozenset[str]:
+    return frozenset(f"{name}={value}" for name, value in changes)
+
+
+def _rough(bench: PassBench, meant: PassConventions) -> float:
+    """Root mean square of a few residuals, metres; infinite where there are none."""
+    try:
+        return float(np.sqrt(np.median(np.sum(bench.residuals(meant, _ROUGH_POINTS) ** 2, axis=1))))
+    except ImpossibleError:
+        return np.inf
+
+
+def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried:
+    try:
+        return Tried(changes, bench.fit(changed(stated, changes)))
+    except ImpossibleError as error:
+        return Tried(changes, None, str(error))
+
+
+def _best(tried: Sequence[Tried]) -> Tried:
+    """The fewest changes among those that are as likely as any."""
+    least = min(tried, key=lambda one: one.cost)
+    if least.fit is None:
+        return next(one for one in tried if not one.changes)
+    factor = max(least.fit.chi_square / least.fit.freedom, 1.0)
+    likely = [one for one in tried if (one.cost - least.cost) / factor < DECIDED]
+    return min(likely, key=lambda one: (len(one.changes), one.cost))
+
+
+def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
+    """Line -> which of its points are gross errors under a reading: far beyond noise and the others' scatter."""
+    square = np.einsum("ni,nij,nj->n", fit.left, np.linalg.inv(fit.noise), fit.left)
+    scale = max(float(np.median(square)) / float(chi2.median(2)), 1.0)
+    bad = square > scale * chi2.isf(_WRONG_SHARE, 2)
+    found, start = {}, 0
+    for name, raw in bench.readings.images.items():
+        found[name] = bad[start : start + len(raw.line)]
+        start += len(raw.line)
+    return found
+
+
+def _answers(
+    bench: PassBench, stated: PassConventions, best: Tried, name: str, values: tuple[Any, ...], factor: float
+) -> tuple[Answer, ...]:
+    question, reading = QUESTIONS[name], changed(stated, best.changes)
+    said, here = question.get(stated), question.get(reading)
+    found = []
+    for value in (said, *values):
+        one = question.put(reading, value)
+        try:
+            fit = bench.fit(one)
+            moved = (
+                None
+                if best.fit is None
+                else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
+            )
+            found.append(Answer(value, value == said, value == here, (fit.cost - best.cost) / factor, moved, ""))
+        except ImpossibleError as error:
+            found.append(Answer(value, value == said, value == here, np.inf, None, str(error)))
+    return tuple(found)
+
+
+def _shown(others: dict[str, tuple[Any, ...]], best: Tried) -> list[Changes]:
+    """Readings whose places are listed: as stated, as found, and with one change each."""
+    singles = [((name, value),) for name, values in others.items() for value in values]
+    return list(dict.fromkeys([(), best.changes, *singles]))
+
+
+def _first_places(
+    bench: PassBench, stated: PassConventions, changes: Changes, count: int
+) -> dict[str, np.ndarray] | str:
+    try:
+        return {name: at[:count] for name, at in bench.places(changed(stated, changes)).items()}
+    except ImpossibleError as error:
+        return str(error)

@@ -1,0 +1,256 @@
+"""A pass in files before anything is read into its numbers: platform, line times, ground and image points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.csv_table import Column, Table, read_table
+from scenes.yaml.errors import InputError, Problem, names_text, nearest, shown
+from scenes.yaml.units import TIME
+from twin.orbit.measured.clock import Readings
+from twin.orbit.measured.ground_files import GroundFile, read_ground_points
+from twin.orbit.measured.platform_files import Conventions, PlatformReadings, read_platform
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
+
+if TYPE_CHECKING:
+    from scenes.specs.measured.orbit_check import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
+    from scenes.specs.three_line_camera import ThreeLineCameraSpec
+
+_LINES = (
+    Column("camera", text=True),
+    Column("line"),
+    Column("time", TIME, needed=False),
+    Column("date_time", text=True, needed=False),
+)
+_POINTS = (
+    Column("point", text=True),
+    Column("camera", text=True),
+    Column("line"),
+    Column("pixel"),
+    Column("sigma_line", least=1e-6, most=1e3),
+    Column("sigma_pixel", least=1e-6, most=1e3),
+    Column("correlation", needed=False, least=-0.999999, most=0.999999),
+)
+_AROUND = 120.0
+"""Seconds of orbit and attitude before and after the lines that are kept: time scales differ by 70 s."""
+_LEAST_AROUND = 12
+"""Readings that are kept there at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class LineClock:
+    """When lines were exposed, as a clock showed it.
+
+    Attributes:
+        line: (K,) numbers of lines, rising.
+        clock: K readings.
+    """
+
+    line: np.ndarray
+    clock: Readings
+
+
+@dataclass(frozen=True, eq=False)
+class RawPoints:
+    """Image points of a line as they stand in the file.
+
+    Attributes:
+        point: (n,) rows of the ground points.
+        line, pixel: (n,) as written.
+        covariance: (n, 2, 2) of line and pixel as written, px^2.
+    """
+
+    point: np.ndarray
+    line: np.ndarray
+    pixel: np.ndarray
+    covariance: np.ndarray
+
+    def taken(self, keep: np.ndarray) -> RawPoints:
+        """Some of them, by mask or index."""
+        return RawPoints(self.point[keep], self.line[keep], self.pixel[keep], self.covariance[keep])
+
+
+@dataclass(frozen=True)
+class PassConventions:
+    """What the numbers of a pass mean.
+
+    Attributes:
+        platform: orbit and attitude.
+        line_scale: time scale of the lines.
+        line_offset: seconds to be added to their times.
+        moment: which moment of its exposure a line's time is: start, middle or end.
+        line_origin: image coordinate of the middle of the line that the table of times calls 0.
+        pixel_origin: image coordinate of the middle of the first pixel.
+        sees: to which side of the track the first pixel looks.
+        backward: whether lines are counted from the last.
+    """
+
+    platform: Conventions
+    line_scale: str
+    line_offset: float
+    moment: str
+    line_origin: float
+    pixel_origin: float
+    sees: str
+    backward: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PassReadings:
+    """What the files of a pass hold.
+
+    Attributes:
+        platform: orbit and attitude about the lines' times.
+        lines: camera -> line times.
+        ground: points on the ground.
+        images: camera -> image points.
+    """
+
+    platform: PlatformReadings
+    lines: Mapping[str, LineClock]
+    ground: GroundFile
+    images: Mapping[str, RawPoints]
+
+
+def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -> tuple[PassReadings, PassConventions]:
+    """What the files of a pass hold, and what is stated of it.
+
+    Args:
+        spec: the files.
+        camera: its lines.
+        folder: that relative paths start from.
+
+    Raises:
+        InputError: a file that cannot be read, or names in one that another does not have.
+    """
+    platform, meant = read_platform(spec.platform, folder)
+    lines = read_line_clocks(spec.lines, tuple(camera.lines), folder)
+    ground = read_ground_points(spec.ground, folder)
+    images = _image_points(spec.image_points, ground, lines, folder)
+    half = 0.5 if spec.image_points.centre == "half" else 0.0
+    stated = PassConventions(
+        meant,
+        spec.lines.time_scale,
+        0.0,
+        spec.lines.moment,
+        half,
+        half + spec.image_points.first_pixel,
+        spec.image_points.first_pixel_sees,
+    )
+    return PassReadings(_around(platform, lines), lines, ground, images), stated
+
+
+def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
+    """Line times of every camera that the table has.
+
+    Args:
+        spec: the table, and what it does not say itself.
+        cameras: names that may stand in it.
+        folder: that relative paths start from.
+
+    Raises:
+        InputError: the table cannot be read, a camera that is none, fewer than two lines of one, lines or times that do
+            not rise.
+    """
+    table = read_table(folder / spec.file, _LINES, 2)
+    clock = _clock(table, spec)
+    names = table["camera"].astype(str)
+    _known(table, "camera", names, cameras)
+    found = {}
+    for name in dict.fromkeys(names.tolist()):
+        rows = np.flatnonzero(names == name)
+        if len(rows) < 2:
+            raise table.error(int(rows[0]), "line", f"one line of {name} tells no line time", None, "two or more")
+        line, taken = table["line"][rows], clock.taken(rows)
+        step = np.diff(taken.day) * 86400.0 + np.diff(taken.second)
+        for what, rise in (("line", np.diff(line)), ("time", step)):
+            if np.any(rise <= 0.0):
+                row, head = int(rows[int(np.argmax(rise <= 0.0)) + 1]), what if what in table else "date_time"
+                raise table.error(row, head, f"{what}s of {name} do not rise", None, "rows in order, each line once")
+        found[name] = LineClock(line, taken)
+    return found
+
+
+def _clock(table: Table, spec: LineTimesFileSpec) -> Readings:
+    if ("time" in table) == ("date_time" in table):
+        raise InputError(spec.issue("times are not said once", ("file",), allowed="a column time [s] or date_time"))
+    try:
+        if "date_time" in table:
+            return Readings.of_texts(table["date_time"].tolist())
+        if spec.epoch is None:
+            raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
+        return Readings.after(spec.epoch, table["time"])
+    except Problem as problem:
+        if problem.within:
+            row = int(problem.within[0])
+            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
+        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+
+
+def _image_points(
+    spec: ImagePointsFileSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
+) -> Mapping[str, RawPoints]:
+    table = read_table(folder / spec.file, _POINTS)
+    known = {str(name): k for k, name in enumerate(ground.points.ids)}
+    names, cameras = table["point"].astype(str), table["camera"].astype(str)
+    _known(table, "camera", cameras, tuple(lines))
+    number = np.array([known.get(name, -1) for name in names.tolist()])
+    if np.any(number < 0):
+        row = int(np.argmax(number < 0))
+        name = str(names[row])
+        raise table.error(row, "point", "no such ground point", shown(name), None, nearest(name, known))
+    found = {}
+    for camera in dict.fromkeys(cameras.tolist()):
+        rows = np.flatnonzero(cameras == camera)
+        _, first = np.unique(number[rows], return_index=True)
+        if len(first) != len(rows):
+            row = int(rows[np.setdiff1d(np.arange(len(rows)), first)[0]])
+            raise table.error(row, "point", f"twice in {camera}", shown(str(names[row])), "each point once")
+        a, b = table["sigma_line"][rows], table["sigma_pixel"][rows]
+        c = a * b * (table["correlation"][rows] if "correlation" in table else 0.0)
+        spread = np.stack([np.stack([a * a, c], -1), np.stack([c, b * b], -1)], axis=1)
+        found[camera] = RawPoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
+    return FrozenMap(found)
+
+
+def _known(table: Table, column: str, names: np.ndarray, allowed: tuple[str, ...]) -> None:
+    wrong = ~np.isin(names, allowed)
+    if np.any(wrong):
+        row = int(np.argmax(wrong))
+        meant = nearest(str(names[row]), allowed)
+        raise table.error(row, column, f"no such {column}", shown(str(names[row])), names_text(allowed), meant)
+
+
+def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> PlatformReadings:
+    """The part of orbit and attitude that any reading of the line times can need."""
+    ends = [(c.clock.day[k], c.clock.second[k]) for c in lines.values() for k in (0, -1)]
+    day, second = min(ends)
+    last = max((d - day) * 86400.0 + s - second for d, s in ends)
+
+    def cut(clock: Readings) -> slice:
+        since = (clock.day - day) * 86400.0 + clock.second - second
+        begin, end = (int(np.searchsorted(since, t)) for t in (-_AROUND, last + _AROUND))
+        return slice(max(begin - _LEAST_AROUND, 0), end + _LEAST_AROUND)
+
+    orbit, attitude = platform.orbit, platform.attitude
+    a, b = cut(orbit.clock), cut(attitude.clock)
+    if len(orbit.clock.taken(a)) < 2 or len(attitude.clock.taken(b)) < 2:
+        return platform  # told by what needs it
+    return replace(platform, orbit=_orbit_part(orbit, a), attitude=_attitude_part(attitude, b))
+
+
+def _orbit_part(orbit: OrbitReadings, part: slice) -> OrbitReadings:
+    speed = None if orbit.velocity is None else orbit.velocity[part]
+    return replace(orbit, clock=orbit.clock.taken(part), position=orbit.position[part], velocity=speed)
+
+
+def _attitude_part(attitude: AttitudeReadings, part: slice) -> AttitudeReadings:
+    q = None if attitude.quaternion is None else attitude.quaternion[part]
+    angles = None if attitude.angles is None else attitude.angles[part]
+    return replace(attitude, clock=attitude.clock.taken(part), quaternion=q, angles=angles)

@@ -1,0 +1,1 @@
+"""Points measured in a user's line images: what `twin.orbit match` does."""

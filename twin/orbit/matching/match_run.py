@@ -1,0 +1,307 @@
+"""Points of an orthophoto, and tie points, in a user's line images: ``python -m twin.orbit match``.
+
+The images are brought together with what is known before: the laboratory's camera, orbit and attitude, line times. From
+there on all is as in a simulated patch (`twin.orbit.images.image_points`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.orbit.calibration_parameters import level_covariance
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from twin.orbit.conventions.pass_readings import LineClock, PassConventions, read_line_clocks
+from twin.orbit.conventions.reading_fit import ImpossibleError, line_times
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import LineCamera, line_cameras
+from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.ground.grid import GroundFrame
+from twin.orbit.images.image_points import (
+    POINTS_REMEDY,
+    MatchedPoints,
+    PatchPoints,
+    PointsError,
+    measure_points,
+)
+from twin.orbit.images.imaged_ground import BEYOND
+from twin.orbit.images.pushbroom import Window
+from twin.orbit.measured.geotiff import LARGEST_PART
+from twin.orbit.measured.map_part import MapPart, UserMap
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
+from twin.orbit.measured.platform_files import platform_table, read_platform
+from twin.run.procedure import Advance, BenchError, silent
+
+if TYPE_CHECKING:
+    from optics.numerics.backend import Backend
+    from scenes.specs.measured.orbit_match import LineImageFileSpec, OrbitMatchSpec
+    from scenes.specs.measured.pass_files_setup import MatchSetup
+
+_BORDER = 5
+"""Places along each side of an image that are followed to the ground."""
+_SPARE = 300.0
+"""Metres of map about what the images show, beside the reach: camera and platform are wrong by as much."""
+
+
+@dataclass(frozen=True, eq=False)
+class UserImage:
+    """A line's image; see `twin.orbit.images.imaged_ground.Frame`.
+
+    Attributes:
+        frame: grey values, (lines, pixels), columns as pixels of the line.
+        window: where it lies in the line's whole image.
+        measured: the line as it is known.
+        sample: distance of pixels and of lines on the ground, metres.
+    """
+
+    frame: np.ndarray
+    window: Window
+    measured: Sensor
+    sample: tuple[float, float]
+
+    def image_point(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Line and pixel of places of the frame (row, column), whole or not."""
+        return self.window.first_line + np.asarray(row), self.window.first_pixel + np.asarray(column)
+
+
+@dataclass(frozen=True, eq=False)
+class UserMaps:
+    """Orthophoto and elevation model."""
+
+    orthophoto: MapPart
+    dem: MapPart
+
+
+@dataclass(frozen=True, eq=False)
+class UserGround:
+    """A piece of ground in a user's images; see `twin.orbit.images.imaged_ground.ImagedGround`."""
+
+    frame: GroundFrame
+    images: Mapping[str, UserImage]
+    control: UserMaps
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What was measured.
+
+    Attributes:
+        setup: what the file says.
+        ground: images and maps.
+        points: measured in the images.
+        measurements: the same with orbit, attitude and line times, as a calibration takes them.
+        accuracy: of the maps' way to WGS 84 as its authority states it, metres; None where it is not stated.
+    """
+
+    setup: MatchSetup
+    ground: UserGround
+    points: PatchPoints
+    measurements: PassMeasurements
+    accuracy: float | None
+
+
+def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Match:
+    """Measure points; nothing is traced or drawn.
+
+    Raises:
+        InputError: files that cannot be read, or do not fit together.
+        BenchError: points that cannot be measured.
+    """
+    advance("points", 0, 3)
+    spec, folder = setup.test, Path()
+    readings, meant = read_platform(spec.platform, folder)
+    table = platform_table(readings, meant)
+    path = TabulatedTrajectory(table)
+    clocks = read_line_clocks(spec.lines, tuple(setup.camera.lines), folder)
+    cameras = line_cameras(setup.camera)
+    light = LightEffects(*(getattr(spec.effects, n) for n in ("light_time", "aberration", "refraction", "wavelength")))
+    times = {}
+    for name in spec.images:
+        if name not in clocks:
+            meant_name, known = nearest(name, clocks), f"{names_text(clocks)}, of which the table has times"
+            raise spec.error("no such line", ("images", name), allowed=known, suggestion=meant_name)
+        times[name] = _times(spec, clocks[name], table.epoch)
+    photo = UserMap.open(spec.orthophoto, folder)
+    dem = UserMap.open(spec.dem, folder, heights=True)
+    sensors = {name: _sensor(spec, name, cameras[name], path, times[name], light) for name in spec.images}
+    images = {name: _image(one, name, sensors[name], folder) for name, one in spec.images.items()}
+    limits = dem.limits()
+    frame, ends = _extent(images, limits, spec.points.reach + spec.points.template)
+    maps = UserMaps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
+    height = float(np.median(maps.dem.values if maps.dem.valid is None else maps.dem.values[maps.dem.valid]))
+    images = {name: _sampled(image, height) for name, image in images.items()}
+    ground = UserGround(frame, FrozenMap(images), maps)
+    advance("points", 1, 3)
+    try:
+        points = measure_points(ground, spec.points)
+    except PointsError as error:
+        raise BenchError(str(error), ("points",), POINTS_REMEDY) from error
+    except ValueError as error:
+        raise BenchError(f"the images cannot be matched: {error}", ("images",), "images of the map's ground") from error
+    advance("points", 3, 3)
+    measured = PassMeasurements(spec.name, table, FrozenMap(times), *_measured(points, spec))
+    return Match(setup, ground, points, measured, max((photo.way.accuracy, dem.way.accuracy)))
+
+
+def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
+    """Of a line's own numbers, its first line in the table being 0."""
+    meant = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
+    try:
+        middle, _ = line_times(clock, meant, epoch, clock.line)
+        return LineTimes.of(clock.line - clock.line[0], middle)
+    except (ImpossibleError, ValueError) as error:
+        raise spec.lines.error(str(error), ("file",)) from None
+
+
+def _sensor(
+    spec: OrbitMatchSpec,
+    name: str,
+    camera: LineCamera,
+    path: TabulatedTrajectory,
+    times: LineTimes,
+    light: LightEffects,
+) -> Sensor:
+    try:
+        return Sensor.of_lines(camera, path, Earth(), times, light)
+    except ValueError as error:
+        problem = f"{name}: lines outside of orbit and attitude: {error}"
+        raise spec.lines.error(problem, ("file",), allowed="times within those of orbit and attitude") from None
+
+
+def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> UserImage:
+    """The image, with columns along the line's pixels."""
+    path = folder / spec.file
+    part = spec.window
+    frame = _read_image(path, spec)
+    row, column = (0, 0) if part is None else (part.row, part.column)
+    rows, columns = frame.shape
+    first_line = spec.first_line + row
+    if spec.first_pixel_sees == "right":
+        first_pixel = spec.first_pixel + column
+    else:
+        frame = np.ascontiguousarray(frame[:, ::-1])
+        first_pixel = sensor.camera.pixels - spec.first_pixel - column - columns
+    if first_pixel < 0 or first_pixel + columns > sensor.camera.pixels:
+        found = f"columns {column} to {column + columns - 1} from pixel {spec.first_pixel}"
+        allowed = (
+            f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
+        )
+        raise InputError(spec.issue("an image wider than its line", ("first_pixel",), found=found, allowed=allowed))
+    if first_line + rows > sensor.lines + 1:
+        found = f"lines to {first_line + rows - 1}"
+        allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
+        raise InputError(
+            spec.issue("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
+        )
+    return UserImage(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
+
+
+def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
+    """Grey values (rows, columns) of the image, or of its window."""
+    from twin.orbit.measured.geotiff import opened
+
+    file, part = str(path), spec.window
+    with opened(file) as source:
+        from rasterio.windows import Window as Part
+
+        if not 1 <= spec.band <= source.count:
+            raise InputError(spec.issue("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}"))
+        shape = (source.height, source.width)
+        row, column, rows, columns = (
+            (0, 0, *shape) if part is None else (part.row, part.column, part.rows, part.columns)
+        )
+        if row + rows > shape[0] or column + columns > shape[1]:
+            allowed = f"within {shape[0]} rows and {shape[1]} columns"
+            raise InputError(spec.issue("a window outside of the image", ("window",), allowed=allowed))
+        if rows * columns > LARGEST_PART:
+            found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
+            raise InputError(
+                spec.issue("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
+            )
+        values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
+    if values.dtype.kind not in "uif":
+        raise InputError(Issue("values that are no grey values", file, None, (), str(values.dtype), "real numbers"))
+    if not np.all(np.isfinite(values)):
+        raise InputError(Issue("grey values that are not finite", file, allowed="images without gaps, or a `window:`"))
+    return values if values.dtype == np.uint16 else values.astype(np.float32)
+
+
+def _extent(
+    images: Mapping[str, UserImage], heights: tuple[float, float], reach: int
+) -> tuple[GroundFrame, tuple[float, float, float, float]]:
+    """Plane coordinates of the ground, and west, east, south and north end of what the images can show, metres."""
+    seen = []
+    for name, image in images.items():
+        window = image.window
+        side = [np.linspace(-reach, n - 1.0 + reach, _BORDER) for n in (window.lines, window.pixels)]
+        row, column = (v.ravel() for v in np.meshgrid(*side, indexing="ij"))
+        line, pixel = image.image_point(row, column)
+        sensor = image.measured
+        line, pixel = np.clip(line, -0.5, sensor.lines - 0.5), np.clip(pixel, -0.5, sensor.camera.pixels - 0.5)
+        for height in heights:
+            points = sensor.ground(line, pixel, height)
+            if not np.all(np.isfinite(points)):
+                raise InputError(Issue(f"{name} looks past the Earth: are the conventions right? `check` tells"))
+            seen.append(points)
+    every = np.concatenate(seen)
+    longitude, latitude, _ = Earth().geodetic(np.mean(every, axis=0))
+    frame = GroundFrame(float(longitude), float(latitude))
+    east, north, _ = frame.local(every)
+    ends = (east.min() - _SPARE, east.max() + _SPARE, north.min() - _SPARE, north.max() + _SPARE)
+    return frame, (float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3]))
+
+
+def _sampled(image: UserImage, height: float) -> UserImage:
+    """With the distances of pixels and lines in its middle."""
+    line, pixel = image.window.middle
+    at = image.measured.ground(line + np.array([-0.5, 0.5, 0, 0]), pixel + np.array([0, 0, -0.5, 0.5]), height)
+    sample = float(np.linalg.norm(at[3] - at[2])), float(np.linalg.norm(at[1] - at[0]))
+    return UserImage(image.frame, image.window, image.measured, sample)
+
+
+def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, Mapping[str, ImagePoints]]:
+    """Accepted points, control and check before ties."""
+    ids: list[str] = []
+    places, roles = [], []
+    rows: dict[str, list[ImagePoints]] = {name: [] for name in spec.images}
+    for sort, one in points.sorts.items():
+        keep = _used(one)
+        start = len(ids)
+        number = {int(k): start + n for n, k in enumerate(np.flatnonzero(keep))}
+        ids += [f"{sort[0]}{k}" for k in number]
+        places.append(np.where(sort == "tie", np.nan, one.ground[keep]))
+        roles += ["tie" if sort == "tie" else "check" if one.check[k] else "control" for k in number]
+        for name, line in one.lines.items():
+            good = np.flatnonzero(line.accepted & keep)
+            image, spread = line.image[good], line.covariance[good] + BEYOND**2 * np.eye(2)
+            which = [number[int(k)] for k in good]
+            rows[name].append(ImagePoints.of(which, image[:, 0], image[:, 1], spread))
+    itrs, role = np.concatenate(places), np.array(roles, object)
+    covariance = np.zeros((len(ids), 3, 3))
+    given = role != "tie"
+    plan, height = spec.control_sigma
+    each = np.ones(int(given.sum()))
+    covariance[given] = level_covariance(itrs[given], plan * each, height * each)
+    return GroundPoints.of(np.array(ids, object), itrs, covariance, role), FrozenMap(
+        {name: _joined(parts) for name, parts in rows.items()}
+    )
+
+
+def _used(points: MatchedPoints) -> np.ndarray:
+    """(n,) bool: seen by a line, or by two for ties."""
+    seen = np.sum([line.accepted for line in points.lines.values()], axis=0)
+    return np.asarray(seen >= (2 if points.kind == "tie" else 1))
+
+
+def _joined(parts: list[ImagePoints]) -> ImagePoints:
+    return ImagePoints(
+        *(np.concatenate([getattr(p, n) for p in parts]) for n in ("point", "line", "pixel", "covariance"))
+    )

@@ -1,0 +1,240 @@
+"""Orbits and attitudes in CCSDS messages: OEM (502.0-B) and AEM (504.0-B), as key = value or as XML.
+
+An attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by a about e that takes frame A to frame B.
+So from A to the body the axes of the body are those of A turned by q, and components in the body become those in A by
+R(q): it turns body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the other way. Version 1 says by
+QUATERNION_TYPE where the scalar stands; version 2 has it last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
+from twin.orbit.measured.clock import known_scale
+from twin.orbit.measured.platform_readings import (
+    AttitudeReadings,
+    OrbitReadings,
+    Scalar,
+    Turns,
+    known_frame,
+    require_orbit,
+    require_unit,
+)
+from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
+
+_COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
+
+
+@dataclass
+class _Segment:
+    """Metadata and data lines of a segment, with the lines on which they stand."""
+
+    keys: dict[str, tuple[str, int]] = field(default_factory=dict)
+    rows: list[list[str]] = field(default_factory=list)
+    lines: list[int] = field(default_factory=list)
+
+
+def message_kind(lines: list[str]) -> str | None:
+    """OEM or AEM for a message's first lines; None for another file."""
+    text = "\n".join(lines[:20])
+    for kind in ("OEM", "AEM"):
+        if f"CCSDS_{kind}_VERS" in text or f"<{kind.lower()}" in text:
+            return kind
+    return None
+
+
+def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
+    """The orbit of an OEM.
+
+    Args:
+        path: of the file.
+        satellite: its OBJECT_ID or OBJECT_NAME; may be left out where there is one only.
+
+    Raises:
+        InputError: it cannot be read, about another body than the Earth, or its segments do not fit together.
+    """
+    file = str(path)
+    segments = _chosen(file, _segments(path, "OEM"), satellite)
+    for segment in segments:
+        centre, line = segment.keys.get("CENTER_NAME", ("", 1))
+        if centre.upper() != "EARTH":
+            raise InputError(Issue("an orbit about another body", file, line, ("CENTER_NAME",), shown(centre), "EARTH"))
+    frame, line = _same(file, segments, "REF_FRAME")
+    rows, lines = _joined(segments)
+    widths = {len(row) for row in rows}
+    cells = [row[1:7] for row in rows] if widths <= {7, 10} else [row[1:] for row in rows]
+    found = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
+    clock = readings(file, [row[0] for row in rows], lines)
+    require_rising(file, clock, lines)
+    require_orbit(file, found[:, :3], lines)
+    return OrbitReadings(
+        file, clock, found[:, :3], found[:, 3:], known_frame(frame, file, line), _scale(file, segments)
+    )
+
+
+def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings:
+    """The attitude of an AEM of quaternions; arguments and errors as `read_oem`."""
+    file = str(path)
+    segments = _chosen(file, _segments(path, "AEM"), satellite)
+    kind, line = _same(file, segments, "ATTITUDE_TYPE")
+    if not kind.upper().startswith("QUATERNION"):
+        problem = "an attitude of another type"
+        raise InputError(Issue(problem, file, line, ("ATTITUDE_TYPE",), shown(kind), "QUATERNION"))
+    frames = {key: _same(file, segments, key) for key in ("REF_FRAME_A", "REF_FRAME_B")}
+    body = [key for key, (name, _) in frames.items() if name.upper().startswith(("SC_", "SC", "SPACECRAFT"))]
+    if len(body) != 1:
+        found = names_text(name for name, _ in frames.values())
+        problem = "one of the two frames must be the body's"
+        allowed = "SC_BODY or another frame of the spacecraft, SC_..., and a reference frame"
+        raise InputError(Issue(problem, file, frames["REF_FRAME_A"][1], ("REF_FRAME_A",), found, allowed))
+    reference, at = frames["REF_FRAME_A" if body[0] == "REF_FRAME_B" else "REF_FRAME_B"]
+    direction, turn_line = _same(file, segments, "ATTITUDE_DIR", "A2B")
+    if direction.upper() not in ("A2B", "B2A"):
+        raise InputError(Issue("no such direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
+    to_body = (direction.upper() == "A2B") == (body[0] == "REF_FRAME_B")
+    turns: Turns = "body_to_frame" if to_body else "frame_to_body"
+    first, type_line = _same(file, segments, "QUATERNION_TYPE", "LAST")
+    if first.upper() not in ("FIRST", "LAST"):
+        raise InputError(Issue("no such type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
+    scalar: Scalar = "first" if first.upper() == "FIRST" else "last"
+    rows, lines = _joined(segments)
+    cells = [row[1:5] if len(row) >= 5 else row[1:] for row in rows]
+    heads = ("QC", "Q1", "Q2", "Q3") if scalar == "first" else ("Q1", "Q2", "Q3", "QC")
+    quaternion = numbers(file, cells, lines, heads)
+    require_unit(file, quaternion, lines)
+    clock = readings(file, [row[0] for row in rows], lines)
+    require_rising(file, clock, lines)
+    frame = known_frame(reference, file, at, "REF_FRAME_A")
+    return AttitudeReadings(file, clock, quaternion, None, frame, _scale(file, segments), scalar, turns)
+
+
+def _segments(path: str | Path, kind: str) -> list[_Segment]:
+    file, lines = str(path), text_lines(path, f"a CCSDS {kind}")
+    xml = any(line.lstrip().startswith("<") for line in lines[:20])
+    found = list(_from_xml(file, "\n".join(lines), kind) if xml else _from_text(file, lines, kind))
+    if not any(segment.rows for segment in found):
+        raise InputError(Issue("no data", file, None, (), None, f"segments of a CCSDS {kind} with lines of data"))
+    return [segment for segment in found if segment.rows]
+
+
+def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
+    segment: _Segment | None = None
+    inside, skipped = "", False
+    for k, raw in enumerate(lines):
+        line = raw.strip()
+        if not line or line.startswith("COMMENT"):
+            continue
+        if line == "META_START":
+            if segment is not None:
+                yield segment
+            segment, inside = _Segment(), "meta"
+        elif line == "META_STOP":
+            inside = "data"
+        elif line in _COVARIANCE:
+            skipped = line == _COVARIANCE[0]
+        elif line in ("DATA_START", "DATA_STOP") or skipped:
+            inside = "data" if line == "DATA_START" else inside
+        elif inside == "meta" or (segment is None and "=" in line):
+            key, sign, value = line.partition("=")
+            if not sign:
+                raise InputError(Issue("not key = value", file, k + 1, (), shown(line), "KEY = VALUE"))
+            if segment is not None:
+                segment.keys[key.strip()] = (value.strip(), k + 1)
+        elif segment is None or inside != "data":
+            raise InputError(Issue("data before META_START", file, k + 1, (), shown(line), f"a CCSDS {kind}"))
+        else:
+            segment.rows.append(line.split())
+            segment.lines.append(k + 1)
+    if skipped or inside == "meta":
+        missing = "COVARIANCE_STOP" if skipped else "META_STOP"
+        raise InputError(Issue("the file ends early", file, len(lines), (), None, missing))
+    if segment is not None:
+        yield segment
+
+
+_STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+_TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1", "Q2", "Q3")}
+
+
+def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(Issue("XML with a document type", file, 1, (), None, "elements alone"))
+    try:
+        root = ElementTree.fromstring(text.encode())
+    except ElementTree.ParseError as error:
+        raise InputError(Issue(f"not XML: {error.msg}", file, error.position[0])) from None
+    for one in root.iter("segment"):
+        segment = _Segment()
+        for meta in one.iter("metadata"):
+            segment.keys |= {item.tag: ((item.text or "").strip(), 1) for item in meta}
+        heads = (
+            _STATE if kind == "OEM" else _TURN[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
+        )
+        for state in (*one.iter("stateVector"), *one.iter("attitudeState")):
+            cells = {item.tag: (item.text or "").strip() for item in state.iter()}
+            if missing := [head for head in heads if not cells.get(head)]:
+                number = len(segment.rows) + 1
+                raise InputError(Issue(f"state {number} has no {missing[0]}", file, None, (), None, names_text(heads)))
+            segment.rows.append([cells[head] for head in heads])
+            segment.lines.append(1)
+        yield segment
+
+
+def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[_Segment]:
+    """Those of one satellite."""
+    names: dict[str, Mapping[str, None]] = {}
+    for segment in segments:
+        known = {segment.keys[k][0]: None for k in ("OBJECT_ID", "OBJECT_NAME") if k in segment.keys}
+        names[segment.keys.get("OBJECT_ID", segment.keys.get("OBJECT_NAME", ("", 0)))[0]] = known
+    every = [name for known in names.values() for name in known]
+    if satellite is None:
+        if len(names) > 1:
+            found = names_text(names)
+            raise InputError(Issue("which satellite is not said", file, None, ("satellite",), found, "one of them"))
+        return segments
+    found_segments = [
+        s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))
+    ]
+    if not found_segments:
+        meant = nearest(satellite, every)
+        raise InputError(Issue("no such satellite", file, None, ("satellite",), satellite, names_text(every), meant))
+    return found_segments
+
+
+def _same(file: str, segments: list[_Segment], key: str, usual: str | None = None) -> tuple[str, int]:
+    """What all segments say of a key, and on which line."""
+    said = [s.keys.get(key) for s in segments]
+    values = {None if one is None else one[0] for one in said}
+    if values == {None} and usual is not None:
+        return usual, 1
+    first = next((one for one in said if one is not None), None)
+    if first is None or None in values:
+        raise InputError(Issue(f"no {key}", file, None, (key,), None, "it in every segment's metadata"))
+    if len(values) > 1:
+        found = names_text(sorted(map(str, values)))
+        raise InputError(Issue(f"segments with different {key}", file, first[1], (key,), found, "the same in all"))
+    return first
+
+
+def _scale(file: str, segments: list[_Segment]) -> str:
+    name, line = _same(file, segments, "TIME_SYSTEM")
+    try:
+        return known_scale(name)
+    except Problem as problem:
+        key = ("TIME_SYSTEM",)
+        raise InputError(Issue(problem.problem, file, line, key, problem.found, problem.allowed)) from None
+
+
+def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
+    """Rows of all segments with their lines; the time at which one ends and the next begins stands once."""
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    for segment in segments:
+        start = 1 if rows and segment.rows and segment.rows[0][0] == rows[-1][0] else 0
+        rows += segment.rows[start:]
+        lines += segment.lines[start:]
+    return rows, lines

@@ -1,0 +1,224 @@
+"""Time scales and what clocks read: UTC, GPS, TAI, TT and the other systems' times, to seconds of atomic time.
+
+A reading is a day and seconds of that day, as the clock shows them. An instant is SI seconds of TAI in two parts, so
+that nothing is lost over decades: whole days since MJD 0 (of TAI) and the rest in seconds.
+
+GPS time is 19 s behind TAI and BeiDou time 33 s, for good; Galileo and QZSS time are taken as GPS time, from which they
+are steered to differ by nanoseconds; TT is 32.184 s ahead of TAI. UTC is behind by the leap seconds (IERS Conventions
+2010, chapter 10).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date, datetime, timedelta
+
+import erfa
+import numpy as np
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.yaml.errors import Problem, names_text, shown
+from twin.orbit.flight.earth import DAY, years_without_announced_leap_seconds
+
+TAI_MINUS: Mapping[str, float] = FrozenMap(
+    {"TAI": 0.0, "GPS": 19.0, "GAL": 19.0, "QZS": 19.0, "BDT": 33.0, "TT": -32.184}
+)
+"""Scale -> seconds to be added to its readings for TAI; those of UTC change."""
+SCALES = ("UTC", *TAI_MINUS)
+_MJD_ZERO = date(1858, 11, 17).toordinal()
+FIRST_DAY, LAST_DAY = date(1972, 1, 1).toordinal() - _MJD_ZERO, date(2100, 1, 1).toordinal() - _MJD_ZERO
+"""Modified Julian days in which instants can lie: UTC has whole leap seconds since the first."""
+_FORM = "a date and time such as 2011-03-05T03:05:00.25 or 2011-064T03:05:00.25, 1972 to 2099"
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What a clock showed.
+
+    Attributes:
+        day: (N,) modified Julian days, whole.
+        second: (N,) seconds of the day, from 0 to 86400, within a leap second up to 86401.
+    """
+
+    day: np.ndarray
+    second: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.day)
+
+    @classmethod
+    def after(cls, epoch: str, seconds: np.ndarray) -> Readings:
+        """Readings of a clock whose days all have 86400 s.
+
+        Args:
+            epoch: what it read at 0 s, ISO 8601 text.
+            seconds: (N,) since then.
+
+        Raises:
+            Problem: not such a text.
+        """
+        day, second = calendar_reading(epoch)
+        whole = np.floor((second + seconds) / DAY)
+        return cls(day + whole.astype(np.int64), second + seconds - DAY * whole)
+
+    @classmethod
+    def of_texts(cls, texts: Sequence[str]) -> Readings:
+        """From calendar texts.
+
+        Args:
+            texts: N of them.
+
+        Raises:
+            Problem: not such a text; ``within`` holds its index.
+        """
+        day, second = np.empty(len(texts), np.int64), np.empty(len(texts))
+        known: dict[str, int] = {}
+        for k, text in enumerate(texts):
+            try:
+                head, _, clock = text.partition("T")
+                one = known.get(head)
+                if one is None:
+                    one = known[head] = _day_of(head)
+                hour, minute, rest = clock.removesuffix("Z").split(":")
+                if len(hour) != 2 or len(minute) != 2 or not (hour + minute + rest.replace(".", "", 1)).isdigit():
+                    raise ValueError
+                seconds = float(rest)
+                if int(hour) > 23 or int(minute) > 59 or seconds >= (61.0 if (hour, minute) == ("23", "59") else 60.0):
+                    raise ValueError
+                day[k], second[k] = one, 3600 * int(hour) + 60 * int(minute) + seconds
+            except ValueError:
+                raise Problem("not a date and time", shown(text), _FORM, within=(k,)) from None
+        return cls(day, second)
+
+    def taken(self, keep: np.ndarray | slice) -> Readings:
+        """Some of them, by mask, slice or index (K,)."""
+        return Readings(self.day[keep], self.second[keep])
+
+    def instants(self, scale: str) -> Instants:
+        """The instants, if the clock shows this scale.
+
+        Raises:
+            Problem: a leap second on a day that has none, or of a scale that has none.
+        """
+        late = self.second >= DAY
+        if scale != "UTC":
+            if np.any(late):
+                found = f"{self.second[late][0]:g} s of the day"
+                raise Problem("a leap second, which only UTC has", found, "time_scale UTC")
+            return Instants(self.day, self.second + TAI_MINUS[scale])
+        days, where = np.unique(self.day, return_inverse=True)
+        ahead = np.array([tai_minus_utc(int(day)) for day in days])
+        if np.any(late):
+            length = np.array([tai_minus_utc(int(day) + 1) for day in days]) - ahead + DAY
+            if np.any(self.second >= length[where]):
+                row = int(np.argmax(self.second >= length[where]))
+                raise Problem("no leap second on this day", calendar(int(self.day[row])), "a second below 60")
+        return Instants(self.day, self.second + ahead[where])
+
+
+@dataclass(frozen=True, eq=False)
+class Instants:
+    """Instants of TAI.
+
+    Attributes:
+        day: (N,) whole days since MJD 0.
+        second: (N,) SI seconds after them.
+    """
+
+    day: np.ndarray
+    second: np.ndarray
+
+    def since(self, epoch: str) -> np.ndarray:
+        """SI seconds (N,) from an epoch in UTC, ISO 8601 text, leap seconds counted; exact to 1e-11 s within a day."""
+        (start,) = _utc(epoch)
+        day, second = start.day[0], start.second[0]
+        return np.asarray((self.day - day) * DAY + (self.second - second))
+
+    def later(self, seconds: float) -> Instants:
+        """So many seconds later."""
+        return Instants(self.day, self.second + seconds)
+
+    def utc_mjd(self) -> np.ndarray:
+        """Modified Julian dates (N,) in UTC, days; not exact within a leap second. For tables over days."""
+        rough = self.day + self.second / DAY
+        days = np.unique(np.floor(rough).astype(np.int64))
+        ahead = {int(day): tai_minus_utc(int(day)) for day in days}
+        offset = np.array([ahead[int(d)] for d in days])[np.searchsorted(days, np.floor(rough))]
+        return np.asarray(self.day + (self.second - offset) / DAY)
+
+
+def _utc(epoch: str) -> tuple[Instants]:
+    return (Readings.of_texts([epoch.strip()]).instants("UTC"),)
+
+
+def epoch_before(instants: Instants) -> str:
+    """UTC of the first of the instants, at its full second, ISO 8601 text ending in Z."""
+    first = np.argmin(instants.day * DAY + instants.second)
+    second = float(instants.second[first])
+    rough = int(instants.day[first]) + (second - tai_minus_utc(int(instants.day[first]))) / DAY
+    day = int(np.floor(rough))
+    # within a leap second it is the one before
+    second = min((int(instants.day[first]) - day) * DAY + second - tai_minus_utc(day), DAY - 1.0)
+    return (datetime.fromordinal(day + _MJD_ZERO) + timedelta(seconds=int(second))).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def tai_minus_utc(day: int) -> float:
+    """TAI - UTC on a modified Julian day, seconds.
+
+    Raises:
+        Problem: before 1972 or after 2099.
+    """
+    if not FIRST_DAY <= day <= LAST_DAY:
+        raise Problem("outside the years of this time scale", f"MJD {day}", _FORM)
+    when = date.fromordinal(day + _MJD_ZERO)
+    with years_without_announced_leap_seconds():
+        return float(erfa.dat(when.year, when.month, when.day, 0.0))
+
+
+def calendar(day: int) -> str:
+    """Date of a modified Julian day."""
+    return date.fromordinal(day + _MJD_ZERO).isoformat()
+
+
+def calendar_reading(text: str) -> tuple[int, float]:
+    """Modified Julian day and second of the day that a text shows.
+
+    Raises:
+        Problem: not such a text.
+    """
+    try:
+        one = Readings.of_texts([text.strip()])
+    except Problem as problem:
+        raise Problem(problem.problem, problem.found, problem.allowed) from None
+    return int(one.day[0]), float(one.second[0])
+
+
+def known_scale(name: str) -> str:
+    """The scale of this name, as files of others spell it: GPST for GPS, GLO and GLONASS for UTC.
+
+    Raises:
+        Problem: another one.
+    """
+    upper = name.strip().upper()
+    found = {"GPST": "GPS", "GLO": "UTC", "GLONASS": "UTC", "BDS": "BDT", "TDT": "TT"}.get(upper, upper)
+    if found not in SCALES:
+        raise Problem("a time scale that cannot be read", shown(name), names_text(SCALES))
+    return found
+
+
+def _day_of(text: str) -> int:
+    """Modified Julian day of 2011-03-05, or of day 64 of a year, 2011-064. ValueError if it is neither."""
+    if len(text) == 8 and text[4] == "-" and text[5:].isdigit() and text[:4].isdigit():
+        start = date(int(text[:4]), 1, 1)
+        found = start + timedelta(days=int(text[5:]) - 1)
+        if found.year != start.year:
+            raise ValueError(text)
+    elif len(text) == 10:
+        found = date.fromisoformat(text)
+    else:
+        raise ValueError(text)
+    day = found.toordinal() - _MJD_ZERO
+    if not FIRST_DAY <= day < LAST_DAY:
+        raise ValueError(text)
+    return day

@@ -1,0 +1,258 @@
+"""Earth orientation from tables: UT1, polar motion and the celestial pole's offsets, and the rotation that they give.
+
+Between the days of a table its numbers are interpolated by cubics through four of them (IERS Gazette 13, 1997). UT1 is
+interpolated as UT1 - TAI, which has no steps. What oceans do to pole and UT1 within a day is not in the tables and is
+left out: some 3 cm on the ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from scenes.yaml.csv_table import Column, read_table
+from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.units import ANGLE, TIME
+from twin.orbit.flight.earth import DAY, tai_of
+from twin.orbit.measured.clock import FIRST_DAY, LAST_DAY, calendar, calendar_reading, tai_minus_utc
+from twin.orbit.measured.text_file import first_lines, numbers, text_lines
+
+WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
+_ARCSEC = np.pi / 648000.0
+_MAS = 1e-3 * _ARCSEC
+_TT_FROM_TAI = 32.184
+_NODE_STEP = 3600.0
+_RATE_STEP = 1.0
+"""Seconds to either side for the rate of rotation: rounding is 1e-16 rad/s, curvature far less."""
+_COLUMNS = (
+    Column("mjd", least=FIRST_DAY, most=LAST_DAY),
+    Column("ut1_utc", TIME, least=-1.0, most=1.0),
+    Column("x_pole", ANGLE, least=-1e-5, most=1e-5),
+    Column("y_pole", ANGLE, least=-1e-5, most=1e-5),
+    Column("dx", ANGLE, needed=False, least=-1e-7, most=1e-7),
+    Column("dy", ANGLE, needed=False, least=-1e-7, most=1e-7),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class EarthOrientation:
+    """A table of Earth orientation; made by `read_earth_orientation`.
+
+    Attributes:
+        file: where it is from.
+        mjd: (K,) modified Julian dates in UTC, rising, four or more.
+        ut1_tai: (K,) UT1 - TAI, seconds.
+        pole: (K, 2) x and y of the pole, radians.
+        offsets: (K, 2) dX and dY of the celestial pole against IAU 2006/2000A, radians.
+    """
+
+    file: str
+    mjd: np.ndarray
+    ut1_tai: np.ndarray
+    pole: np.ndarray
+    offsets: np.ndarray
+
+    def rotation(self, epoch: str, first: float, last: float) -> TableRotation:
+        """The Earth's rotation from `first` to `last`, seconds from an epoch in UTC.
+
+        Raises:
+            InputError: the table does not reach over the span.
+        """
+        day, second = calendar_reading(epoch)
+        begin, end = (day + (second + t) / DAY for t in (first, last))
+        if begin < self.mjd[0] or end > self.mjd[-1]:
+            found = f"{calendar(int(self.mjd[0]))} to {calendar(int(self.mjd[-1]))}"
+            needed = f"a table that holds {calendar(int(begin))} to {calendar(int(end))}"
+            raise InputError(
+                Issue("the table of Earth orientation ends before the data", self.file, None, (), found, needed)
+            )
+        one, two = tai_of(epoch)
+        around = np.ceil(0.5 * (last - first) / _NODE_STEP) + 3.0
+        node = 0.5 * (first + last) + _NODE_STEP * np.arange(-around, around + 1.0)
+        pole = np.stack(erfa.xys06a(one, two + (node + _TT_FROM_TAI) / DAY), axis=-1)
+        return TableRotation(self, epoch, CubicSpline(node, pole))
+
+    def at(self, mjd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """UT1 - TAI (N,), seconds, pole (N, 2) and offsets (N, 2), radians, at dates in UTC (N,)."""
+        count = len(self.mjd)
+        start = np.clip(np.searchsorted(self.mjd, mjd, side="right") - 2, 0, count - 4)
+        which = start[..., None] + np.arange(4)
+        nodes = self.mjd[which]
+        weight = np.ones(which.shape)
+        for k in range(4):
+            for j in range(4):
+                if j != k:
+                    weight[..., k] *= (mjd - nodes[..., j]) / (nodes[..., k] - nodes[..., j])
+        ut1 = np.sum(weight * self.ut1_tai[which], axis=-1)
+        pole, offsets = (np.sum(weight[..., None] * v[which], axis=-2) for v in (self.pole, self.offsets))
+        return ut1, pole, offsets
+
+
+@dataclass(frozen=True, eq=False)
+class TableRotation:
+    """Rotation GCRS -> ITRS by a table; as `twin.orbit.flight.earth.EarthRotation`.
+
+    Attributes:
+        table: of Earth orientation.
+        epoch: UTC, ISO 8601 text; times are SI seconds from it.
+        celestial_pole: spline of the pole's X and Y and of the locator s by IAU 2006/2000A, radians.
+    """
+
+    table: EarthOrientation
+    epoch: str
+    celestial_pole: Any
+
+    def turn(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """UT1 as the second part of a Julian date whose first is `julian`, (...), and pole and offsets (..., 2)."""
+        t = np.asarray(seconds, dtype=np.float64)
+        day, second = calendar_reading(self.epoch)
+        tai = second + tai_minus_utc(day) + t
+        ut1_tai, pole, offsets = self.table.at(day + (second + t) / DAY)
+        return (tai + ut1_tai) / DAY, pole, offsets
+
+    @property
+    def julian(self) -> float:
+        """First part of the Julian date of the epoch, days."""
+        return 2400000.5 + calendar_reading(self.epoch)[0]
+
+    def matrix(self, seconds: Any) -> np.ndarray:
+        """Rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
+        t = np.asarray(seconds, dtype=np.float64)
+        ut1, pole, offsets = self.turn(t)
+        x, y, s = np.moveaxis(self.celestial_pole(t), -1, 0)
+        celestial = erfa.c2ixys(x + offsets[..., 0], y + offsets[..., 1], s)
+        return np.asarray(erfa.c2tcio(celestial, erfa.era00(self.julian, ut1), self._polar(t, pole)))
+
+    def mean_equinox(self, seconds: Any) -> np.ndarray:
+        """Rotation TEME -> ITRS, (...) -> (..., 3, 3): by Greenwich mean sidereal time of 1982 and polar motion
+        (Vallado et al., AIAA 2006-6753, appendix C).
+        """
+        ut1, pole, _ = self.turn(seconds)
+        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ _about_z(erfa.gmst82(self.julian, ut1)))
+
+    def _polar(self, t: np.ndarray, pole: np.ndarray) -> np.ndarray:
+        one, two = tai_of(self.epoch)
+        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(one, two + (t + _TT_FROM_TAI) / DAY)))
+
+
+def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
+    """Angular velocity (N, 3), rad/s, of the axes to which a rotation of time leads, in these axes.
+
+    Args:
+        matrix: seconds (N,) -> (N, 3, 3).
+        seconds: (N,).
+    """
+    turn = matrix(seconds + _RATE_STEP) @ np.swapaxes(matrix(seconds - _RATE_STEP), -1, -2)
+    # of a rotation by a small angle, whose sine and angle differ by 1e-12 of it
+    lower = np.stack(
+        [turn[..., 1, 2] - turn[..., 2, 1], turn[..., 2, 0] - turn[..., 0, 2], turn[..., 0, 1] - turn[..., 1, 0]],
+        axis=-1,
+    )
+    sine = 0.5 * np.linalg.norm(lower, axis=-1, keepdims=True)
+    return np.asarray(0.5 * lower * (np.arcsin(sine) / np.maximum(sine, 1e-300)) / (2.0 * _RATE_STEP))
+
+
+def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) -> EarthOrientation:
+    """A table of a week that holds the same everywhere.
+
+    Args:
+        epoch: UTC, ISO 8601 text.
+        ut1_utc: UT1 - UTC at the epoch, seconds; UT1 runs on evenly from there, also over a leap second.
+        pole: x and y of the pole, radians.
+    """
+    day, _ = calendar_reading(epoch)
+    mjd = day + np.arange(-3.0, 5.0)
+    ones = np.ones((len(mjd), 1))
+    return EarthOrientation(
+        "", mjd, ones[:, 0] * (ut1_utc - tai_minus_utc(day)), ones * np.array(pole), 0.0 * mjd[:, None] * np.ones(2)
+    )
+
+
+def read_earth_orientation(path: str | Path) -> EarthOrientation:
+    """A table of Earth orientation.
+
+    Args:
+        path: of a file finals2000A (all, data or daily), C04 (14 or 20), or CSV with columns mjd, ut1_utc [s], x_pole
+            [arcsec], y_pole [arcsec] and perhaps dx [mas] and dy [mas].
+
+    Raises:
+        InputError: it cannot be read, or holds fewer than four days.
+    """
+    file, start = str(path), list(first_lines(path, WHAT, 400))
+    if any("mjd" in line.lower() and not line.startswith("#") and "," in line for line in start):
+        table = read_table(path, _COLUMNS, 4)
+        zero = np.zeros(len(table))
+        offsets = np.stack([table[n] if n in table else zero for n in ("dx", "dy")], axis=-1)
+        lines = [int(v) for v in table.lines]
+        return _checked(file, lines, table["mjd"], table["ut1_utc"], table.stacked("x_pole", "y_pole"), offsets)
+    rows = [(k + 1, line) for k, line in enumerate(text_lines(path, WHAT)) if line.strip() and not line.startswith("#")]
+    data = [(k, line) for k, line in rows if line.split()[0].isdigit() and len(line.split()[0]) == 4]
+    return _c04(file, data) if data and len(data[0][1].split()) in (16, 21) else _finals(file, rows)
+
+
+def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
+    cells = [line.split() for _, line in rows]
+    lines = [k for k, _ in rows]
+    place = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
+    short = next((k for k, row in enumerate(cells) if len(row) != len(cells[0])), None)
+    if short is not None:
+        found = f"{len(cells[short])} columns"
+        raise InputError(Issue("a row of another length", file, lines[short], (), found, f"{len(cells[0])} columns"))
+    heads = ("MJD", "x", "y", "UT1-UTC", "dX", "dY")
+    table = numbers(file, [[row[k] for k in place] for row in cells], lines, heads)
+    late = table[:, 0] >= FIRST_DAY
+    lines = [k for k, one in zip(lines, late, strict=True) if one]
+    table = table[late]
+    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _ARCSEC)
+
+
+_FINAL = {"x": (134, 144), "y": (144, 154), "UT1-UTC": (154, 165), "dX": (165, 175), "dY": (175, 185)}
+"""Of Bulletin B, which is final; later days have Bulletin A alone."""
+_FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
+
+
+def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
+    """Bulletin B of finals2000A where it is given, else A; days without prediction of what is needed are left out."""
+    cells, lines = [], []
+    for k, line in rows:
+        cut = [line[a:b].strip() for a, b in _FINALS.values()]
+        if len(line) < 68 and len(line) > 15 and line[15:].strip():
+            raise InputError(Issue("a line that ends early", file, k, (), f"{len(line)} characters", WHAT))
+        if len(line) < 15:
+            raise InputError(Issue("not a line of this table", file, k, (), repr(line[:40]), WHAT))
+        final = [line[a:b].strip() for a, b in _FINAL.values()]
+        cut[1:] = final if all(final) else cut[1:]
+        if all(cut[1:4]):
+            cells.append([text or "0" for text in cut])
+            lines.append(k)
+    table = numbers(file, cells, lines, tuple(_FINALS))
+    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _MAS)
+
+
+def _checked(
+    file: str, lines: list[int], mjd: np.ndarray, ut1_utc: np.ndarray, pole: np.ndarray, offsets: np.ndarray
+) -> EarthOrientation:
+    if len(mjd) < 4:
+        raise InputError(Issue("too few days", file, None, (), f"{len(mjd)} days", "four days or more"))
+    for row in (*np.flatnonzero(np.diff(mjd) <= 0.0)[:1] + 1, *np.flatnonzero(np.diff(mjd) > 10.0)[:1] + 1):
+        problem = "days that do not rise, or a gap of more than ten"
+        raise InputError(Issue(problem, file, lines[row], (), f"MJD {mjd[row]:g}", "days in order"))
+    far = (np.abs(ut1_utc) > 1.0) | np.any(np.abs(pole) > 1e-5, axis=1) | (mjd < FIRST_DAY) | (mjd > LAST_DAY)
+    if np.any(far):
+        row = int(np.argmax(far))
+        found = f"MJD {mjd[row]:g}, UT1 - UTC {ut1_utc[row]:g} s"
+        raise InputError(Issue("not Earth orientation", file, lines[row], (), found, "UT1 - UTC within 1 s, a pole "
+                               "within 2 arcsec, days of 1972 to 2099"))  # fmt: skip
+    ahead = np.array([tai_minus_utc(int(np.floor(day))) for day in mjd])
+    return EarthOrientation(file, mjd, ut1_utc - ahead, pole, offsets)
+
+
+def _about_z(angle: np.ndarray) -> np.ndarray:
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    rows = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1.0], axis=-1)
+    return np.asarray(rows.reshape(*np.shape(angle), 3, 3))

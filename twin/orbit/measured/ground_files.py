@@ -1,0 +1,282 @@
+"""Ground points from files: CSV, GeoJSON (RFC 7946), and .gcp of the Ames Stereo Pipeline."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scenes.yaml.csv_table import Column, read_table, table_text
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, shown
+from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
+from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.measured.datum import Datum, Geoid
+from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
+from twin.orbit.measured.text_file import numbers, text_lines
+
+if TYPE_CHECKING:
+    from scenes.specs.measured.pass_files import GroundFileSpec
+
+_SIGMAS = ("sigma_east", "sigma_north", "sigma_up")
+_PLACES = (("longitude", "latitude", "height"), ("east", "north", "height"), ("x", "y", "z"))
+_COLUMNS = (
+    Column("point", text=True),
+    *(Column(name, ANGLE, needed=False) for name in ("longitude", "latitude")),
+    *(Column(name, DISTANCE, needed=False) for name in ("east", "north", "height", "x", "y", "z")),
+    *(Column(name, LENGTH, needed=False, least=0.0, most=1e4) for name in (*_SIGMAS, "sigma")),
+    Column("role", text=True, needed=False),
+)
+_GEOGRAPHIC = "EPSG:4979"
+
+
+@dataclass(frozen=True, eq=False)
+class GroundFile:
+    """What a file of ground points holds.
+
+    Attributes:
+        points: in the ITRS.
+        accuracy: of the way there, as the systems' authority states it, metres; None where it is not stated.
+        images: image file -> (n, 5) row of `points`, line, pixel and their sigmas, where the file has some.
+    """
+
+    points: GroundPoints
+    accuracy: float | None
+    images: Mapping[str, np.ndarray]
+
+
+@dataclass(eq=False)
+class _Rows:
+    """Of a file: names, places in its own system, sigmas (NaN where there are none), roles, lines."""
+
+    ids: list[str]
+    places: np.ndarray
+    sigmas: np.ndarray
+    roles: list[str]
+    lines: Sequence[int | None]
+
+
+def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
+    """The points of a file.
+
+    Args:
+        spec: the file, and what it does not say itself.
+        folder: that relative paths start from.
+
+    Raises:
+        InputError: it cannot be read; with file and line, or the feature of a GeoJSON file.
+    """
+    path = folder / spec.file
+    images: dict[str, np.ndarray] = {}
+    match path.suffix.lower():
+        case ".geojson" | ".json":
+            rows, system = _geojson(path, spec), spec.crs or _GEOGRAPHIC
+        case ".gcp":
+            rows, images = _gcp(path)
+            system = _required(spec)
+        case _:
+            rows, system = _csv(path, spec), _required(spec)
+    file = str(path)
+    try:
+        geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
+        datum = Datum.of(system, spec.heights, geoid)
+    except Problem as problem:
+        raise spec.error(problem.problem, ("crs",), found=problem.found, allowed=problem.allowed) from None
+    try:
+        itrs = datum.itrs(*rows.places.T)
+    except Problem as problem:
+        line = rows.lines[int(problem.within[0])] if problem.within else None
+        raise InputError(Issue(problem.problem, file, line, (), problem.found, problem.allowed)) from None
+    height = Earth().geodetic(itrs)[2]
+    high = ~((height > -1000.0) & (height < 10000.0))
+    if np.any(high):
+        row = int(np.argmax(high))
+        found = f"{height[row]:.6g} m above the ellipsoid"
+        raise InputError(
+            Issue("no place on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
+        )
+    covariance = _covariance(spec, file, rows, itrs, path.suffix.lower() == ".gcp" and spec.sigma_axes == "xyz")
+    try:
+        points = GroundPoints.of(np.array(rows.ids, object), itrs, covariance, np.array(rows.roles, object))
+    except ValueError as error:
+        raise InputError(Issue(str(error), file)) from None
+    return GroundFile(points, datum.accuracy, images)
+
+
+def _required(spec: GroundFileSpec) -> str:
+    if spec.crs is None:
+        raise spec.error("the system of the coordinates is not said", ("crs",), allowed="EPSG:4979, EPSG:32650, ...")
+    return spec.crs
+
+
+def _covariance(spec: GroundFileSpec, file: str, rows: _Rows, itrs: np.ndarray, earth_fixed: bool) -> np.ndarray:
+    """(n, 3, 3) in axes of the ITRS, m^2."""
+    sigma = rows.sigmas.copy()
+    missing = np.isnan(sigma).any(axis=1)
+    if np.any(missing):
+        if spec.sigma is None:
+            row = int(np.argmax(missing))
+            problem, allowed = "a point without sigmas", f"{names_text(_SIGMAS)} in the file, or `sigma:` for all"
+            raise InputError(Issue(problem, file, rows.lines[row], (), shown(rows.ids[row]), allowed))
+        sigma[missing] = (spec.sigma[0], spec.sigma[0], spec.sigma[1])
+    square = sigma[:, None, :] ** 2
+    lon, lat, _ = Earth().geodetic(itrs)
+    axes = np.swapaxes(east_north_up(lon, lat), 1, 2)
+    if earth_fixed:
+        axes = np.where(missing[:, None, None], axes, np.eye(3))
+    return np.asarray((axes * square) @ np.swapaxes(axes, 1, 2))
+
+
+def _unique(file: str, ids: Sequence[str], lines: Sequence[int | None]) -> None:
+    seen: set[str] = set()
+    for name, line in zip(ids, lines, strict=True):
+        if name in seen:
+            raise InputError(Issue("a point that is there twice", file, line, (), shown(name), "each point once"))
+        seen.add(name)
+
+
+def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = ("role",)) -> str:
+    if role not in ROLES[:2]:
+        raise InputError(Issue("no such role", file, line, key, shown(role), names_text(ROLES[:2])))
+    return role
+
+
+def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
+    table, file = read_table(path, _COLUMNS), str(path)
+    sets = [names for names in _PLACES if all(name in table for name in names)]
+    others = [n for names in _PLACES for n in names if n in table and not (sets and n in sets[0])]
+    if len(sets) != 1 or others:
+        allowed = "; or ".join(names_text(names) for names in _PLACES)
+        raise InputError(
+            Issue("not one complete set of coordinates", file, None, (), names_text(table.columns), allowed)
+        )
+    places = table.stacked(*sets[0])
+    if sets[0] == _PLACES[0]:
+        places[:, :2] = np.degrees(places[:, :2])
+    _fits(spec, sets[0])
+    lines = [int(v) for v in table.lines]
+    have = [name for name in _SIGMAS if name in table]
+    if have and len(have) < 3:
+        raise InputError(Issue("sigmas are not complete", file, None, (), names_text(have), names_text(_SIGMAS)))
+    if have and "sigma" in table:
+        raise InputError(Issue("sigmas are given in two ways", file, None, (), names_text([*have, "sigma"])))
+    sigmas = table.stacked(*_SIGMAS) if have else np.full((len(table), 3), np.nan)
+    if "sigma" in table:
+        sigmas = np.repeat(table["sigma"][:, None], 3, axis=1)
+    ids = [str(v) for v in table["point"]]
+    _unique(file, ids, lines)
+    roles = [_role(file, str(r), k) for r, k in zip(table["role"], lines, strict=True)] if "role" in table else []
+    return _Rows(ids, places, sigmas, roles or ["control"] * len(ids), lines)
+
+
+def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
+    """InputError unless columns of these names can be coordinates of the system."""
+    import pyproj
+
+    try:
+        crs = pyproj.CRS(_required(spec))
+    except pyproj.exceptions.CRSError:
+        return  # told by whoever needs it
+    right = _PLACES[0] if crs.is_geographic else _PLACES[2] if crs.is_geocentric else _PLACES[1]
+    if names != right:
+        raise spec.error(
+            f"columns {names_text(names)} are not coordinates of {crs.name}", ("crs",), allowed=names_text(right)
+        )
+
+
+def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
+    file, text = str(path), table_text(path, "a GeoJSON file")
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(Issue(f"not JSON: {error.msg}", file, error.lineno)) from None
+    except RecursionError:
+        raise InputError(Issue("not GeoJSON: nested too deeply", file)) from None
+    except ValueError as error:
+        raise InputError(Issue(f"not JSON: {error}", file)) from None
+    features = data.get("features") if isinstance(data, dict) else None
+    if not isinstance(features, list) or not features:
+        raise InputError(Issue("no features", file, None, ("features",), None, "a FeatureCollection of Points"))
+    if "crs" in data and spec.crs is None:
+        problem = "a member `crs`, which GeoJSON no longer has"
+        raise InputError(Issue(problem, file, None, ("crs",), shown(data["crs"]), "`crs:` in the test's file"))
+    ids, places, sigmas, roles = [], [], [], []
+    for k, one in enumerate(features):
+        key: tuple[str | int, ...] = ("features", k)
+        if not isinstance(one, dict):
+            raise InputError(Issue("not a feature", file, None, key, shown(one), "a Feature of a Point"))
+        geometry, properties = one.get("geometry"), one.get("properties") or {}
+        kind = geometry.get("type") if isinstance(geometry, dict) else None
+        if not isinstance(geometry, dict) or kind != "Point" or not isinstance(properties, dict):
+            raise InputError(Issue("not a point", file, None, (*key, "geometry"), shown(kind), "a Point"))
+        place = geometry.get("coordinates")
+        if not isinstance(place, list) or len(place) != 3 or not all(map(_finite, place)):
+            at = (*key, "geometry", "coordinates")
+            raise InputError(Issue("not a place", file, None, at, shown(place), "[longitude, latitude, height]"))
+        name = one.get("id", properties.get("point", properties.get("id", properties.get("name"))))
+        if not isinstance(name, str | int) or isinstance(name, bool) or not str(name).strip():
+            raise InputError(Issue("a point without a name", file, None, (*key, "id"), shown(name), "an `id`"))
+        spread = [properties.get(n) for n in _SIGMAS]
+        if any(v is not None for v in spread) and not all(_finite(v) and 0.0 <= float(v) <= 1e4 for v in spread):  # type: ignore[arg-type]
+            at = (*key, "properties")
+            raise InputError(Issue("not sigmas", file, None, at, shown(spread), f"{names_text(_SIGMAS)}, metres"))
+        ids.append(str(name))
+        places.append([float(v) for v in place])
+        sigmas.append([math.nan if v is None else float(v) for v in spread])
+        role = properties.get("role", "control")
+        roles.append(_role(file, role if isinstance(role, str) else shown(role), None, (*key, "properties", "role")))
+    lines: list[int | None] = [None] * len(ids)
+    _unique(file, ids, lines)
+    return _Rows(ids, np.array(places), np.array(sigmas), roles, lines)
+
+
+def _finite(value: Any) -> bool:
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+_GCP = ("latitude", "longitude", "height", "sigma x", "sigma y", "sigma z")
+
+
+def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray]]:
+    """Points of a .gcp file, and where its images have them."""
+    file = str(path)
+    rows, lines = [], []
+    for k, line in enumerate(text_lines(path, "a .gcp file")):
+        cells = line.replace(",", " ").split()
+        if not cells or line.lstrip().startswith("#"):
+            if "WKT:" in line:
+                problem = "a header with a projection"
+                raise InputError(Issue(problem, file, k + 1, (), None, "latitude and longitude, and no WKT"))
+            continue
+        if len(cells) < 7 or (len(cells) - 7) % 5:
+            allowed = "id, latitude, longitude, height, three sigmas, and for each image name, column, row, two sigmas"
+            raise InputError(Issue("not a ground control point", file, k + 1, (), f"{len(cells)} fields", allowed))
+        rows.append(cells)
+        lines.append(k + 1)
+    if not rows:
+        raise InputError(Issue("no points", file, None, (), None, "one a line"))
+    found = numbers(file, [row[1:7] for row in rows], lines, _GCP)
+    bad = (found[:, 3:] <= 0.0) | (found[:, 3:] > 1e4)
+    if np.any(bad):
+        row, column = (int(v) for v in np.argwhere(bad)[0])
+        value = shown(rows[row][4 + column])
+        raise InputError(Issue("not a sigma", file, lines[row], (_GCP[3 + column],), value, "0 m to 10 km"))
+    ids = [row[0] for row in rows]
+    _unique(file, ids, lines)
+    images: dict[str, list[np.ndarray]] = {}
+    for k, cells in enumerate(rows):
+        for start in range(7, len(cells), 5):
+            heads = ("column", "row", "sigma column", "sigma row")
+            column, line, sigma_column, sigma_row = numbers(file, [cells[start + 1 : start + 5]], [lines[k]], heads)[0]
+            if not (sigma_column > 0.0 and sigma_row > 0.0):
+                raise InputError(Issue("not a sigma", file, lines[k], ("image",), shown(cells[start]), "above zero"))
+            images.setdefault(cells[start], []).append(np.array([k, line, column, sigma_row, sigma_column]))
+    measured = {name: np.array(values) for name, values in images.items()}
+    return _Rows(ids, found[:, [1, 0, 2]], found[:, 3:], ["control"] * len(ids), lines), measured

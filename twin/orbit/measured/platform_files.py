@@ -1,0 +1,321 @@
+"""Orbit and attitude from files of any format into a table of readings in the ITRS.
+
+Reading and understanding are two steps: `PlatformReadings` holds what the files say, `Conventions` what it means, and
+`platform_table` makes the table of both, so that the same readings can be understood another way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import erfa
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scenes.specs.measured.orbit_data import body_axes_matrix
+from scenes.yaml.csv_table import Column, Table, read_table
+from scenes.yaml.errors import InputError, Issue, Problem
+from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
+from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
+from twin.orbit.flight.trajectory import Attitude
+from twin.orbit.measured.ccsds import message_kind, read_aem, read_oem
+from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
+from twin.orbit.measured.earth_orientation import (
+    EarthOrientation,
+    TableRotation,
+    constant_orientation,
+    rate_of,
+    read_earth_orientation,
+)
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.sp3 import is_sp3, read_sp3
+from twin.orbit.measured.text_file import first_lines, require_rising
+
+if TYPE_CHECKING:
+    from scenes.specs.measured.pass_files import AttitudeFileSpec, OrbitFileSpec, PlatformFilesSpec
+
+_ORBIT = tuple(Column(name, DISTANCE) for name in "xyz") + tuple(Column(f"v{n}", SPEED, needed=False) for n in "xyz")
+_CLOCK = (Column("time", TIME, needed=False), Column("date_time", text=True, needed=False))
+_NAMED = ("qx", "qy", "qz", "qw")
+_PLACED = ("q1", "q2", "q3", "q4")
+_ANGLES = ("roll", "pitch", "yaw")
+_TURN = (
+    *(Column(name, needed=False) for name in (*_NAMED, *_PLACED)),
+    *(Column(name, ANGLE, needed=False) for name in _ANGLES),
+)
+_EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
+"""Frame bias (IERS Conventions 2010, section 5.5.4)."""
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """What the numbers of orbit and attitude files mean; names as in `scenes.specs.measured.pass_files`.
+
+    Attributes:
+        orbit_frame, attitude_frame: axes.
+        orbit_scale, attitude_scale: time scales.
+        orbit_offset, attitude_offset: seconds to be added to the times.
+        scalar: where a quaternion's scalar part stands.
+        turns: what a quaternion turns into what.
+        body_axes: of the attitude's body.
+        sequence: of angles.
+        law: of the orbital frame.
+    """
+
+    orbit_frame: str
+    orbit_scale: str
+    attitude_frame: str
+    attitude_scale: str
+    orbit_offset: float = 0.0
+    attitude_offset: float = 0.0
+    scalar: str = "last"
+    turns: str = "body_to_frame"
+    body_axes: tuple[str, str, str] = ("forward", "right", "down")
+    sequence: str = "xyz"
+    law: Attitude = field(default_factory=Attitude)
+
+
+@dataclass(frozen=True, eq=False)
+class PlatformReadings:
+    """Orbit and attitude as their files hold them.
+
+    Attributes:
+        orbit: of one file.
+        attitude: of another.
+        earth: table of Earth orientation; None where there is none.
+    """
+
+    orbit: OrbitReadings
+    attitude: AttitudeReadings
+    earth: EarthOrientation | None
+
+
+def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadings, Conventions]:
+    """What the files of a platform hold, and what it means.
+
+    Args:
+        spec: the files, and what they do not say themselves.
+        folder: that relative paths start from.
+
+    Raises:
+        InputError: a file that cannot be read, something that neither file nor spec says, or that they say differently.
+    """
+    orbit, attitude = _orbit(spec.orbit, folder), _attitude(spec.attitude, folder)
+    turned = attitude.quaternion is not None
+    spec_of = spec.attitude
+    frame = _stated(spec_of, "frame", spec_of.frame, attitude.frame, "the frame that the body is turned against")
+    if frame == "orbital" and (spec_of.nadir is None or spec_of.steering is None):
+        problem = "which orbital frame is not said"
+        raise spec_of.error(problem, (), allowed="nadir: geodetic or geocentric, and steering: none or yaw")
+    found = Conventions(
+        _stated(spec.orbit, "frame", spec.orbit.frame, orbit.frame, "the frame of the positions"),
+        _stated(spec.orbit, "time_scale", spec.orbit.time_scale, orbit.scale, "the time scale of the orbit"),
+        frame,
+        _stated(spec_of, "time_scale", spec_of.time_scale, attitude.scale, "the time scale of the attitude"),
+        spec.orbit.offset,
+        spec_of.offset,
+        _stated(spec_of, "scalar", spec_of.scalar, attitude.scalar, "where the scalar stands") if turned else "last",
+        _stated(spec_of, "turns", spec_of.turns, attitude.turns, "what is turned") if turned else "body_to_frame",
+        spec_of.body_axes,
+        "xyz" if turned else _stated(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
+        Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
+    )
+    return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, found)), found
+
+
+def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | None = None) -> PlatformTable:
+    """The readings understood in one way.
+
+    Args:
+        readings: of the files.
+        meant: what they mean.
+        epoch: from which times count, UTC, ISO 8601; None for the first second of the orbit.
+
+    Raises:
+        InputError: a leap second that is none, no Earth orientation for an inertial frame, attitude by an orbital frame
+            at a time without orbit.
+    """
+    orbit, attitude = readings.orbit, readings.attitude
+    fixes = _instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset)
+    looks = _instants(attitude.file, attitude.clock, meant.attitude_scale, meant.attitude_offset)
+    epoch = epoch or epoch_before(fixes)
+    time, turn_time = fixes.since(epoch), looks.since(epoch)
+    inertial = {meant.orbit_frame, meant.attitude_frame} - {"ITRS", "orbital"}
+    rotation = None
+    if inertial:
+        if readings.earth is None:
+            what = f"{' and '.join(sorted(inertial))} without Earth orientation"
+            allowed = "`earth_orientation:` with a table, or `earth:` with UT1 - UTC and the pole"
+            raise InputError(Issue(what, orbit.file, None, (), None, allowed))
+        first, last = min(time[0], turn_time[0]), max(time[-1], turn_time[-1])
+        rotation = readings.earth.rotation(epoch, float(first) - 2.0, float(last) + 2.0)
+    position, velocity = _in_itrs(orbit, meant.orbit_frame, time, rotation)
+    matrix = _body(attitude, meant)
+    if meant.attitude_frame == "orbital":
+        unit = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
+        flown = TabulatedTrajectory(PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), meant.law)
+        try:
+            matrix = flown.orbital_to_itrs(turn_time) @ matrix
+        except ValueError as error:
+            raise InputError(Issue(f"attitude against the orbit: {error}", attitude.file)) from None
+    elif rotation is not None and meant.attitude_frame != "ITRS":
+        matrix = to_itrs(meant.attitude_frame, rotation)(turn_time) @ matrix
+    quaternion = Rotation.from_matrix(matrix).as_quat(canonical=False)
+    try:
+        return PlatformTable.of(epoch, time, position, velocity, turn_time, quaternion)
+    except ValueError as error:
+        raise InputError(Issue(str(error), orbit.file)) from None
+
+
+def _in_itrs(
+    orbit: OrbitReadings, frame: str, time: np.ndarray, rotation: TableRotation | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    if frame == "ITRS" or rotation is None:
+        return orbit.position, orbit.velocity
+    turn = to_itrs(frame, rotation)
+    matrix = turn(time)
+    position = np.einsum("nij,nj->ni", matrix, orbit.position)
+    if orbit.velocity is None:
+        return position, None
+    carried = np.cross(rate_of(turn, time), position)
+    return position, np.einsum("nij,nj->ni", matrix, orbit.velocity) - carried
+
+
+def to_itrs(frame: str, rotation: TableRotation) -> Any:
+    """Seconds (N,) -> rotation (N, 3, 3) from an inertial frame to the ITRS, by the Earth's rotation."""
+    if frame == "TEME":
+        return rotation.mean_equinox
+    if frame == "EME2000":
+        return lambda seconds: rotation.matrix(seconds) @ _EME2000_FROM_GCRS.T
+    return rotation.matrix
+
+
+def _body(attitude: AttitudeReadings, meant: Conventions) -> np.ndarray:
+    """Rotation (M, 3, 3) from the body to the attitude's frame."""
+    if attitude.quaternion is not None:
+        q = attitude.quaternion if meant.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
+        matrix = np.asarray(Rotation.from_quat(q).as_matrix())
+        if meant.turns == "frame_to_body":
+            matrix = np.swapaxes(matrix, 1, 2)
+    else:
+        assert attitude.angles is not None
+        order = ["xyz".index(axis) for axis in meant.sequence]
+        matrix = np.asarray(Rotation.from_euler(meant.sequence.upper(), attitude.angles[:, order]).as_matrix())
+    return matrix @ np.array(body_axes_matrix(meant.body_axes), dtype=np.float64)
+
+
+def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants:
+    try:
+        return clock.instants(scale).later(offset)
+    except Problem as problem:
+        raise InputError(Issue(problem.problem, file, None, (), problem.found, problem.allowed)) from None
+
+
+def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str) -> str:
+    """What spec and file say together."""
+    if said is None and found is None:
+        raise spec.error(f"{what} is not said, neither by the file nor here", (key,), allowed=f"`{key}:` here")
+    if said is not None and found is not None and said != found:
+        raise spec.error(
+            f"{what} is said differently by the file", (key,), found=said, allowed=f"{found}, as the file says"
+        )
+    return str(said or found)
+
+
+def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: Conventions) -> EarthOrientation | None:
+    if spec.earth_orientation is not None:
+        return read_earth_orientation(folder / spec.earth_orientation)
+    if spec.earth is not None:
+        first = epoch_before(_instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset))
+        return constant_orientation(first, spec.earth.ut1_utc, spec.earth.polar_motion)
+    return None
+
+
+def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
+    path = folder / spec.file
+    head = list(first_lines(path, "an orbit: SP3-c or d, CCSDS OEM, or CSV"))
+    if head and is_sp3(head[0]):
+        return read_sp3(path, spec.satellite)
+    if (kind := message_kind(head)) is not None:
+        if kind != "OEM":
+            raise InputError(Issue("a CCSDS message of another kind", str(path), 1, (), kind, "OEM"))
+        return read_oem(path, spec.satellite)
+    table = read_table(path, (*_CLOCK, *_ORBIT), 2)
+    clock, scale = _clock(table, spec)
+    have = [name for name in ("vx", "vy", "vz") if name in table]
+    if len(have) in (1, 2):
+        raise InputError(
+            Issue("velocities are not complete", str(path), None, (), ", ".join(have), "vx, vy, vz or none")
+        )
+    position, lines = table.stacked("x", "y", "z"), [int(v) for v in table.lines]
+    require_orbit(str(path), position, lines)
+    velocity = table.stacked("vx", "vy", "vz") if have else None
+    return OrbitReadings(str(path), clock, position, velocity, None, scale)
+
+
+def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
+    path = folder / spec.file
+    head = list(first_lines(path, "an attitude: CCSDS AEM, or CSV"))
+    if (kind := message_kind(head)) is not None:
+        if kind != "AEM":
+            raise InputError(Issue("a CCSDS message of another kind", str(path), 1, (), kind, "AEM"))
+        return read_aem(path, spec.satellite)
+    table = read_table(path, (*_CLOCK, *_TURN), 2)
+    clock, scale = _clock(table, spec)
+    sets = [names for names in (_NAMED, _PLACED, _ANGLES) if any(n in table for n in names)]
+    if len(sets) != 1 or not all(name in table for name in sets[0]):
+        allowed = "qx, qy, qz, qw, or q1, q2, q3, q4, or roll [deg], pitch [deg], yaw [deg]"
+        found = ", ".join(table.columns)
+        raise InputError(Issue("not one complete set of columns", str(path), None, (), found, allowed))
+    values, lines = table.stacked(*sets[0]), [int(v) for v in table.lines]
+    if sets[0] == _ANGLES:
+        return AttitudeReadings(str(path), clock, None, values, None, scale)
+    require_unit(str(path), values, lines)
+    return AttitudeReadings(str(path), clock, values, None, None, scale, "last" if sets[0] == _NAMED else None)
+
+
+def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
+    """Readings of a table; with the scale UTC where each of them says so by a Z."""
+    if ("time" in table) == ("date_time" in table):
+        found = ", ".join(table.columns)
+        raise InputError(
+            Issue("times are not said once", table.file, None, (), found, "time [s] with `epoch:`, or date_time")
+        )
+    lines = [int(v) for v in table.lines]
+    if "date_time" in table:
+        if spec.epoch is not None:
+            raise spec.error("an epoch for times of the day", ("epoch",), allowed="no epoch, or a column time [s]")
+        texts = table["date_time"]
+        try:
+            clock = Readings.of_texts(texts.tolist())
+        except Problem as problem:
+            row = int(problem.within[0])
+            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
+        require_rising(table.file, clock, lines)
+        return clock, "UTC" if all(text.endswith("Z") for text in texts) else None
+    if spec.epoch is None:
+        raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
+    try:
+        clock, between = Readings.after(spec.epoch, table["time"]), 0.0
+        zoned = "UTC" if spec.epoch.endswith("Z") else None
+        if (spec.time_scale or zoned) == "UTC":
+            clock, between = _counted(spec, clock)
+    except Problem as problem:
+        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+    if between and spec.leap_seconds is None:
+        count = f"{between:g} leap seconds lie between the epoch and the times"
+        raise spec.error(count, ("leap_seconds",), allowed="counted or skipped")
+    require_rising(table.file, clock, lines)
+    return clock, zoned
+
+
+def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> tuple[Readings, float]:
+    """Readings of a clock that shows UTC, and leap seconds between its epoch and the first of them."""
+    days, where = np.unique(clock.day, return_inverse=True)
+    start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
+    since = np.array([tai_minus_utc(int(day)) for day in days]) - start
+    if spec.leap_seconds != "counted":
+        return clock, float(np.max(np.abs(since)))
+    return Readings(clock.day, clock.second - since[where]), float(np.max(np.abs(since)))
