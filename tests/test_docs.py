@@ -143,6 +143,7 @@ FRAMES = "docs/measured_frames.md"
 """Page whose tables list files of frames."""
 ORBIT_FILES = "docs/orbit_files.md"
 """Its blocks are read by tests/twin/test_orbit_file_examples.py."""
+NO_COURSES = (*MEASURED, FRAMES, ORBIT_FILES)
 
 
 def models_of(text: str) -> list[type[Any]]:

@@ -38,9 +38,9 @@ _WEIGHTS = {
 """Order -> weights of central differences by the number of steps (Fornberg, Math. Comp. 51, 699, 1988)."""
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
 """Order -> weights of f(k h) + f(-k h) - 2 f(0). Their sum is what that tends to with k, extrapolated by even powers:
-nothing of a smooth f. Of a jump J anywhere within the steps it is such a part of J that, over h, it bounds what J does to
-the central difference: J of the first step against 0.62 J, J/2 of the second against 0.13 J, J/10 of the third against
-0.02 J for order 6.
+nothing of a smooth f. Of a jump J anywhere within the steps it is such a part of J that, over h, it bounds what J does
+to the central difference: J of the first step against 0.62 J, J/2 of the second against 0.13 J, J/10 of the third
+against 0.02 J for order 6.
 """
 
 
