@@ -226,9 +226,7 @@ def _lattice(aperture: Aperture, step: float) -> np.ndarray:
     """Places in the aperture, (P, 2), metres. Their number along a side is odd to that of any even mesh."""
     x0, x1, y0, y1 = aperture.bounds
     counts = [int(np.clip(np.ceil(side / step), 40, _FINEST)) for side in (x1 - x0, y1 - y0)]
-    x, y = (
-        a + (b - a) * (np.arange(n) + 0.5) / n for (a, b), n in zip(((x0, x1), (y0, y1)), counts, strict=True)
-    )
+    x, y = (a + (b - a) * (np.arange(n) + 0.5) / n for (a, b), n in zip(((x0, x1), (y0, y1)), counts, strict=True))
     every = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return np.asarray(every[aperture.contains(every[:, 0], every[:, 1])])
 

@@ -21,6 +21,7 @@ from scenes.specs.course import (
     TemperatureGradient,
     Term,
 )
+from scenes.specs.deformation import Deformation, checked_deformation
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
@@ -113,6 +114,26 @@ class PerturbationSpec(Spec):
             "temperature": self.temperature != TemperatureSpec(),
         }
         return tuple(name for name, does in done.items() if does)
+
+
+class BodyPerturbationSpec(PerturbationSpec):
+    """What happens to one body in a job: a perturbation, and for a mirror or a prism's face the displaced nodes of a
+    finite-element program. The other motions come on top of these.
+
+    Attributes:
+        deformation: the table of nodes, or a mesh; None for none.
+    """
+
+    deformation: Deformation | None = None
+
+    @classmethod
+    def of(cls, perturb: Mapping[str, PerturbationSpec]) -> "FrozenMap[str, BodyPerturbationSpec]":
+        """Perturbations of another file's as a job has them."""
+        return FrozenMap({path: cls.model_construct(**dict(what)) for path, what in perturb.items()})
+
+    def uses(self) -> tuple[str, ...]:
+        """Which of the actions do something, deformation the last."""
+        return (*super().uses(), *(("deformation",) if self.deformation is not None else ()))
 
 
 def _some(images: tuple[str, ...]) -> tuple[str, ...]:
@@ -218,7 +239,7 @@ class JobSpec(Spec):
     """
 
     instrument: Reference
-    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    perturb: Paths[BodyPerturbationSpec] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
@@ -252,6 +273,22 @@ class JobSpec(Spec):
             for path, added in self.course.fields(time).items():
                 out[path] = out.get(path, Temperature()) + added
         return out
+
+
+def with_deformations(job: JobSpec) -> JobSpec:
+    """The job with the full paths and checksums of the tables that deform its bodies.
+
+    Raises:
+        InputError: a table that cannot be read or is not the one of the checksum.
+    """
+    changed = {
+        path: what.model_copy(
+            update={"deformation": checked_deformation(job, ("perturb", path, "deformation"), what.deformation)}
+        )
+        for path, what in job.perturb.items()
+        if what.deformation is not None
+    }
+    return job.model_copy(update={"perturb": FrozenMap({**job.perturb, **changed})}) if changed else job
 
 
 @dataclass(frozen=True)
@@ -322,7 +359,8 @@ def perturbation_issues(
         return [_no_such_node(owner, nodes, path, key)]
     info, issues = nodes[path], []
     for action in what.uses():
-        if action not in info.allows:
+        # nodes are displaced where a surface has a figure
+        if ("figure" if action == "deformation" else action) not in info.allows:
             issues.append(_not_allowed(owner, info, action, (*key, action)))
     if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
         known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))

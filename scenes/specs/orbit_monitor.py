@@ -14,6 +14,7 @@ from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.job import (
     AnalysisSpec,
+    BodyPerturbationSpec,
     JobSpec,
     NodeInfo,
     PerturbationSpec,
@@ -265,7 +266,7 @@ class OrbitMonitorSpec(Spec):
         )
         job = JobSpec.model_construct(
             instrument=self.instrument,
-            perturb=self.perturb,
+            perturb=BodyPerturbationSpec.of(self.perturb),
             course=self.course,
             disturbances=self.disturbances,
             render=frames,

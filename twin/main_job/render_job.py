@@ -19,6 +19,7 @@ from scenes.specs.channel import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
+from twin.main_job.deformation_results import deformation_warnings
 from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
@@ -166,6 +167,7 @@ def render_job(
             *blur_warnings(resolved, backend),
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
+            *deformation_warnings(experiment.deformed(resolved.job)),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),

@@ -124,6 +124,8 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
             out.append(path)
         covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
         missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]
+        if path in given and given[path].deformation is not None:
+            missing = ["by a table of nodes"]
         if missing:
             out.append(f"{path} (figure {', '.join(missing)})")
     return tuple(out)

@@ -4,7 +4,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -19,15 +19,18 @@ from analysis.monitor.monitoring import MonitorGeometry
 from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.pose import triple
-from optics.geometry.tree import Motion, State
+from optics.geometry.tree import Motion, State, compose
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
+from optics.thermal.nodal_deformation import NodalDeformation
+from scenes.models.deformed_faces import deformed_face
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.channel import SIDES
 from scenes.specs.course import noll
+from scenes.specs.deformation import DeformationSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
@@ -58,6 +61,7 @@ class MonitorExperiment:
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
         self.path = MonitorPath(self.instrument, backend)
+        self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
         """The same instrument, with all that has been worked out of it, under another job's stated disturbances.
@@ -97,9 +101,37 @@ class MonitorExperiment:
         fields = job.fields()
         try:
             self.thermal.check(fields)
-            return self.thermal.state(fields, motions_of(job), progress)
+            return self.thermal.state(fields, self.motions(job), progress)
         except TemperatureError as error:
             raise job.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
+
+    def motions(self, job: JobSpec, time: int | None = None) -> State:
+        """The state that a job describes without its heat: ``motions_of`` on top of its bodies' deformations.
+
+        Raises:
+            InputError: a table of nodes that does not describe its body.
+        """
+        deformed = {path: face.motion() for path, face in self.deformed(job).items()}
+        moved = motions_of(job, time)
+        if not deformed:
+            return moved
+        bodies = {body.path: body for body in self.instrument.assembly.tree.bodies}
+        return compose(deformed, moved, bodies)
+
+    def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
+        """Body -> what the table of nodes is that deforms it; kept, since many states may have the same.
+
+        Raises:
+            InputError: a table that does not describe its body.
+        """
+        out = {}
+        for path, what in job.perturb.items():
+            if what.deformation is not None:
+                if (path, what.deformation) not in self._deformed:
+                    face = deformed_face(self.instrument, job, path, what.deformation)
+                    self._deformed[path, what.deformation] = face
+                out[path] = self._deformed[path, what.deformation]
+        return out
 
     @property
     def nominal_photons(self) -> np.ndarray:
