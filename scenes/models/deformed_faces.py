@@ -7,9 +7,9 @@ from optics.geometry.surface import Surface
 from optics.raytrace.assembly import Interaction
 from optics.thermal.nodal_deformation import NodalDeformation, NodesError, nodal_deformation
 from scenes.models.instrument_model import Instrument
-from scenes.specs.deformation import DeformationSpec, read_nodes
-from scenes.specs.job import JobSpec
+from scenes.specs.job import DeformationSpec, JobSpec
 from scenes.yaml.errors import names_text, nearest
+from scenes.yaml.node_table import read_nodes
 
 
 def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: DeformationSpec) -> NodalDeformation:
@@ -19,14 +19,14 @@ def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: Deforma
         instrument: the instrument.
         job: that names the table, for what is wrong.
         path: of the body, which has a reflecting or refracting surface.
-        spec: the table, as ``scenes.specs.deformation.checked_deformation`` has left it.
+        spec: the table, as ``scenes.specs.job.with_deformations`` has left it.
 
     Raises:
         InputError: no such frame; nodes that are not on the surface or do not cover it.
     """
     key = ("perturb", path, "deformation")
     surface, aperture = _face(instrument, path)
-    nodes = read_nodes(spec.table, spec)
+    nodes = read_nodes(spec.table, spec.unit, spec.field, spec.sha256)
     points, moves = nodes.points, nodes.moves
     if spec.frame is not None:
         known = instrument.assembly.tree.paths

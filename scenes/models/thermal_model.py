@@ -248,8 +248,8 @@ class ThermalModel:
         return self._face_changes(path, self.mirror_displacements(path), {path: (aperture, Pose())})
 
     def mirror_displacements(self, path: str) -> Sequence[Displacement]:
-        """Displacements of a mirror's material, in its frame, by a gradient of 1 K/m along x, y and z of it that is zero
-        at its middle.
+        """Displacements of a mirror's material, in its frame, by a gradient of 1 K/m along x, y and z of it, the
+        temperature being zero at its middle.
 
         Args:
             path: of the mirror.

@@ -8,7 +8,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
-from scenes.specs.job import FigureTerm, PerturbationSpec
+from scenes.specs.job import FigureTerm, PlainPerturbationSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector3
 from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, Whole
@@ -45,7 +45,7 @@ class CameraUnderTestSpec(Spec):
     """
 
     camera: Reference
-    as_built: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    as_built: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
     def _cold(self) -> "CameraUnderTestSpec":

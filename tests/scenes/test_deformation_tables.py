@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from scenes.models.deformed_faces import deformed_face
-from scenes.specs.deformation import DeformationSpec, read_nodes
-from scenes.specs.job import BodyPerturbationSpec, JobSpec, check_nodes
+from scenes.specs.job import DeformationSpec, JobSpec, PerturbationSpec, check_nodes
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
+from scenes.yaml.node_table import read_nodes
 
 BODY = "base/forward/M1"
 JOB = "instrument: gf7_pair\nperturb:\n  base/forward/M1: {deformation: %s}\n"
@@ -97,13 +97,13 @@ def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -
     cells = [("triangle", np.array([[0, 1, 24], [1, 25, 24]]))]
     mesh = meshio.Mesh(1e3 * nodes[:, :3], cells, point_data={"U": 1e3 * nodes[:, 3:]})
     mesh.write(place, **({"file_format": "gmsh"} if ending == "msh" else {}))
-    read = read_nodes(place, spec(place, unit="mm"))
+    read = read_nodes(place, unit="mm")
     np.testing.assert_allclose(read.points, nodes[:, :3], rtol=1e-15)
     np.testing.assert_allclose(read.moves, nodes[:, 3:], rtol=1e-15)
     with pytest.raises(InputError, match="does not say its unit"):
         load_job(job(tmp_path, place.name))
     with pytest.raises(InputError, match="no such vectors"):
-        read_nodes(place, spec(place, unit="mm", field="displacement"))
+        read_nodes(place, unit="mm", field="displacement")
 
 
 def test_a_mesh_without_displacements_or_with_several(tmp_path, nodes) -> None:
@@ -111,7 +111,7 @@ def test_a_mesh_without_displacements_or_with_several(tmp_path, nodes) -> None:
     for data, problem in (({}, "no vectors"), ({"U": nodes[:, 3:], "v": nodes[:, 3:]}, "several vectors")):
         meshio.Mesh(nodes[:, :3], [("vertex", np.arange(5)[:, None])], point_data=data).write(place)
         with pytest.raises(InputError, match=problem):
-            read_nodes(place, spec(place, unit="m"))
+            read_nodes(place, unit="m")
     for name in ("m1.bdf", "m1.inp", "m1.cdb"):
         (tmp_path / name).write_text("$ a deck\n")
         with pytest.raises(InputError, match="no displacements that can be read"):
@@ -187,7 +187,7 @@ def test_mutated_files_are_read_or_refused(tmp_path, nodes, gf7_pair, kind: str)
                     data = data[: at + 1]
         place.write_bytes(bytes(data))
         try:
-            read_nodes(place, spec(place, unit=None if kind == "csv" else "m"))
+            read_nodes(place, unit=None if kind == "csv" else "m")
         except InputError as error:
             files.append(error.issues[0].file)
     assert len(files) > 15
@@ -214,7 +214,7 @@ def test_files_that_are_not_there_or_not_tables(tmp_path, nodes) -> None:
 
 def test_only_what_has_a_figure_is_deformed(tmp_path, nodes, gf7_pair) -> None:
     place = table(tmp_path / "m1.csv", nodes)
-    what = BodyPerturbationSpec(deformation=DeformationSpec(table=str(place)))
+    what = PerturbationSpec(deformation=DeformationSpec(table=str(place)))
     for path in ("base/forward", "base/forward/focal_plane"):
         with pytest.raises(InputError, match="does not allow deformation"):
             check_nodes(JobSpec(instrument="gf7_pair", perturb={path: what.plain()}), gf7_pair.nodes)

@@ -30,8 +30,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.channel import SIDES
 from scenes.specs.course import noll
-from scenes.specs.deformation import DeformationSpec
-from scenes.specs.job import JobSpec
+from scenes.specs.job import DeformationSpec, JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus

@@ -23,7 +23,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
-from scenes.specs.job import BodyPerturbationSpec, JobSpec, perturbation_issues
+from scenes.specs.job import JobSpec, PerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import motions_of
 from twin.monitor.truth import trace_truth
@@ -118,7 +118,7 @@ def changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
     ]
     if issues:
         raise InputError(*issues)
-    job = JobSpec.model_construct(instrument=spec.camera, perturb=BodyPerturbationSpec.of(spec.changes))
+    job = JobSpec.model_construct(instrument=spec.camera, perturb=PerturbationSpec.of(spec.changes))
     thermal = ThermalModel(instrument)
     try:
         thermal.check(job.fields())

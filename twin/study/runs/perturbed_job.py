@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.job import BodyPerturbationSpec, JobSpec, PerturbationSpec, TemperatureSpec
+from scenes.specs.job import JobSpec, PerturbationSpec, TemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector
@@ -101,7 +101,7 @@ def _of_mapping(model: type[Spec], key: KeyPath) -> Quantity | None:
     return next((item for item in metadata if isinstance(item, Quantity)), None)
 
 
-def _numbers(what: BodyPerturbationSpec) -> dict[str, Any]:
+def _numbers(what: PerturbationSpec) -> dict[str, Any]:
     """A perturbation as nested dictionaries and lists of SI numbers, and its deformation as it is."""
     heat = what.temperature
     return {
@@ -132,10 +132,10 @@ def _put(parts: Any, key: KeyPath, value: float) -> None:
     parts[key[-1]] = value
 
 
-def _spec(parts: Mapping[str, Any]) -> BodyPerturbationSpec:
+def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
     # every number has been read by its own validator, and no validator of the class looks at several at once
     heat = parts["temperature"]
-    return BodyPerturbationSpec.model_construct(
+    return PerturbationSpec.model_construct(
         rotate=tuple(parts["rotate"]),
         shift=tuple(parts["shift"]),
         pivot=parts["pivot"],

@@ -1,4 +1,4 @@
-"""Deformations of mirrors and faces from finite-element programs: a table or a mesh with displaced nodes."""
+"""Displaced nodes of finite-element programs from CSV files, and from meshes by meshio."""
 
 import contextlib
 import hashlib
@@ -6,17 +6,13 @@ import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, StringConstraints
 
-from optics.geometry import zernike
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.nodal_deformation import LEAST_NODES, TERMS
+from optics.thermal.nodal_deformation import LEAST_NODES
 from scenes.yaml.csv_table import LARGEST_TABLE, Column, read_table
-from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
-from scenes.yaml.spec import Reference, Spec, Text, Whole
+from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.units import LENGTH, unit_ratio
 from scenes.yaml.yaml_file import is_file
 
@@ -32,36 +28,6 @@ INPUT_DECKS = (".inp", ".bdf", ".nas", ".fem", ".dat", ".cdb", ".ans", ".rst", "
 DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'dx [mm]', 'dy [mm]', 'dz [mm]', or a .vtu file"
 
 
-class DeformationSpec(Spec):
-    """Displaced nodes of a finite-element program, on a mirror's optical surface or a face.
-
-    Attributes:
-        table: CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med)
-            that has displacements at its nodes; relative to this file.
-        frame: path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
-        terms: highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
-        unit: of a mesh, whose file has none.
-        field: name of the displacements in a mesh; needed when it has several vectors at its nodes.
-        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
-    """
-
-    table: Reference
-    frame: Reference | None = None
-    terms: Annotated[Whole, Field(ge=3, le=zernike.MAX_NOLL)] = TERMS
-    unit: Literal["m", "mm", "um"] | None = None
-    field: Text | None = None
-    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
-
-
-def _named(value: Any) -> Any:
-    """`deformation: m1.csv` names the table alone."""
-    return {"table": value} if isinstance(value, str) else value
-
-
-Deformation = Annotated[DeformationSpec, BeforeValidator(_named)]
-"""With its keys, or the table's name alone."""
-
-
 @dataclass(frozen=True, eq=False)
 class DisplacedNodes:
     """Nodes and their displacements, metres, (N, 3) each, in the frame that the specification names."""
@@ -70,52 +36,25 @@ class DisplacedNodes:
     moves: np.ndarray
 
 
-def checked_deformation(owner: Spec, key: KeyPath, spec: DeformationSpec) -> DeformationSpec:
-    """The same with the table's full path and checksum, when it can be read.
+def read_nodes(
+    path: str | Path, unit: str | None = None, field: str | None = None, sha256: str | None = None
+) -> DisplacedNodes:
+    """The nodes of a table or a mesh.
 
     Args:
-        owner: the specification that names it, which knows its file.
-        key: of the deformation in there.
-        spec: as read.
-
-    Raises:
-        InputError: no such table, one that is not right, or another one than the checksum says.
-    """
-    path = (Path(owner.source.file).parent / spec.table).absolute()
-    place = (*key, "table")
-    if not is_file(path):
-        kinds = names_text((*TABLES, *MESHES))
-        raise owner.error(f"no such file: {path}", place, allowed=f"a file ({kinds}), relative to this one")
-    ending = path.suffix.lower()
-    if ending in INPUT_DECKS:
-        text = f"a {ending} file has no displacements that can be read here"
-        raise owner.error(text, place, found=spec.table, allowed=DECKS_NEED)
-    if ending not in (*TABLES, *MESHES):
-        meant = nearest(ending, (*TABLES, *MESHES))
-        text = "neither a table nor a mesh that is known"
-        allowed = names_text((*TABLES, *MESHES))
-        raise owner.error(text, place, found=spec.table, allowed=allowed, suggestion=meant)
-    if ending in TABLES:
-        wrong = next((name for name in ("unit", "field") if getattr(spec, name) is not None), None)
-        if wrong is not None:
-            text = f"a table has its units in its heads and no {wrong} beside them"
-            raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
-    elif spec.unit is None:
-        raise owner.error("a mesh's file does not say its unit", place, found=spec.table, allowed="unit: mm beside it")
-    read_nodes(path, spec)
-    return spec.model_copy(update={"table": str(path), "sha256": _digest(path)})
-
-
-def read_nodes(path: str | Path, spec: DeformationSpec) -> DisplacedNodes:
-    """The nodes of a table or a mesh.
+        path: of the file; its ending says what it is.
+        unit: of a mesh.
+        field: name of the displacements in a mesh, None for its only vectors.
+        sha256: checksum that the file must have, None for any.
 
     Raises:
         InputError: it cannot be read, with the line and the column of a table, or is not the one of the checksum.
     """
-    if spec.sha256 is not None and is_file(Path(path)) and (digest := _digest(Path(path))) != spec.sha256:
-        raise _another(path, spec, digest)
+    if sha256 is not None and is_file(Path(path)) and (digest := digest_of(Path(path))) != sha256:
+        text = "not the table that was used: its checksum is another"
+        raise InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {sha256}, as the job says"))
     if Path(path).suffix.lower() in MESHES:
-        return _of_mesh(Path(path), spec)
+        return _of_mesh(Path(path), unit or "m", field)
     columns = [Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*PLACES, *MOVES)]
     table = read_table(path, [*columns, Column("node", text=True, needed=False)], LEAST_NODES)
     if len(table.lines) > MOST_NODES:
@@ -131,7 +70,7 @@ def read_nodes(path: str | Path, spec: DeformationSpec) -> DisplacedNodes:
     return DisplacedNodes(points, moves)
 
 
-def _of_mesh(path: Path, spec: DeformationSpec) -> DisplacedNodes:
+def _of_mesh(path: Path, unit: str, field: str | None) -> DisplacedNodes:
     """The nodes of a mesh by meshio, whose readers end in any exception."""
     import meshio  # only a job with a mesh waits for it
 
@@ -151,16 +90,16 @@ def _of_mesh(path: Path, spec: DeformationSpec) -> DisplacedNodes:
     except (Exception, SystemExit) as error:
         reason = re.sub(r"\s+", " ", str(error)).strip()[:200] or type(error).__name__
         raise InputError(Issue(f"meshio cannot read this mesh: {reason}", file)) from None
-    if spec.field is None and len(vectors) != 1:
+    if field is None and len(vectors) != 1:
         text = "no vectors at its nodes" if not vectors else "several vectors at its nodes"
         remedy = DECKS_NEED if not vectors else "field: one of " + names_text(sorted(vectors))
         raise InputError(Issue(text, file, found=names_text(sorted(vectors)) or None, allowed=remedy))
-    name = spec.field if spec.field is not None else next(iter(vectors))
+    name = field if field is not None else next(iter(vectors))
     if name not in vectors:
         known = sorted(vectors)
         issue = Issue("no such vectors at its nodes", file, None, (), shown(name), names_text(known) or "none")
         raise InputError(issue if nearest(name, known) is None else _suggesting(issue, nearest(name, known)))
-    factor = unit_ratio(spec.unit or "m", LENGTH.si)
+    factor = unit_ratio(unit, LENGTH.si)
     points, moves = points * factor, vectors[name] * factor
     if points.ndim != 2 or points.shape[1] != 3 or not LEAST_NODES <= len(points) <= MOST_NODES:
         raise InputError(
@@ -179,11 +118,7 @@ def _suggesting(issue: Issue, suggestion: str | None) -> Issue:
     return Issue(issue.problem, issue.file, issue.line, issue.key, issue.found, issue.allowed, suggestion)
 
 
-def _another(path: str | Path, spec: DeformationSpec, digest: str) -> InputError:
-    text = "not the table that was used: its checksum is another"
-    return InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {spec.sha256}, as the job says"))
-
-
-def _digest(path: Path) -> str:
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
