@@ -32,7 +32,9 @@ from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
 from scenes.specs.resolved import resolve
+from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
+from scenes.yaml.node_table import COLUMNS
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
 
@@ -125,7 +127,7 @@ def test_every_block_is_of_a_sort_that_is_tested() -> None:
 
 
 def tables() -> list[Piece]:
-    """Contents of CSV files: of a course's table."""
+    """Contents of CSV files: of a course's table, or of displaced nodes."""
     return blocks("csv")
 
 
@@ -154,7 +156,18 @@ def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument, backend) -> N
         build_instrument(spec, {site.camera: load_camera(site.camera) for site in spec.cameras.values()}, backend)
 
 
-@pytest.mark.parametrize("block", tables(), ids=str)
+def node_tables() -> list[Piece]:
+    """Those of displaced nodes."""
+    return [block for block in tables() if block.text.startswith("node,")]
+
+
+@pytest.mark.parametrize("block", node_tables(), ids=str)
+def test_a_table_of_nodes_can_be_read(block: Piece, tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text(block.text, "utf-8")
+    assert len(read_table(tmp_path / "table.csv", COLUMNS)) == len(block.text.splitlines()) - 1
+
+
+@pytest.mark.parametrize("block", [block for block in tables() if block not in node_tables()], ids=str)
 def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(block.text, "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ncourse: {table: table.csv}\n", "utf-8")

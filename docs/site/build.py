@@ -16,7 +16,7 @@ from docs.site.link_check import faults
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
 NOTEBOOKS = ("start", "my_camera", "heat", "targets_mtf", "orbit_calibration", "trade_study")
-GUIDES = ("monitor", "monitor_layout", "disturbances", "camera", "laboratory", "orbit", "studies")
+GUIDES = ("monitor", "monitor_layout", "disturbances", "finite_elements", "camera", "laboratory", "orbit", "studies")
 MEANING = ("conventions", "glossary")
 PROGRAM = ("architecture",)
 """Pages of docs by the part of the site in which they stand, in order; other notebooks and pages follow these."""

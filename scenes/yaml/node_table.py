@@ -19,6 +19,11 @@ from scenes.yaml.yaml_file import is_file
 PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
 FARTHEST = 100.0
 """Metres: no coordinate of a node and no displacement is larger."""
+COLUMNS = (
+    *(Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*PLACES, *MOVES)),
+    Column("node", text=True, needed=False),
+)
+"""Of a table; the nodes' own numbers say nothing here."""
 MOST_NODES = 1_000_000
 TABLES = (".csv", ".tsv", ".txt")
 MESHES = FrozenMap({".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".med": "med"})
@@ -55,8 +60,7 @@ def read_nodes(
         raise InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {sha256}, as the job says"))
     if Path(path).suffix.lower() in MESHES:
         return _of_mesh(Path(path), unit or "m", field)
-    columns = [Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*PLACES, *MOVES)]
-    table = read_table(path, [*columns, Column("node", text=True, needed=False)], LEAST_NODES)
+    table = read_table(path, COLUMNS, LEAST_NODES)
     if len(table.lines) > MOST_NODES:
         allowed = f"at most {MOST_NODES}: those of the optical surface alone"
         raise InputError(Issue(f"{len(table.lines)} nodes", str(path), int(table.lines[MOST_NODES]), allowed=allowed))
