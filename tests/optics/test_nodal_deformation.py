@@ -76,6 +76,7 @@ def test_a_large_turn_and_a_growth_are_exact_too() -> None:
     assert face.rms(face.change) < 1e-14
 
 
+@pytest.mark.slow
 def test_figure_and_ripple_on_20000_nodes_come_back_within_the_sampling_error() -> None:
     points = mesh(DISK, 160)
     assert len(points) > 20_000

@@ -160,7 +160,9 @@ def test_what_is_wrong_with_a_table_is_told_by_its_line(tmp_path, nodes, change,
     assert found in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", ["csv", "vtu", "vtk", "med", "msh"])
+@pytest.mark.parametrize(
+    "kind", ["csv", *(pytest.param(k, marks=pytest.mark.slow) for k in ("vtu", "vtk", "med", "msh"))]
+)
 def test_mutated_files_are_read_or_refused(tmp_path, nodes, gf7_pair, kind: str) -> None:
     place = tmp_path / f"m1.{kind}"
     few = nodes[::3]

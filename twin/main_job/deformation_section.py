@@ -28,12 +28,12 @@ def deformation_section(run: RenderRun) -> Section | None:
     if not faces:
         return None
     heads = (
-        *("body", "nodes", "spacing [mm]", "rotate x [arcsec]", "rotate y [arcsec]", "rotate z [arcsec]"),
+        *("body", "nodes", "not used", "spacing [mm]", "rotate x [arcsec]", "rotate y [arcsec]", "rotate z [arcsec]"),
         *("shift x [µm]", "shift y [µm]", "shift z [µm]", "growth [ppm]"),
     )
     rows: list[tuple[Cell, ...]] = [
         (
-            *(path, len(face.weight), 1e3 * face.spacing),
+            *(path, len(face.weight), face.others, 1e3 * face.spacing),
             *(turn / ARCSEC for turn in face.rotate),
             *(1e6 * move for move in face.shift),
             1e6 * face.growth,
@@ -65,7 +65,13 @@ def deformation_section(run: RenderRun) -> Section | None:
         (about,),
         (
             Table(
-                "deformation_motion", "Rigid motion and growth", "In the body's own nominal axes.", heads, rows, (), 5
+                "deformation_motion",
+                "Rigid motion and growth",
+                "In the body's own nominal axes, about its origin. Nodes off the optical surface are not used.",
+                heads,
+                rows,
+                (),
+                5,
             ),
             Table(
                 "deformation_figure",
@@ -76,6 +82,13 @@ def deformation_section(run: RenderRun) -> Section | None:
                 (),
                 4,
             ),
+            SvgFigure(
+                "deformation_maps",
+                "Maps of the change of sag",
+                "At the nodes: beyond the rigid motion, after the Zernike terms, and what the grid does not carry. "
+                "White is zero; every map has its own scale.",
+                _maps_svg(faces),
+            ),
             Table(
                 "deformation_terms",
                 "Zernike terms",
@@ -84,13 +97,6 @@ def deformation_section(run: RenderRun) -> Section | None:
                 terms,
                 (),
                 5,
-            ),
-            SvgFigure(
-                "deformation_maps",
-                "Maps of the change of sag",
-                "At the nodes: beyond the rigid motion, after the Zernike terms, and what the grid does not carry. "
-                "White is zero; every map has its own scale.",
-                _maps_svg(faces),
             ),
         ),
         1,

@@ -257,11 +257,14 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     if resolved.job.course is not None:
         return too_large(resolved.job, resolved.job.course.shown, reason)
     moved = ", ".join(resolved.job.perturb) or "nothing"
+    allowed = "motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller"
+    if any(what.deformation is not None for what in resolved.job.perturb.values()):
+        allowed += "; with a table of displaced nodes that ripples, no image quality and no targets"
     return resolved.job.error(
         f"the perturbed instrument cannot be rendered: {reason}",
         ("perturb",),
         found=f"motions of {moved}",
-        allowed="motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller",
+        allowed=allowed,
     )
 
 
