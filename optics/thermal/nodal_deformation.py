@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +32,6 @@ from optics.geometry.pose import triple
 from optics.geometry.surface import GridFigure, Surface
 from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.deformation import HELD_TERMS
 
 TERMS = 36
 """Zernike terms by default: to seventh order."""
@@ -168,7 +166,7 @@ def nodal_deformation(
         raise NodesError(text, f"{2 * terms} nodes or more, or fewer terms")
     root = np.sqrt(weight)
     # terms that hardly differ on the aperture are not told apart, as in ``face_change``
-    fitted = np.linalg.lstsq(basis * root[:, None], change * root, rcond=HELD_TERMS)[0]
+    fitted = np.linalg.lstsq(basis * root[:, None], change * root, rcond=zernike.HELD)[0]
     residual = change - basis @ fitted
     grid, lost, between = _gridded(places[:, :2], residual, weight, aperture, spacing)
     return NodalDeformation(
@@ -323,6 +321,8 @@ class _Spline:
 
     def fit(self, values: np.ndarray, used: np.ndarray) -> GridFigure:
         """The grid nearest to values (K,) at the places that are used (K,)."""
+        from scipy.sparse.linalg import splu  # every file of a job waits for this module, and none for that
+
         design = self._design[used]
         normal = sparse.csc_array(design.T @ design + self._bending)
         solved = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
