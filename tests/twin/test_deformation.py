@@ -22,6 +22,7 @@ from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from tests.twin.path_bench import scene_beam
+from twin.main_job.deformation_results import deformation_warnings
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.render import app
 from twin.study.runs.perturbed_job import JobMaker
@@ -143,6 +144,24 @@ def test_a_rigid_table_is_the_rigid_motion(experiment, gf7_pair) -> None:
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-7)  # a turn of 1e-12 rad is worth 1e-6 px
 
 
+def test_a_face_of_glass(experiment) -> None:
+    """A table of a prism's mirror face, of defocus alone, does what that Zernike term does."""
+    bench, body = experiment("gf7_pair"), "base/forward/monitor/left/prism_180/mirror"
+    element = next(e for e in bench.instrument.assembly.elements.values() if e.body == body)
+    disk = element.figure_disk
+    x0, x1, y0, y1 = element.aperture.bounds
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(x0, x1, 24), np.linspace(y0, y1, 20)))
+    square = ((x - disk.centre[0]) ** 2 + (y - disk.centre[1]) ** 2) / disk.radius**2
+    moves = np.stack([0.0 * x, 0.0 * x, 5e-8 * np.sqrt(3.0) * (2.0 * square - 1.0)], axis=-1)
+    face = nodal_deformation(np.stack([x, y, 0.0 * x], axis=-1), moves, element.surface, element.aperture)
+    images = bench.path.expected_photons([{}, {body: Motion(figure={4: 5e-8})}, {body: face.motion()}], single=False)
+    nominal, by_term, by_table = images[:, 0]
+    peak = np.max(nominal)
+    assert np.max(np.abs(by_term - nominal)) > 1e-4 * peak
+    # the nodes' own piston is a rigid motion, which moves the aperture by picometres
+    np.testing.assert_allclose(by_table, by_term, rtol=0, atol=1e-7 * peak)
+
+
 # --- in a job ---------------------------------------------------------------------------------------------------------
 
 
@@ -197,6 +216,23 @@ def test_a_run_folder_repeats_its_run_without_the_job(job, tmp_path) -> None:
     assert changed.exit_code == 2
     assert "checksum is another" in changed.stderr
     assert not (tmp_path / "three").exists()
+
+
+def test_warnings_name_the_body_and_what_is_wrong_with_its_mesh(gf7_pair) -> None:
+    element = gf7_pair.assembly.elements["forward/M1"]
+    x0, x1, y0, y1 = element.aperture.bounds
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(x0, x1, 40), np.linspace(y0, y1, 30)))
+    points = np.stack([x, y, element.surface.sag(x, y)], axis=-1)
+    rough = np.random.default_rng(1).normal(0.0, 5e-9, len(x))
+    smooth, noisy = (
+        nodal_deformation(points, np.stack([0.0 * x, 0.0 * x, u], axis=-1), element.surface, element.aperture)
+        for u in (5e-9 * np.sin(8.0 * x), rough)
+    )
+    assert deformation_warnings({M1: smooth}) == ()
+    (mesh,) = deformation_warnings({M1: smooth, M2: noisy})
+    assert mesh.startswith(f"{M2}: the mesh prints through")
+    plane, _ = deformation_warnings({M1: smooth, M2: noisy}, [M1])
+    assert plane.startswith(f"{M1}: stray light takes faces of glass as planes")
 
 
 STUDY = """name: deformed

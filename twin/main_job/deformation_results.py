@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import PurePath
 from typing import Any
 
@@ -73,9 +73,18 @@ def _numbers(face: NodalDeformation) -> dict[str, Any]:
     }
 
 
-def deformation_warnings(faces: Mapping[str, NodalDeformation]) -> tuple[str, ...]:
-    """What the user should know of the meshes."""
-    out = []
+def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collection[str] = ()) -> tuple[str, ...]:
+    """What the user should know of the meshes.
+
+    Args:
+        faces: body -> what its table is.
+        planes: of these, faces of glass in a run with stray light, which takes them as planes.
+    """
+    bent = {path: 1e9 * faces[path].rms(faces[path].change) for path in planes}
+    out = [
+        f"{path}: stray light takes faces of glass as planes, without the {size:.3g} nm rms by which its table bends it"
+        for path, size in bent.items()
+    ]
     for path, face in faces.items():
         rest, between, lost = (1e9 * value for value in (face.rms(face.residual), face.between, face.rms(face.lost)))
         if face.printed_through:

@@ -150,6 +150,8 @@ def render_job(
         advance(QUALITY, 0, 1)
         quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
         advance(QUALITY, 1, 1)
+    deformed = experiment.deformed(resolved.job)
+    of_glass = {e.body for e in instrument.assembly.elements.values() if e.solid is not None}
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -167,7 +169,7 @@ def render_job(
             *blur_warnings(resolved, backend),
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
-            *deformation_warnings(experiment.deformed(resolved.job)),
+            *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
