@@ -123,6 +123,8 @@ def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
     for path, info in nodes.items():
         pivots = [*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,))]
         never = {action: False for action in ACTIONS if action not in info.allows}
+        if "figure" not in info.allows:
+            never["deformation"] = False
         out[path] = {"properties": {"pivot": {"enum": pivots}, **never}}
     return out
 

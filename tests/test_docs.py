@@ -35,6 +35,7 @@ from scenes.specs.measured.monitor_frames_setup import read_frame_table
 from scenes.specs.resolved import resolve
 from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
+from scenes.yaml.node_table import COLUMNS as NODE_COLUMNS
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.laboratory.measured_focus import IMAGE_COLUMNS, MTF_COLUMNS
@@ -137,8 +138,9 @@ def tables() -> list[Piece]:
 MEASURED = {
     "docs/measured_laboratory.md": (COMPARISON_COLUMNS, SPOT_COLUMNS, MTF_COLUMNS, IMAGE_COLUMNS),
     "docs/measured_orbit.md": tuple(COLUMNS.values()),
+    "docs/finite_elements.md": (NODE_COLUMNS,),
 }
-"""Page whose tables are measurements and no courses -> columns of the sorts of table that it shows."""
+"""Page whose tables are measurements, or nodes, and no courses -> columns of the sorts of table that it shows."""
 FRAMES = "docs/measured_frames.md"
 """Page whose tables list files of frames."""
 ORBIT_FILES = "docs/orbit_files.md"
@@ -195,9 +197,7 @@ def test_a_table_of_frames_can_be_read(block: Piece, tmp_path: Path) -> None:
     assert times
 
 
-@pytest.mark.parametrize(
-    "block", [block for block in tables() if block.page not in (*MEASURED, FRAMES, ORBIT_FILES)], ids=str
-)
+@pytest.mark.parametrize("block", [block for block in tables() if block.page not in NO_COURSES], ids=str)
 def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(block.text, "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ncourse: {table: table.csv}\n", "utf-8")

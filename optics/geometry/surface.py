@@ -88,6 +88,16 @@ class GridFigure:
         rows, columns = self.values.shape
         return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
 
+    def plus(self, other: GridFigure) -> GridFigure:
+        """The sum of two figures on the same samples; exact.
+
+        Raises:
+            ValueError: they have other samples.
+        """
+        if self.bounds != other.bounds or self.values.shape != other.values.shape:
+            raise ValueError("two grid figures of one surface stand on different samples; put them on the same ones")
+        return GridFigure(self.values + other.values, self.bounds)
+
     @property
     def spacing(self) -> tuple[float, float]:
         """Sample distance along x and y, metres."""
@@ -104,7 +114,19 @@ class GridFigure:
         return np.asarray(map_coordinates(self.values, place, order=3, mode="mirror"))
 
 
-Figure = ZernikeFigure | GridFigure
+@dataclass(frozen=True, eq=False)
+class SummedFigure:
+    """Zernike terms and a grid together, as a deformed mirror's state has them."""
+
+    terms: ZernikeFigure
+    grid: GridFigure
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:
+        """Sag error at x, y (metres), NumPy."""
+        return self.terms.sag(x, y) + self.grid.sag(x, y)
+
+
+Figure = ZernikeFigure | GridFigure | SummedFigure
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,6 +332,20 @@ class Surface:
         """True when the ideal shape is flat."""
         return self.curvature == 0.0 and not any(self.even) and not self.terms
 
+    @property
+    def zernike_figure(self) -> ZernikeFigure | None:
+        """The part of the figure that is Zernike terms."""
+        if isinstance(self.figure, SummedFigure):
+            return self.figure.terms
+        return self.figure if isinstance(self.figure, ZernikeFigure) else None
+
+    @property
+    def grid_figure(self) -> GridFigure | None:
+        """The part of the figure that is a grid."""
+        if isinstance(self.figure, SummedFigure):
+            return self.figure.grid
+        return self.figure if isinstance(self.figure, GridFigure) else None
+
     def with_figure(self, figure: Figure | None) -> Surface:
         """The same shape with another figure."""
         return replace(self, figure=figure)
@@ -328,8 +364,8 @@ class Surface:
         Raises:
             ValueError: neither a Zernike figure nor an aperture sets the disk.
         """
-        if isinstance(self.figure, ZernikeFigure):
-            return self.figure
+        if self.zernike_figure is not None:
+            return self.zernike_figure
         match aperture:
             case Circle(radius, centre):
                 return ZernikeFigure(radius, centre)

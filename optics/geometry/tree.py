@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import Pose, rotation_matrix, triple
+from optics.geometry.surface import GridFigure
 from optics.numerics.array_math import product, turned
 from optics.numerics.frozen_map import FrozenMap
 
@@ -62,6 +63,7 @@ class Motion:
             unlike ``scale`` it does not enlarge the bodies that it carries (each has a temperature of its own).
         index: change of the refractive index of a glass body.
         index_gradient: gradient of that change in the body's frame, zero at its origin, 1/m.
+        grid: surface error of a mirror or face beyond ``figure``, on a grid.
     """
 
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -72,6 +74,7 @@ class Motion:
     stretch: float = 0.0
     index: float = 0.0
     index_gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    grid: GridFigure | None = None
 
     def __post_init__(self) -> None:
         """Freeze the figure."""
@@ -248,6 +251,9 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     """One state that does ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
 
     Exact for the rigid parts; figures and indices add.
+
+    Raises:
+        ValueError: both have a grid figure of the same body, on different samples.
     """
     out = dict(first)
     for path, motion in then.items():
@@ -268,8 +274,15 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
             stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
             index=before.index + motion.index,
             index_gradient=triple(np.array(before.index_gradient) + np.array(motion.index_gradient)),
+            grid=_sum(before.grid, motion.grid),
         )
     return out
+
+
+def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None:
+    if first is None or then is None:
+        return then if first is None else first
+    return first.plus(then)
 
 
 def _affine(motion: Motion, body: Body) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,8 @@ import numpy as np
 
 MAX_NOLL = 66
 """Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
+HELD = 1e-6
+"""Share of their size: combinations of terms that show less on an aperture are left out of fits over it."""
 
 
 def noll_to_nm(index: int) -> tuple[int, int]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose
-from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
+from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
 from optics.geometry.tree import Motion, PlacedBodies, RigidTree, State
 from optics.numerics.frozen_map import FrozenMap
 
@@ -56,7 +56,7 @@ class Element:
         Raises:
             ValueError: neither a Zernike figure nor an aperture sets the disk.
         """
-        if self.aperture is None and not isinstance(self.surface.figure, ZernikeFigure):
+        if self.aperture is None and self.surface.zernike_figure is None:
             raise ValueError(f"element {self.name!r} needs an aperture to carry a figure: it sets the disk")
         return self.surface.figure_disk(self.aperture)
 
@@ -64,17 +64,33 @@ class Element:
         """The surface with what a motion adds to its figure.
 
         Raises:
-            ValueError: nothing sets the disk of that figure, or the surface has a grid figure, too.
+            ValueError: nothing sets the disk of that figure, or two grids stand on different samples.
         """
-        if not motion.figure:
+        if not motion.figure and motion.grid is None:
             return self.surface
+        grid = self.grid_in(motion)
+        if not motion.figure and self.surface.zernike_figure is None:
+            return self.surface.with_figure(grid)
         disk = self.figure_disk
-        if isinstance(self.surface.figure, GridFigure):
-            raise ValueError(f"element {self.name!r} has a grid figure; as one surface it cannot carry another")
         terms = {**disk.terms}
         for j, amplitude in motion.figure.items():
             terms[j] = terms.get(j, 0.0) + amplitude
-        return self.surface.with_figure(replace(disk, terms=terms))
+        whole = replace(disk, terms=terms)
+        return self.surface.with_figure(whole if grid is None else SummedFigure(whole, grid))
+
+    def grid_in(self, motion: Motion) -> GridFigure | None:
+        """The grid figure of the surface with the one that a motion adds to it.
+
+        Raises:
+            ValueError: they stand on different samples.
+        """
+        own = self.surface.grid_figure
+        if own is None or motion.grid is None:
+            return motion.grid if own is None else own
+        try:
+            return own.plus(motion.grid)
+        except ValueError as error:
+            raise ValueError(f"element {self.name!r}: {error}") from None
 
     def with_aperture(self, aperture: Aperture | None) -> Element:
         """The same element with another aperture."""

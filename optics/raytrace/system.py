@@ -15,7 +15,15 @@ import numpy as np
 from optics.geometry import zernike
 from optics.geometry.aperture import ApertureNumbers
 from optics.geometry.sag_terms import SagTerm, grown, kinds_of, of_kinds
-from optics.geometry.surface import Figure, FigureNumbers, GridFigure, SurfaceNumbers, ZernikeFigure
+from optics.geometry.surface import (
+    Figure,
+    FigureNumbers,
+    GridFigure,
+    GridNumbers,
+    SummedFigure,
+    SurfaceNumbers,
+    ZernikeFigure,
+)
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
@@ -107,7 +115,7 @@ class SystemBatch:
         tangents: ``values`` for the derivative that was asked for (None for a number that has none), or None.
         world_tangents: likewise of ``world``.
         size: of the last element's body relative to nominal, (B,).
-        grids: per element, spline tables (grid figures are not perturbed), flattened with their size.
+        grids: per element, the spline tables of all systems' grid figures, one after the other; None without any.
         count: B.
         states: number of states S; systems are ordered sequence by sequence, B = sequences * S.
     """
@@ -222,6 +230,11 @@ def assemble(
         for chain, along in zip(chains, media, strict=True)
     ]
     values = [_joined([chain[i] for chain in numbers]) for i in range(len(chains[0]))]
+    tables: list[np.ndarray | None] = [None] * len(values)
+    for i, structure in enumerate(structures):
+        if structure.grid:
+            grid, tables[i] = _grids([chain[i] for chain in chains], states)
+            values[i] = replace(values[i], surface=replace(values[i].surface, grid=grid))
     world = [_joined([chain[i] for chain in poses]) for i in range(len(chains[0]))]
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
     return SystemBatch(
@@ -231,7 +244,7 @@ def assemble(
         tuple(map_leaves(_tangent, value) for value in values) if step is not None else None,
         tuple(map_leaves(_tangent, pose) for pose in world) if step is not None else None,
         size,
-        tuple(_grid(chains[0][i]) for i in range(len(chains[0]))),
+        tuple(tables),
         len(chains) * len(states),
         len(states),
     )
@@ -300,11 +313,11 @@ def _index_numbers(
 
 def _structures(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
     """Common structure of the i-th elements of all chains."""
+    grid = any(_has_grid(e, states) for e in elements)
     kinds = {
         (
             e.interaction,
             e.surface.is_plane,
-            isinstance(_known_figure(e), GridFigure),
             None if e.aperture is None else type(e.aperture.numbers()),
         )
         for e in elements
@@ -313,14 +326,14 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
         raise ValueError(
             f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}"
         )
-    interaction, is_plane, grid, aperture = kinds.pop()
+    interaction, is_plane, aperture = kinds.pop()
     # a plane may have terms that are zero, and the terms that a surface lacks are
     terms = kinds_of([term for e in elements for term in e.surface.terms])
     even = 0 if is_plane else max(len(e.surface.even) for e in elements)
     order = -1
     for e in elements:
-        if isinstance(e.surface.figure, ZernikeFigure):
-            order = max(order, zernike.order_of(e.surface.figure.terms))
+        if e.surface.zernike_figure is not None:
+            order = max(order, zernike.order_of(e.surface.zernike_figure.terms))
         for state in states:
             motion = state.get(e.body)
             if motion is not None and motion.figure:
@@ -331,15 +344,43 @@ def _structures(elements: Sequence[Element], states: Sequence[State], graded: tu
 def _known_figure(element: Element) -> Figure | None:
     """The figure of an element's surface; ValueError for one that the trace would leave out."""
     match element.surface.figure:
-        case None | ZernikeFigure() | GridFigure() as figure:
+        case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
             return figure
         case other:
             raise ValueError(f"element {element.name!r}: the trace knows no figure of type {type(other).__name__}")
 
 
-def _grid(element: Element) -> np.ndarray | None:
-    figure = element.surface.figure
-    return figure.spline.ravel() if isinstance(figure, GridFigure) else None
+def _has_grid(element: Element, states: Sequence[State]) -> bool:
+    """Whether a surface has a figure on a grid, of its own or in some state."""
+    _known_figure(element)
+    own = element.surface.grid_figure is not None
+    return own or any(state.get(element.body, AT_REST).grid is not None for state in states)
+
+
+_NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
+"""What a system without a grid reads where others of its batch have one."""
+
+
+def _grids(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:
+    """Numbers of the grids of the i-th elements of all chains in all states, (chains * states,) each, and one table of
+    the coefficients of all.
+    """
+    first: dict[int, int] = {}
+    figures, numbers, tables, length = [], [], [], 0
+    for element in elements:
+        own: dict[int, GridFigure] = {}  # a grid that many states share is added to the element's and stored once
+        for state in states:
+            motion = state.get(element.body, AT_REST)
+            if id(motion.grid) not in own:
+                own[id(motion.grid)] = element.grid_in(motion) or _NO_GRID
+            figure = own[id(motion.grid)]
+            if id(figure) not in first:
+                first[id(figure)] = length
+                figures.append(figure)  # so that its id remains its own
+                tables.append(figure.spline.ravel())
+                length += tables[-1].size
+            numbers.append(replace(figure.numbers, first=float(first[id(figure)])))
+    return map_leaves(lambda *values: np.array(values), numbers[0], *numbers[1:]), np.concatenate(tables)
 
 
 def _world(element: Element, placed: PlacedBodies) -> FrameNumbers:
@@ -398,10 +439,7 @@ def _surface_numbers(
             even.append(term / scale ** (2 * n + 3))
     terms = tuple(grown(term, scale) for term in of_kinds(surface.terms, structure.terms))
     figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
-    grid = None
-    if isinstance(surface.figure, GridFigure):
-        grid = map_leaves(lambda number: np.full(count, number), surface.figure.numbers)
-    return SurfaceNumbers(curvature, conic, tuple(even), terms, figure, grid)
+    return SurfaceNumbers(curvature, conic, tuple(even), terms, figure)
 
 
 def _figure_numbers(

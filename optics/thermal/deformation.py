@@ -143,9 +143,6 @@ def rigid_modes(points: np.ndarray) -> np.ndarray:
     return np.concatenate([shifts, turns]).reshape(6, -1)
 
 
-_HELD_TERMS = 1e-6  # combinations of terms that show on the aperture by less than this share of their size are left out
-
-
 @dataclass(frozen=True)
 class FaceChange:
     """How an optical face moved and changed, in the face's own nominal frame.
@@ -212,7 +209,7 @@ def face_change(
     z = zernike.basis(terms, (x - centre[0]) / radius, (y - centre[1]) / radius)[:, 3:]
     further = sag_change(modes[2:5]).T * scale[2:5]  # piston and two tilts, of the size of the terms
     columns = np.concatenate([further, z], axis=1)
-    fitted = np.linalg.lstsq(columns * root[:, None], change * root, rcond=_HELD_TERMS)[0]
+    fitted = np.linalg.lstsq(columns * root[:, None], change * root, rcond=zernike.HELD)[0]
     rigid[2:5] += fitted[:3] * scale[2:5]
     residual = change - columns @ fitted
     return FaceChange(

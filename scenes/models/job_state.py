@@ -2,33 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from optics.geometry.pose import triple
-from optics.geometry.tree import Motion, State
+from optics.geometry.tree import Motion, State, compose
+from optics.thermal.nodal_deformation import NodalDeformation
+from scenes.models.deformed_faces import deformed_face
+from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
 from scenes.specs.job import JobSpec
 
 
-def job_state(job: JobSpec, thermal: ThermalModel, progress: Callable[[str], None] = lambda path: None) -> State:
+def job_state(
+    job: JobSpec,
+    thermal: ThermalModel,
+    progress: Callable[[str], None] = lambda path: None,
+    moved: State | None = None,
+) -> State:
     """The perturbed state that a job describes.
 
     Args:
         job: its perturbation, checked by ``scenes.specs.job.check_nodes``.
         thermal: of its instrument.
         progress: called with the path of each body whose thermo-elastic solution begins.
+        moved: the state without its heat, where it is known; None for all that the job says.
 
     Raises:
-        InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
+        InputError: a temperature at or below 0 K, or one at which a glass's index is not known; a table of nodes that
+            does not describe its body.
     """
     fields = job.fields()
+    if moved is None:
+        moved = on_deformed(thermal.instrument, deformations_of(job, thermal.instrument), motions_of(job))
     try:
         thermal.check(fields)
-        return thermal.state(fields, motions_of(job), progress)
+        return thermal.state(fields, moved, progress)
     except TemperatureError as error:
         raise job.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
+
+
+def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDeformation]:
+    """Body -> what the table of nodes is that a job deforms it by.
+
+    Raises:
+        InputError: a table that does not describe its body.
+    """
+    named = {path: what.deformation for path, what in job.perturb.items() if what.deformation is not None}
+    return {path: deformed_face(instrument, job, path, table) for path, table in named.items()}
+
+
+def on_deformed(instrument: Instrument, deformed: Mapping[str, NodalDeformation], moved: State) -> State:
+    """The motions of a state on top of its bodies' deformations."""
+    if not deformed:
+        return moved
+    bodies = {body.path: body for body in instrument.assembly.tree.bodies}
+    return compose({path: face.motion() for path, face in deformed.items()}, moved, bodies)
 
 
 def motions_of(job: JobSpec, time: int | None = None) -> State:

@@ -21,7 +21,7 @@ from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
 from optics.materials.glass import glass
 from optics.materials.material import Material, material
-from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
+from optics.thermal.deformation import Displaced, Displacement, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, carried_motion
 from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
@@ -240,9 +240,20 @@ class ThermalModel:
         arms = np.array([0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE])
         support = middle + _within(corners, middle, arms) * arms
         elastic = ElasticBody(polyhedron_mesh(corners, SPACING), self.materials[path])
-        return self._unit_gradients(path, elastic, support, faces)
+        return self._face_changes(path, self._unit_gradients(path, elastic, support), faces)
 
     def _mirror_response(self, path: str) -> Response:
+        camera, name = self._mirrors[path]
+        aperture = self.instrument.cameras[camera].apertures[name]
+        return self._face_changes(path, self.mirror_displacements(path), {path: (aperture, Pose())})
+
+    def mirror_displacements(self, path: str) -> Sequence[Displacement]:
+        """Displacements of a mirror's material, in its frame, by a gradient of 1 K/m along x, y and z of it, the
+        temperature being zero at its middle.
+
+        Args:
+            path: of the mirror.
+        """
         camera, name = self._mirrors[path]
         model = self.instrument.cameras[camera]
         surface, aperture = model.surfaces[name], model.apertures[name]
@@ -255,14 +266,12 @@ class ThermalModel:
         radius = 0.25 * float(min(high[:2] - low[:2]))
         support = np.array([[x + radius * c, y + radius * s, back] for c, s in _THREE])
         elastic = ElasticBody(mirror_mesh(surface, aperture, thickness, side, CELLS), self.materials[path])
-        return self._unit_gradients(path, elastic, support, {path: (aperture, Pose())})
+        return self._unit_gradients(path, elastic, support)
 
-    def _unit_gradients(
-        self, path: str, elastic: ElasticBody, support: np.ndarray, faces: Mapping[str, tuple[Aperture, Pose]]
-    ) -> Response:
+    def _unit_gradients(self, path: str, elastic: ElasticBody, support: np.ndarray) -> Sequence[Displacement]:
         about = self._bodies[path].pivots.get("centre", (0.0, 0.0, 0.0))
         loads = [_unit_load(a, np.array(about)) for a in range(3)]
-        return self._face_changes(path, elastic.solve_many(loads, Kinematic(support)), faces)
+        return elastic.solve_many(loads, Kinematic(support))
 
     def _free(self, path: str, axis: int) -> Formula:
         """A body that nothing holds, in a gradient of 1 K/m: it stays and does not turn where its mount is."""

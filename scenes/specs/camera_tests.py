@@ -10,7 +10,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
-from scenes.specs.job import FigureTerm, PerturbationSpec
+from scenes.specs.job import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable_test import DataFile, TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Angle, PositiveLength, Quantity, Vector, Vector3
@@ -48,7 +48,7 @@ class CameraUnderTestSpec(Spec):
     """
 
     camera: Reference
-    as_built: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    as_built: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
 
     @model_validator(mode="after")
     def _cold(self) -> "CameraUnderTestSpec":

@@ -2,14 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, model_validator
 
+from optics.geometry import zernike
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
+from optics.thermal.nodal_deformation import TERMS
 from scenes.specs.course import (
     DEFAULT_PIVOT,
     NO_MOTION,
@@ -24,9 +27,11 @@ from scenes.specs.course import (
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
+from scenes.yaml.node_table import DECKS_NEED, INPUT_DECKS, MESHES, TABLES, digest_of, read_nodes
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
+from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Text, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
+from scenes.yaml.yaml_file import is_file
 
 
 def target_names() -> tuple[str, ...]:
@@ -83,7 +88,7 @@ def _uniform(value: Any) -> Any:
     return {"change": value} if isinstance(value, str | int | float) else value
 
 
-class PerturbationSpec(Spec):
+class PlainPerturbationSpec(Spec):
     """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and
     for a mirror or a prism's face a figure error.
 
@@ -113,6 +118,62 @@ class PerturbationSpec(Spec):
             "temperature": self.temperature != TemperatureSpec(),
         }
         return tuple(name for name, does in done.items() if does)
+
+
+class DeformationSpec(Spec):
+    """Displaced nodes of a finite-element program, on a mirror's optical surface or a face.
+
+    Attributes:
+        table: CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med)
+            that has displacements at its nodes; relative to this file.
+        frame: path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
+        terms: highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
+        unit: of a mesh, whose file has none.
+        field: name of the displacements in a mesh; needed when it has several vectors at its nodes.
+        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
+    """
+
+    table: Reference
+    frame: Reference | None = None
+    terms: Annotated[Whole, Field(ge=3, le=zernike.MAX_NOLL)] = TERMS
+    unit: Literal["m", "mm", "um"] | None = None
+    field: Text | None = None
+    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
+
+
+def _named(value: Any) -> Any:
+    """`deformation: m1.csv` names the table alone."""
+    return {"table": value} if isinstance(value, str) else value
+
+
+Deformation = Annotated[DeformationSpec, BeforeValidator(_named)]
+"""With its keys, or the table's name alone."""
+
+
+class PerturbationSpec(PlainPerturbationSpec):
+    """What happens to one body of a job's instrument: also, for a mirror or a prism's face, the displaced nodes of a
+    finite-element program. The other motions come on top of these.
+
+    Attributes:
+        rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
+        shift: in the body's own frame, metres.
+        pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
+        figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
+        scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
+        temperature: uniform change as `2 K`, or with a gradient.
+        deformation: the table of nodes, or a mesh; None for none.
+    """
+
+    deformation: Deformation | None = None
+
+    @classmethod
+    def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
+        """Perturbations of another file's as a job has them."""
+        return FrozenMap({path: cls.model_construct(**dict(what)) for path, what in perturb.items()})
+
+    def uses(self) -> tuple[str, ...]:
+        """Which of the actions do something, deformation the last."""
+        return (*super().uses(), *(("deformation",) if self.deformation is not None else ()))
 
 
 def _some(images: tuple[str, ...]) -> tuple[str, ...]:
@@ -187,7 +248,9 @@ class AnalysisSpec(Spec):
     centroid: Literal["ml", "gaussian", "energy"] = "ml"
 
 
-def pivot_problem(perturb: Mapping[str, PerturbationSpec], course: CourseSpec, within: KeyPath = ()) -> Problem | None:
+def pivot_problem(
+    perturb: Mapping[str, PlainPerturbationSpec], course: CourseSpec, within: KeyPath = ()
+) -> Problem | None:
     """What is wrong where a course turns a node about another pivot than the perturbation that it is added to.
 
     Args:
@@ -254,6 +317,56 @@ class JobSpec(Spec):
         return out
 
 
+def _checked(owner: Spec, key: KeyPath, spec: DeformationSpec) -> DeformationSpec:
+    """The same with the table's full path and checksum, when it can be read.
+
+    Args:
+        owner: the specification that names it, which knows its file.
+        key: of the deformation in there.
+        spec: as read.
+
+    Raises:
+        InputError: no such table, one that is not right, or another one than the checksum says.
+    """
+    path = (Path(owner.source.file).parent / spec.table).absolute()
+    place = (*key, "table")
+    if not is_file(path):
+        kinds = names_text((*TABLES, *MESHES))
+        raise owner.error(f"no such file: {path}", place, allowed=f"a file ({kinds}), relative to this one")
+    ending = path.suffix.lower()
+    if ending in INPUT_DECKS:
+        text = f"a {ending} file has no displacements that can be read here"
+        raise owner.error(text, place, found=spec.table, allowed=DECKS_NEED)
+    if ending not in (*TABLES, *MESHES):
+        meant = nearest(ending, (*TABLES, *MESHES))
+        text = "neither a table nor a mesh that is known"
+        allowed = names_text((*TABLES, *MESHES))
+        raise owner.error(text, place, found=spec.table, allowed=allowed, suggestion=meant)
+    if ending in TABLES:
+        wrong = next((name for name in ("unit", "field") if getattr(spec, name) is not None), None)
+        if wrong is not None:
+            text = f"a table has its units in its heads and no {wrong} beside them"
+            raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
+    elif spec.unit is None:
+        raise owner.error("a mesh's file does not say its unit", place, found=spec.table, allowed="unit: mm beside it")
+    read_nodes(path, spec.unit, spec.field, spec.sha256)
+    return spec.model_copy(update={"table": str(path), "sha256": digest_of(path)})
+
+
+def with_deformations(job: JobSpec) -> JobSpec:
+    """The job with the full paths and checksums of the tables that deform its bodies.
+
+    Raises:
+        InputError: a table that cannot be read or is not the one of the checksum.
+    """
+    changed = {
+        path: what.model_copy(update={"deformation": _checked(job, ("perturb", path, "deformation"), what.deformation)})
+        for path, what in job.perturb.items()
+        if what.deformation is not None
+    }
+    return job.model_copy(update={"perturb": FrozenMap({**job.perturb, **changed})}) if changed else job
+
+
 @dataclass(frozen=True)
 class NodeInfo:
     """What may be done to a body of the instrument.
@@ -307,7 +420,7 @@ def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Is
 
 
 def perturbation_issues(
-    owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PerturbationSpec, key: KeyPath
+    owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PlainPerturbationSpec, key: KeyPath
 ) -> list[Issue]:
     """What is wrong with a perturbation of the node ``path`` that stands at ``key`` of a specification.
 
@@ -322,7 +435,8 @@ def perturbation_issues(
         return [_no_such_node(owner, nodes, path, key)]
     info, issues = nodes[path], []
     for action in what.uses():
-        if action not in info.allows:
+        # nodes are displaced where a surface has a figure
+        if ("figure" if action == "deformation" else action) not in info.allows:
             issues.append(_not_allowed(owner, info, action, (*key, action)))
     if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
         known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))

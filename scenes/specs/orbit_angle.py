@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from scenes.specs.job import PerturbationSpec
+from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
@@ -34,7 +34,7 @@ def _turn(value: Any) -> Any:
     return {"rotate": value} if isinstance(value, list) else value
 
 
-Change = Annotated[PerturbationSpec, BeforeValidator(_turn)]
+Change = Annotated[PlainPerturbationSpec, BeforeValidator(_turn)]
 
 
 def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:

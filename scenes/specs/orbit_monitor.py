@@ -17,6 +17,7 @@ from scenes.specs.job import (
     JobSpec,
     NodeInfo,
     PerturbationSpec,
+    PlainPerturbationSpec,
     RenderSpec,
     check_nodes,
     perturbation_issues,
@@ -84,9 +85,9 @@ class MotionSpec(Spec):
         return float(passed >= 0.0)
 
     @property
-    def furthest(self) -> PerturbationSpec:
+    def furthest(self) -> PlainPerturbationSpec:
         """The whole of the motion as a perturbation."""
-        return PerturbationSpec.model_construct(rotate=self.rotate, shift=self.shift, pivot=self.pivot)
+        return PlainPerturbationSpec.model_construct(rotate=self.rotate, shift=self.shift, pivot=self.pivot)
 
 
 class GroundSpec(Spec):
@@ -168,7 +169,7 @@ class OrbitMonitorSpec(Spec):
     description: Text = ""
     instrument: Reference
     cameras: tuple[Name, ...] | None = None
-    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    perturb: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
     course: CourseSpec
     motion: Paths[MotionSpec] = Field(default_factory=FrozenMap)
     reference: Moment
@@ -265,7 +266,7 @@ class OrbitMonitorSpec(Spec):
         )
         job = JobSpec.model_construct(
             instrument=self.instrument,
-            perturb=self.perturb,
+            perturb=PerturbationSpec.of(self.perturb),
             course=self.course,
             disturbances=self.disturbances,
             render=frames,

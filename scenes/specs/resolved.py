@@ -10,7 +10,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
-from scenes.specs.job import JobSpec, TargetsSpec
+from scenes.specs.job import JobSpec, TargetsSpec, with_deformations
 from scenes.specs.load import (
     find_disturbances,
     instrument_path,
@@ -178,8 +178,8 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
             allowed = "a config.yaml of a run with targets, or the job's own file"
             raise resolved.error(text, ("line_detectors",), allowed=allowed)
     source = resolved.source
-    job = resolved.job.with_source(Source(source.file, source.lines, ("job",)))
-    changed: dict[str, Spec] = {"job": job}
+    job = cast(JobSpec, resolved.job.with_source(Source(source.file, source.lines, ("job",))))
+    changed: dict[str, Spec] = {"job": with_deformations(job)}
     if resolved.disturbances is not None:
         changed["disturbances"] = resolved.disturbances.with_source(
             Source(source.file, source.lines, ("disturbances",))

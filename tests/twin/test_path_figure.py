@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,10 @@ CASES: dict[str, tuple[Surface, Figure | None, State]] = {
     "grid": (BOWL, WAVY, {}),
     "flat": (plane(), ASTIGMATIC, HEAT),
     "flat grid": (plane(), WAVY, {}),
+    "grid of a state": (BOWL, None, {"mirror": Motion(grid=WAVY, stretch=2e-5)}),
+    "all of a state": (BOWL, ASTIGMATIC, {"mirror": replace(HEAT["mirror"], grid=WAVY)}),
+    "two grids": (BOWL, WAVY, {"mirror": Motion(figure={4: 3e-7}, grid=WAVY)}),
+    "flat grid of a state": (plane(), None, {"mirror": Motion(grid=WAVY)}),
 }
 
 
@@ -109,10 +115,13 @@ def test_mirrors_with_and_without_figures_stand_in_one_scene(backend, gf7_pair) 
     assert np.max(np.abs(ideal - place)[path]) > 1e-6
 
 
-def test_a_second_figure_on_a_grid_is_refused() -> None:
+def test_a_second_grid_on_other_samples_is_refused() -> None:
     assembly = bench(BOWL.with_figure(WAVY), Circle(0.2))
-    with pytest.raises(ValueError, match="has a grid figure"):
-        scene(assembly, HEAT)
+    other = {"mirror": Motion(grid=GridFigure(np.zeros((5, 5)), WAVY.bounds))}
+    with pytest.raises(ValueError, match="different samples"):
+        scene(assembly, other)
+    with pytest.raises(ValueError, match=r"'mirror'.*different samples"):
+        assemble(assembly, ["all"], [other])
     unlimited = Element("mirror", "mirror", BOWL, Interaction.REFLECT)
     with pytest.raises(ValueError, match="needs an aperture"):
         unlimited.figured(HEAT["mirror"])

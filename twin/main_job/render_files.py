@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from scenes.specs.channel import Channel
+from twin.main_job.deformation_results import config_text, deformation_numbers, faces_of, table_names
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
@@ -29,7 +31,11 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
-    folder.write_text("config.yaml", run.resolved.to_yaml())
+    folder.write_text("config.yaml", config_text(run.resolved))
+    for path, name in table_names(run.resolved.job).items():
+        given = run.resolved.job.perturb[path].deformation
+        assert given is not None
+        folder.write_bytes(name, Path(given.table).read_bytes())
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     recovered = recovered_numbers(run)
     for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
@@ -50,6 +56,8 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
         _write_series(run, run.series, folder)
     if run.targets is not None:
         _write_targets(run.targets, folder)
+    if faces_of(run):
+        _write_numbers(folder, "deformation", deformation_numbers(run))
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
 

@@ -19,6 +19,7 @@ from scenes.specs.channel import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
+from twin.main_job.deformation_results import deformation_warnings
 from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
@@ -149,6 +150,8 @@ def render_job(
         advance(QUALITY, 0, 1)
         quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
         advance(QUALITY, 1, 1)
+    deformed = experiment.deformed(resolved.job)
+    of_glass = {e.body for e in instrument.assembly.elements.values() if e.solid is not None}
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -166,6 +169,7 @@ def render_job(
             *blur_warnings(resolved, backend),
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
+            *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
@@ -255,11 +259,14 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     if resolved.job.course is not None:
         return too_large(resolved.job, resolved.job.course.shown, reason)
     moved = ", ".join(resolved.job.perturb) or "nothing"
+    allowed = "motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller"
+    if any(what.deformation is not None for what in resolved.job.perturb.values()):
+        allowed += "; with a table of displaced nodes that ripples, no image quality and no targets"
     return resolved.job.error(
         f"the perturbed instrument cannot be rendered: {reason}",
         ("perturb",),
         found=f"motions of {moved}",
-        allowed="motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller",
+        allowed=allowed,
     )
 
 

@@ -11,6 +11,7 @@ import cv2
 from markupsafe import Markup
 
 from twin.main_job import assumptions, crosstalk_content, part_content, report_content, report_labels
+from twin.main_job.deformation_results import config_text
 from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.motion_map import motion_map_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
@@ -123,7 +124,7 @@ def render_report(
         far=f"{FAR:g}",
         run=run,
         pitch_um=f"{1e6 * experiment.path.pitch:g}",
-        config=run.resolved.to_yaml(),
+        config=config_text(run.resolved),
         command=reproduce(PROGRAM, "config.yaml", f"--seed {run.seed} --frames {run.frames}", f"--backend {backend}"),
         versions=versions(),
         backend=backend,

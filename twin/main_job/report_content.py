@@ -91,6 +91,8 @@ def _perturbations(run: RenderRun) -> list[dict[str, str]]:
         motion = motions.get(path, Motion())
         parts = [_motion_text(motion)] if _motion_text(motion) or path not in fields else []
         parts += [_heat_text(fields[path])] if path in fields else []
+        deformed = job.perturb[path].deformation if path in job.perturb else None
+        parts = [*filter(None, parts), "deformed by a table of nodes"] if deformed is not None else parts
         out.append({"node": path, "motion": "; ".join(parts), "pivot": motion.pivot})
     return out
 

@@ -116,7 +116,8 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
     for path, motion in run.state.items():
         if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
             continue
-        if motion.stretch or motion.index or any(motion.index_gradient):
+        deformed = path in given and given[path].deformation is not None
+        if (motion.stretch and not deformed) or motion.index or any(motion.index_gradient):
             out.append(HEAT)
         if path not in given:
             continue
@@ -124,6 +125,8 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
             out.append(path)
         covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
         missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]
+        if deformed:
+            missing = ["of a table of nodes"]
         if missing:
             out.append(f"{path} (figure {', '.join(missing)})")
     return tuple(out)

@@ -182,7 +182,7 @@ def recovered_numbers(run: RenderRun) -> dict[str, Any]:
 
 def _moves(motion: Motion) -> bool:
     moved = (*motion.rotate, *motion.shift, motion.scale, motion.stretch, motion.index, *motion.index_gradient)
-    return any(moved) or any(motion.figure.values())
+    return any(moved) or any(motion.figure.values()) or motion.grid is not None
 
 
 def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:

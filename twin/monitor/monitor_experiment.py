@@ -4,7 +4,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cached_property
@@ -20,13 +20,15 @@ from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
+from optics.thermal.nodal_deformation import NodalDeformation
+from scenes.models.deformed_faces import deformed_face
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.job_state import job_state
+from scenes.models.job_state import job_state, motions_of, on_deformed
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.channel import SIDES
-from scenes.specs.job import JobSpec
+from scenes.specs.job import DeformationSpec, JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus
@@ -56,6 +58,7 @@ class MonitorExperiment:
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
         self.path = MonitorPath(self.instrument, backend)
+        self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
         """The same instrument, with all that has been worked out of it, under another job's stated disturbances.
@@ -92,7 +95,30 @@ class MonitorExperiment:
         Raises:
             InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
         """
-        return job_state(job, self.thermal, progress)
+        return job_state(job, self.thermal, progress, self.motions(job))
+
+    def motions(self, job: JobSpec, time: int | None = None) -> State:
+        """The state that a job describes without its heat: ``motions_of`` on top of its bodies' deformations.
+
+        Raises:
+            InputError: a table of nodes that does not describe its body.
+        """
+        return on_deformed(self.instrument, self.deformed(job), motions_of(job, time))
+
+    def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
+        """Body -> what the table of nodes is that deforms it; kept, since many states may have the same.
+
+        Raises:
+            InputError: a table that does not describe its body.
+        """
+        out = {}
+        for path, what in job.perturb.items():
+            if what.deformation is not None:
+                if (path, what.deformation) not in self._deformed:
+                    face = deformed_face(self.instrument, job, path, what.deformation)
+                    self._deformed[path, what.deformation] = face
+                out[path] = self._deformed[path, what.deformation]
+        return out
 
     @property
     def nominal_photons(self) -> np.ndarray:

@@ -203,7 +203,7 @@ def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
             if error.origin in course.temperature:
                 raise course.error(text, course.key(error.origin, k), allowed=error.allowed) from error
             raise job.error(text, ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
-        out.append(experiment.thermal.state(fields, motions_of(job, k)))
+        out.append(experiment.thermal.state(fields, experiment.motions(job, k)))
     return out
 
 

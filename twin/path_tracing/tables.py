@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.geometry.aperture import Aperture, DiskNumbers, EllipseNumbers, RectangleNumbers, RingNumbers
 from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
-from optics.geometry.surface import FigureNumbers, GridFigure, GridNumbers, SurfaceNumbers, ZernikeFigure
+from optics.geometry.surface import FigureNumbers, GridNumbers, SurfaceNumbers
 from optics.geometry.zernike import triangle_size
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
@@ -77,8 +77,8 @@ class SurfaceForm:
     def of(cls, surfaces: Sequence[SceneSurface]) -> SurfaceForm:
         """What is needed for all of them."""
         shapes = [s.surface for s in surfaces]
-        order = max((f.order for s in shapes if isinstance(f := s.figure, ZernikeFigure)), default=-1)
-        grid = any(isinstance(s.figure, GridFigure) for s in shapes)
+        order = max((f.order for s in shapes if (f := s.zernike_figure) is not None), default=-1)
+        grid = any(s.grid_figure is not None for s in shapes)
         flat = order < 0 and not grid and all(s.is_plane for s in shapes)
         terms = kinds_of([term for s in shapes for term in s.terms])
         return cls(max((len(s.even) for s in shapes), default=0), terms, order, grid, flat)
@@ -268,17 +268,17 @@ def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.nd
         size = 2 + triangle_size(form.figure_order)
         polynomials = np.zeros((len(surfaces), BLOCK * _blocks(size)))
         for i, s in enumerate(surfaces):
-            if isinstance(s.surface.figure, ZernikeFigure):
-                numbers = s.surface.figure.numbers(form.figure_order)
+            if (terms := s.surface.zernike_figure) is not None:
+                numbers = terms.numbers(form.figure_order)
                 polynomials[i, :size] = [numbers.x, numbers.y, *numbers.coefficients]
     if form.grid:
         grids, tables = np.zeros((len(surfaces), GRID_ROW)), [np.zeros(64)]
         grids[:, :7] = _NO_GRID
         for i, s in enumerate(surfaces):
-            if isinstance(s.surface.figure, GridFigure):
-                grids[i, :7] = list(leaves(s.surface.figure.numbers).values())
+            if (grid := s.surface.grid_figure) is not None:
+                grids[i, :7] = list(leaves(grid.numbers).values())
                 grids[i, 6] = sum(len(table) for table in tables)
-                tables.append(s.surface.figure.spline.ravel())
+                tables.append(grid.spline.ravel())
         samples = np.concatenate(tables)
     return polynomials, grids, samples
 

@@ -53,6 +53,10 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "spots_px": "left before right spot of every camera, of each row and column",
         },
         "crosstalk": {"rows and columns": _CAMERA, "motions": "in the moved body's own nominal axes"},
+        "deformation": {
+            "motions": "in the body's own nominal axes, rotate before shift, both about its origin",
+            "figure": "sag along the surface's +z where the node now stands, Noll's terms, rms over the disk",
+        },
         "stray": {"sources": "shares of light, of no frame", "detector": "by the name of the channel"},
         "quality": {"fields": "shares of half the line, +1 at its left end, +Y of the focal plane"},
         "mtf": {

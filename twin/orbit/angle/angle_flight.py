@@ -24,7 +24,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError, ThermalModel
-from scenes.specs.job import JobSpec, perturbation_issues
+from scenes.specs.job import JobSpec, PerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.earth import Earth, east_north_up
@@ -115,7 +115,7 @@ def changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
     ]
     if issues:
         raise InputError(*issues)
-    job = JobSpec.model_construct(instrument=spec.camera, perturb=spec.changes)
+    job = JobSpec.model_construct(instrument=spec.camera, perturb=PerturbationSpec.of(spec.changes))
     thermal = ThermalModel(instrument)
     try:
         thermal.check(job.fields())

@@ -8,7 +8,7 @@ import numpy as np
 
 from analysis.units import ARCSEC
 from scenes.specs.course import DEFAULT_PIVOT
-from scenes.specs.job import PerturbationSpec
+from scenes.specs.job import PlainPerturbationSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.orbit.angle.angle_plots import signs
 from twin.orbit.angle.angle_run import AngleRun, values_of
@@ -152,7 +152,7 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _change_text(change: PerturbationSpec) -> str:
+def _change_text(change: PlainPerturbationSpec) -> str:
     """What happens to a line or a node, in the file's words."""
     plain = change.plain()
     text = []

@@ -203,16 +203,4 @@ def _named(motion: ElementaryMotion, about: State) -> State:
     """The state ``about`` in which the motion's body names its pivot and, with zero amplitude, its figure term."""
     start = about.get(motion.body, Motion(pivot=motion.pivot))
     figure = {motion.axis: 0.0, **start.figure} if motion.kind == FIGURE else start.figure
-    return {
-        **about,
-        motion.body: Motion(
-            start.rotate,
-            start.shift,
-            start.pivot,
-            start.scale,
-            figure,
-            start.stretch,
-            start.index,
-            start.index_gradient,
-        ),
-    }
+    return {**about, motion.body: replace(start, figure=figure)}

@@ -102,7 +102,7 @@ def _of_mapping(model: type[Spec], key: KeyPath) -> Quantity | None:
 
 
 def _numbers(what: PerturbationSpec) -> dict[str, Any]:
-    """A perturbation as nested dictionaries and lists of SI numbers."""
+    """A perturbation as nested dictionaries and lists of SI numbers, and its deformation as it is."""
     heat = what.temperature
     return {
         "rotate": list(what.rotate),
@@ -111,6 +111,7 @@ def _numbers(what: PerturbationSpec) -> dict[str, Any]:
         "figure": dict(what.figure),
         "scale": what.scale,
         "temperature": {"change": heat.change, "gradient": list(heat.gradient)},
+        "deformation": what.deformation,
     }
 
 
@@ -141,6 +142,7 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
         figure=FrozenMap(parts["figure"]),
         scale=parts["scale"],
         temperature=TemperatureSpec.model_construct(change=heat["change"], gradient=tuple(heat["gradient"])),
+        deformation=parts["deformation"],
     )
 
 

@@ -217,6 +217,9 @@ def _refuse_names(study: StudySpec, place: KeyPath) -> None:
     if study.base.command == "render" and place[:1] == ("job",) and place[1:2] and place[1] in BY_NAME:
         text = "the file that stands here has been read, its contents are what can be varied"
         raise Problem(text, key_text(place), f"a key that begins with {place[1]}, without job", within=(0,))
+    if "deformation" in place:
+        text = "a table of displaced nodes is part of the base, and a study does not vary it"
+        raise Problem(text, key_text(place), "another key of perturb: rotate, shift, scale, figure or temperature")
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:

@@ -1,0 +1,227 @@
+"""Nodes of finite-element programs: what was put into their displacements comes back, whatever the mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from optics.geometry import zernike
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface, plane
+from optics.thermal.deformation import Formula, face_change
+from optics.thermal.nodal_deformation import NodalDeformation, NodesError, nodal_deformation
+
+BOWL = Surface(-0.25, -1.0, (1e-3,))
+DISK = Circle(0.3, (0.02, -0.45))  # off the axis, as mirrors of a TMA
+TURN, SHIFT = np.array([2e-3, -1e-3, 4e-3]), np.array([1e-4, -2e-4, 3e-4])
+APERTURES = [DISK, Circle(0.3, (0.0, 0.0), 0.1), Rectangle(0.4, 0.2, (0.0, -0.5)), Ellipse(0.3, 0.2)]
+
+
+def mesh(aperture: Aperture, along: int, seed: int = 1, surface: Surface = BOWL, uneven: bool = False) -> np.ndarray:
+    """An irregular mesh of a surface that reaches some nodes beyond the aperture, (N, 3); uneven: twice as fine at
+    +x.
+    """
+    rng = np.random.default_rng(seed)
+    x0, x1, y0, y1 = aperture.bounds
+    count = (along, max(8, round(along * (y1 - y0) / (x1 - x0))))
+    u, v = np.meshgrid(np.linspace(-1.06, 1.06, count[0]), np.linspace(-1.06, 1.06, count[1]))
+    u, v = (w + rng.uniform(-0.4, 0.4, w.shape) * 2.0 / n for w, n in ((u, count[0]), (v, count[1])))
+    u = np.where(uneven, 1.06 - (1.06 - u) * (1.06 + 0.5 * (1.06 - u)) / 2.12, u)
+    x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u.ravel(), 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v.ravel()
+    return np.stack([x, y, surface.sag(x, y)], axis=-1)
+
+
+def moved(points: np.ndarray, turn: np.ndarray = TURN, shift: np.ndarray = SHIFT, size: float = 1.0) -> np.ndarray:
+    """Displacements of a rigid motion and growth."""
+    return size * Rotation.from_rotvec(turn).apply(points) + shift - points
+
+
+def whole(face: NodalDeformation, surface: Surface, aperture: Aperture, points: np.ndarray) -> np.ndarray:
+    """z of the deformed surface in the nominal frame over x, y of points there, by its parts, metres."""
+    disk = surface.figure_disk(aperture)
+    turn, shift = Rotation.from_rotvec(face.rotate).as_matrix(), np.array(face.shift)
+    q = (points - shift) @ turn
+    for _ in range(30):  # along z of the nominal frame to the surface
+        u, v = (q[:, 0] - disk.centre[0]) / disk.radius, (q[:, 1] - disk.centre[1]) / disk.radius
+        sag = surface.grown(1.0 + face.growth).sag(q[:, 0], q[:, 1])
+        sag = sag + sum(a * zernike.zernike(j, u, v) for j, a in face.figure.items())
+        sag = sag + (0.0 if face.grid is None else face.grid.sag(q[:, 0], q[:, 1]))
+        q = q + (sag - q[:, 2])[:, None] * turn[2] / turn[2, 2]
+    return np.asarray((q @ turn.T + shift)[:, 2])
+
+
+@pytest.mark.parametrize("aperture", APERTURES, ids=["disk", "ring", "rectangle", "ellipse"])
+@pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
+def test_a_rigid_motion_alone_is_exact(aperture: Aperture, uneven: bool) -> None:
+    points = mesh(aperture, 50, uneven=uneven)
+    face = nodal_deformation(points, moved(points), BOWL, aperture)
+    # rounding of coordinates of 1 m is 1e-16; the least lever arm is a tenth of that
+    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(face.shift, SHIFT, rtol=0, atol=1e-12)
+    assert abs(face.growth) < 1e-12
+    assert face.rms(face.change) < 1e-14
+    assert face.grid is None
+    assert not face.printed_through
+
+
+def test_a_large_turn_and_a_growth_are_exact_too() -> None:
+    points = mesh(DISK, 40)
+    turn = np.array([0.3, -0.2, 0.5])
+    face = nodal_deformation(points, moved(points, turn, 100.0 * SHIFT, 1.0 + 3e-4), BOWL, DISK)
+    np.testing.assert_allclose(face.rotate, turn, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(face.shift, 100.0 * SHIFT, rtol=0, atol=1e-12)
+    assert face.growth == pytest.approx(3e-4, abs=1e-12)
+    assert face.rms(face.change) < 1e-14
+
+
+@pytest.mark.slow
+def test_figure_and_ripple_on_20000_nodes_come_back_within_the_sampling_error() -> None:
+    points = mesh(DISK, 160)
+    assert len(points) > 20_000
+    x, y = (points[:, :2] - DISK.centre).T
+
+    def bump(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        smooth = 100e-9 * zernike.zernike(5, x / 0.3, y / 0.3) - 40e-9 * zernike.zernike(9, x / 0.3, y / 0.3)
+        return smooth + 20e-9 * np.cos(2.0 * np.pi * x / 0.05) * np.cos(2.0 * np.pi * y / 0.07)
+
+    lifted = points + np.stack([0.0 * x, 0.0 * x, bump(x, y)], axis=-1)
+    face = nodal_deformation(points, lifted @ _turned().T + SHIFT - points, BOWL, DISK)
+    # the bump's own nearest rigid motion is at most its rms over the radius
+    np.testing.assert_allclose(face.rotate, TURN, rtol=0, atol=1e-9)
+    assert face.figure[5] == pytest.approx(100e-9, rel=0.01)
+    assert face.figure[9] == pytest.approx(-40e-9, rel=0.02)
+    assert face.rms(face.residual) == pytest.approx(10e-9, rel=0.03)  # half of the ripple's amplitude
+    assert not face.printed_through
+    # the surface itself, at places between the nodes; the mesh says how well it knows them
+    rng = np.random.default_rng(7)
+    r, t = 0.3 * np.sqrt(rng.uniform(0.0, 1.0, 3000)), rng.uniform(0.0, 2.0 * np.pi, 3000)
+    at = np.stack([r * np.cos(t), r * np.sin(t)], axis=-1) + DISK.centre
+    true = np.stack([*at.T, BOWL.sag(*at.T) + bump(*(at - DISK.centre).T)], axis=-1) @ _turned().T + SHIFT
+    error = whole(face, BOWL, DISK, true) - true[:, 2]
+    assert face.between < 0.2e-9
+    assert np.sqrt(np.mean(error**2)) < face.between
+    assert face.rms(face.lost) < 1e-12
+
+
+def lifted_by(points: np.ndarray, height: float) -> np.ndarray:
+    """Points elsewhere along z."""
+    return np.asarray(points + np.array([0.0, 0.0, height]))
+
+
+def _turned() -> np.ndarray:
+    return Rotation.from_rotvec(TURN).as_matrix()
+
+
+def test_it_is_what_face_change_finds_of_the_same_field() -> None:
+    """The same displacement as a field, by the fit of heated faces: the same surface but for second order."""
+
+    def field(p: np.ndarray) -> np.ndarray:
+        x, y = p[:, 0] - DISK.centre[0], p[:, 1] - DISK.centre[1]
+        # slides along the surface by 2 um, and bends: where the nodes end up counts
+        return np.stack([2e-6 * (x / 0.3) ** 2, -1e-6 * x * y / 0.09, 3e-7 * (x * x - y * y) / 0.09], axis=-1)
+
+    points = mesh(DISK, 60)
+    face = nodal_deformation(points, field(points), BOWL, DISK)
+    old = face_change(Formula(field), BOWL, DISK, Pose(), 36)
+    flat = points[face.weight > 0.0] if len(face.weight) == len(points) else points[:0]
+    assert len(flat) > 2000
+    x, y = flat[:, 0], flat[:, 1]
+    h = 1e-6
+    sx, sy = (BOWL.sag(x + h, y) - BOWL.sag(x - h, y)) / (2 * h), (BOWL.sag(x, y + h) - BOWL.sag(x, y - h)) / (2 * h)
+    rigid = np.cross(old.rotate, flat) + old.shift
+    u, v = (x - DISK.centre[0]) / 0.3, (y - DISK.centre[1]) / 0.3
+    expected = rigid[:, 2] - sx * rigid[:, 0] - sy * rigid[:, 1]
+    expected = expected + sum(a * zernike.zernike(j, u, v) for j, a in old.figure.items())
+    found = whole(face, BOWL, DISK, flat) - flat[:, 2]
+    assert np.std(found) > 1e-7
+    # slopes times second differences of 2 um: 1e-11 m; the terms of ``face_change`` leave no more
+    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-11 + 5.0 * old.residual_rms)
+
+
+def test_order_of_the_nodes_and_nodes_elsewhere_do_not_matter() -> None:
+    points = mesh(DISK, 40)
+    moves = moved(points) + 1e-7 * np.sin(20.0 * points[:, :1]) * [0.0, 0.0, 1.0]
+    face = nodal_deformation(points, moves, BOWL, DISK)
+    order = np.random.default_rng(3).permutation(len(points))
+    back = lifted_by(points[order], 0.05)  # the back of the mirror, which does something else
+    other = nodal_deformation(
+        np.concatenate([back, points[order]]), np.concatenate([0.0 * back, moves[order]]), BOWL, DISK
+    )
+    assert other.others == len(back)
+    assert (other.rotate, other.shift, other.growth) == (face.rotate, face.shift, face.growth)
+    assert other.figure == face.figure
+    assert face.grid is not None
+    assert other.grid is not None
+    np.testing.assert_array_equal(other.grid.values, face.grid.values)
+
+
+def test_a_finer_half_of_a_mesh_does_not_weigh_more() -> None:
+    def bent(points: np.ndarray) -> np.ndarray:
+        return 1e-6 * (points[:, :1] / 0.3) ** 3 * np.array([0.0, 0.0, 1.0])
+
+    even, uneven = (
+        nodal_deformation(p, bent(p), plane(), Circle(0.3))
+        for p in (mesh(Circle(0.3), 80, surface=plane()), mesh(Circle(0.3), 80, 2, plane(), uneven=True))
+    )
+    # of u = x^3 the turn about y is -(mean x^4) / (mean x^2), exactly -r^2/2 in these units
+    assert even.rotate[1] == pytest.approx(-0.5e-6 / 0.3, rel=3e-3)
+    assert uneven.rotate[1] == pytest.approx(-0.5e-6 / 0.3, rel=3e-3)
+    points = mesh(Circle(0.3), 80, 2, plane(), uneven=True)
+    p = points[np.hypot(*points[:, :2].T) < 0.3]
+    plain = -np.sum(p[:, 0] * bent(p)[:, 2]) / np.sum(p[:, 0] ** 2)
+    assert abs(plain / (0.5e-6 / 0.3) + 1.0) > 0.02  # every node alike would be off by this
+
+
+def test_a_mesh_that_prints_through_is_told() -> None:
+    points = mesh(DISK, 50)
+    rng = np.random.default_rng(4)
+    rough = np.concatenate([np.zeros((len(points), 2)), rng.normal(0.0, 5e-9, (len(points), 1))], axis=1)
+    face = nodal_deformation(points, moved(points) + rough, BOWL, DISK)
+    assert face.printed_through
+    assert face.between > 4e-9  # what is independent from node to node cannot be foretold
+    fine = nodal_deformation(points, moved(points) + 1e-3 * rough, BOWL, DISK)
+    assert not fine.printed_through  # 5 pm does not show
+
+
+def test_a_noisy_mesh_does_not_make_waves_where_it_has_no_nodes() -> None:
+    points = mesh(DISK, 50)
+    moves = 1e-8 * np.random.default_rng(5).normal(size=(len(points), 3))
+    face = nodal_deformation(points, moves, BOWL, DISK)
+    assert face.grid is not None
+    # 3000 places: 10 nm of noise is beyond 4.5 sigma at one of a hundred tries; a spline may overshoot by as much again
+    at = mesh(DISK, 55, 9)
+    at = at[DISK.contains(at[:, 0], at[:, 1])]
+    assert np.max(np.abs(face.grid.sag(at[:, 0], at[:, 1]))) < 9e-8
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda p: lifted_by(p, 0.01), "stand on the clear aperture"),
+        (lambda p: 1e3 * p, "stand on the clear aperture"),
+        (lambda p: p * [1.0, 1.0, -1.0], "stand on the clear aperture"),
+        (lambda p: p[:10], "stand on the clear aperture"),
+        (lambda p: p[np.hypot(p[:, 0] - 0.1, p[:, 1] + 0.4) > 0.08], "no node within"),
+        (lambda p: p[p[:, 0] < 0.15], "no node within"),
+        (lambda p: p[::30], "Zernike terms|no node within"),
+    ],
+    ids=["beside", "unit", "sign", "few", "hole", "edge", "coarse"],
+)
+def test_nodes_that_do_not_describe_the_face(change, problem: str) -> None:
+    points = change(mesh(DISK, 40))
+    with pytest.raises(NodesError, match=problem) as caught:
+        nodal_deformation(points, 0.0 * points, BOWL, DISK)
+    assert caught.value.allowed
+
+
+def test_displacements_of_another_unit() -> None:
+    points = mesh(DISK, 40)
+    with pytest.raises(NodesError, match="grow the face"):
+        nodal_deformation(points, 0.1 * points, BOWL, DISK)
+    bend = np.stack([0 * points[:, 0], 0 * points[:, 0], 0.3 * points[:, 0] ** 2], axis=-1)
+    with pytest.raises(NodesError, match="more than 1 mm"):
+        nodal_deformation(points, bend, BOWL, DISK)
+    with pytest.raises(ValueError, match="finite"):
+        nodal_deformation(points, points * np.nan, BOWL, DISK)

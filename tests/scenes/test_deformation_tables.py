@@ -1,0 +1,237 @@
+"""Tables and meshes of displaced nodes: units and orders, and what is wrong with them, by line and column."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+from scenes.models.deformed_faces import deformed_face
+from scenes.specs.job import DeformationSpec, JobSpec, PerturbationSpec, check_nodes
+from scenes.specs.load import load_job
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.node_table import read_nodes
+
+BODY = "base/forward/M1"
+JOB = "instrument: gf7_pair\nperturb:\n  base/forward/M1: {deformation: %s}\n"
+HEADS = ("x", "y", "z", "dx", "dy", "dz")
+TURN, SHIFT = np.array([2e-6, -3e-6, 1e-6]), np.array([1e-6, -2e-6, 3e-6])
+
+
+@pytest.fixture(scope="module")
+def nodes(gf7_pair) -> np.ndarray:
+    """Nodes of M1 and their displacements, (N, 6), metres."""
+    element = gf7_pair.assembly.elements["forward/M1"]
+    x0, x1, y0, y1 = element.aperture.bounds
+    x, y = (
+        a.ravel() for a in np.meshgrid(np.linspace(x0 - 0.01, x1 + 0.01, 24), np.linspace(y0 - 0.01, y1 + 0.01, 20))
+    )
+    points = np.stack([x, y, element.surface.sag(x, y)], axis=-1)
+    bump = 2e-8 * np.sin(9.0 * x) * np.cos(7.0 * y)
+    moves = np.cross(TURN, points) + SHIFT + np.stack([0 * x, 0 * x, bump], axis=-1)
+    return np.hstack([points, moves])
+
+
+def table(
+    place: Path, nodes: np.ndarray, units: tuple[str, str] = ("mm", "um"), order: tuple[int, ...] = tuple(range(6))
+) -> Path:
+    """A CSV file with these units of places and displacements, columns in an order."""
+    per = {"m": 1.0, "mm": 1e3, "um": 1e6, "nm": 1e9}
+    factors = np.array([per[units[0]]] * 3 + [per[units[1]]] * 3)
+    heads = [f"{HEADS[k]} [{units[k // 3]}]" for k in order]
+    rows = [",".join(repr(float(v)) for v in row[list(order)]) for row in nodes * factors]
+    place.write_text("\n".join([",".join(heads), *rows]) + "\n")
+    return place
+
+
+def job(folder: Path, deformation: str) -> Path:
+    place = folder / "job.yaml"
+    place.write_text(JOB % deformation)
+    return place
+
+
+def spec(path: Path, **more) -> DeformationSpec:
+    return DeformationSpec(table=str(path), **more)
+
+
+def test_units_and_order_of_rows_and_columns_do_not_matter(tmp_path, nodes, gf7_pair) -> None:
+    a = table(tmp_path / "a.csv", nodes)
+    shuffled = np.random.default_rng(1).permutation(nodes)
+    b = table(tmp_path / "b.csv", shuffled, ("m", "nm"), (5, 1, 3, 0, 2, 4))
+    one, two = (deformed_face(gf7_pair, load_job(job(tmp_path, p.name)), BODY, spec(p)) for p in (a, b))
+    # rounding of 1 um in 1 nm: 1e-16 of the coordinates, some times over in sums of 500 nodes
+    np.testing.assert_allclose(one.rotate, two.rotate, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(one.shift, two.shift, rtol=0, atol=1e-14)
+    assert one.rms(one.change) == pytest.approx(two.rms(two.change), abs=1e-14)
+    assert one.grid is not None
+    assert two.grid is not None
+    x, y = one.places[one.weight > 0.0].T
+    np.testing.assert_allclose(one.grid.sag(x, y), two.grid.sag(x, y), rtol=0, atol=1e-13)
+    assert np.max(np.abs(one.grid.sag(x, y))) > 1e-11
+
+
+def test_nodes_in_another_frame(tmp_path, nodes, gf7_pair) -> None:
+    placed = gf7_pair.assembly.place()
+    pose = placed.pose("base").inverse() @ placed.pose(BODY)
+    elsewhere = np.hstack([pose.apply(nodes[:, :3]), nodes[:, 3:] @ pose.rotation.T])
+    own, base = (table(tmp_path / f"{k}.csv", n) for k, n in enumerate((nodes, elsewhere)))
+    read = load_job(job(tmp_path, own.name))
+    one, two = (
+        deformed_face(gf7_pair, read, BODY, spec(own)),
+        deformed_face(gf7_pair, read, BODY, spec(base, frame="base")),
+    )
+    np.testing.assert_allclose(one.rotate, two.rotate, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(one.shift, two.shift, rtol=0, atol=1e-13)
+    with pytest.raises(InputError, match="stand on the clear aperture"):
+        deformed_face(gf7_pair, read, BODY, spec(base))
+    with pytest.raises(InputError, match="no such node"):
+        deformed_face(gf7_pair, read, BODY, spec(base, frame="base/forwrd"))
+
+
+@pytest.mark.parametrize("ending", ["vtu", "vtk", "msh", "med"])
+def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -> None:
+    place = tmp_path / f"m1.{ending}"
+    cells = [("triangle", np.array([[0, 1, 24], [1, 25, 24]]))]
+    mesh = meshio.Mesh(1e3 * nodes[:, :3], cells, point_data={"U": 1e3 * nodes[:, 3:]})
+    mesh.write(place, **({"file_format": "gmsh"} if ending == "msh" else {}))
+    read = read_nodes(place, unit="mm")
+    np.testing.assert_allclose(read.points, nodes[:, :3], rtol=1e-15)
+    np.testing.assert_allclose(read.moves, nodes[:, 3:], rtol=1e-15)
+    with pytest.raises(InputError, match="does not say its unit"):
+        load_job(job(tmp_path, place.name))
+    with pytest.raises(InputError, match="no such vectors"):
+        read_nodes(place, unit="mm", field="displacement")
+
+
+def test_a_mesh_without_displacements_or_with_several(tmp_path, nodes) -> None:
+    place = tmp_path / "m1.vtu"
+    for data, problem in (({}, "no vectors"), ({"U": nodes[:, 3:], "v": nodes[:, 3:]}, "several vectors")):
+        meshio.Mesh(nodes[:, :3], [("vertex", np.arange(5)[:, None])], point_data=data).write(place)
+        with pytest.raises(InputError, match=problem):
+            read_nodes(place, unit="m")
+    for name in ("m1.bdf", "m1.inp", "m1.cdb"):
+        (tmp_path / name).write_text("$ a deck\n")
+        with pytest.raises(InputError, match="no displacements that can be read"):
+            load_job(job(tmp_path, name))
+
+
+def edited(lines: list[str], change) -> str:
+    change(lines)
+    return "\n".join(lines) + "\n"
+
+
+def _put(row: int, column: int, text: str):
+    def change(lines: list[str]) -> None:
+        cells = lines[row].split(",")
+        cells[column] = text
+        lines[row] = ",".join(cells)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "line", "found"),
+    [
+        (_put(7, 4, "1,5"), 8, "7 cells under 6 heads"),
+        (_put(7, 4, "NaN"), 8, "dy"),
+        (_put(7, 4, "1e400"), 8, "dy"),
+        (_put(7, 0, "a"), 8, "x"),
+        (_put(7, 2, "2e5"), 8, "out of range"),
+        (_put(0, 3, "u [mm]"), 1, "no such column"),
+        (_put(0, 3, "dx"), 1, "without a unit"),
+        (_put(0, 3, "dx [arcsec]"), 1, "dx"),
+        (_put(0, 3, "x [mm]"), 1, "another column holds the same"),
+        (lambda lines: lines.append(lines[3][: len(lines[3]) // 2]), 482, "cells under 6 heads"),
+        (lambda lines: lines.__setitem__(slice(9, None), []), 1, "rows below the heads"),
+        (lambda lines: lines.append(",".join([*lines[3].split(",")[:3], "9", "9", "9"])), 482, "another displacement"),
+        (lambda lines: lines.clear(), 1, "empty"),
+    ],
+)
+def test_what_is_wrong_with_a_table_is_told_by_its_line(tmp_path, nodes, change, line: int, found: str) -> None:
+    place = table(tmp_path / "m1.csv", nodes)
+    place.write_text(edited(place.read_text().splitlines(), change))
+    with pytest.raises(InputError) as caught:
+        load_job(job(tmp_path, place.name))
+    (issue,) = caught.value.issues
+    assert (Path(issue.file).name, issue.line) == ("m1.csv", line)
+    assert found in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "kind", ["csv", *(pytest.param(k, marks=pytest.mark.slow) for k in ("vtu", "vtk", "med", "msh"))]
+)
+def test_mutated_files_are_read_or_refused(tmp_path, nodes, gf7_pair, kind: str) -> None:
+    place = tmp_path / f"m1.{kind}"
+    few = nodes[::3]
+    if kind == "csv":
+        table(place, few)
+    else:
+        mesh = meshio.Mesh(few[:, :3], [("triangle", np.array([[0, 1, 9]]))], point_data={"U": few[:, 3:]})
+        mesh.write(place, **({"file_format": "gmsh"} if kind == "msh" else {}))
+    content = place.read_bytes()
+    rng = np.random.default_rng(6)
+    files = []
+    for _ in range(60):
+        data = bytearray(content)
+        for _ in range(int(rng.integers(1, 4))):
+            at = int(rng.integers(0, len(data)))
+            match int(rng.integers(0, 4)):
+                case 0:
+                    data[at] = int(rng.integers(0, 256))
+                case 1:
+                    del data[at : at + int(rng.integers(1, 200))]
+                case 2:
+                    data[at:at] = b"<!-- \x00 9e99,;\n"
+                case _:
+                    data = data[: at + 1]
+        place.write_bytes(bytes(data))
+        try:
+            read_nodes(place, unit=None if kind == "csv" else "m")
+        except InputError as error:
+            files.append(error.issues[0].file)
+    assert len(files) > 15
+    assert set(files) == {str(place)}
+
+
+def test_files_that_are_not_there_or_not_tables(tmp_path, nodes) -> None:
+    (tmp_path / "m1.xlsx").write_bytes(b"PK")
+    table(tmp_path / "m1.csv", nodes)
+    cases = [
+        ("no.csv", "no such file"),
+        ("m1.xlsx", "neither a table nor a mesh"),
+        ("{table: m1.csv, unit: mm}", "units in its heads"),
+        ("{table: m1.csv, terms: 2}", "terms"),
+        ("{table: m1.csv, terms: 67}", "terms"),
+        ("{tabel: m1.csv}", "table"),
+        (f"{{table: m1.csv, sha256: {'f' * 64}}}", "checksum"),
+        (".", "no such file"),
+    ]
+    for text, problem in cases:
+        with pytest.raises(InputError, match=problem):
+            load_job(job(tmp_path, text))
+
+
+def test_only_what_has_a_figure_is_deformed(tmp_path, nodes, gf7_pair) -> None:
+    place = table(tmp_path / "m1.csv", nodes)
+    what = PerturbationSpec(deformation=DeformationSpec(table=str(place)))
+    for path in ("base/forward", "base/forward/focal_plane"):
+        with pytest.raises(InputError, match="does not allow deformation"):
+            check_nodes(JobSpec(instrument="gf7_pair", perturb={path: what.plain()}), gf7_pair.nodes)
+
+
+def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:
+    place = table(tmp_path / "m1.csv", nodes)
+    resolved = resolve(job(tmp_path, place.name))
+    given = resolved.job.perturb[BODY].deformation
+    assert given is not None
+    assert given.table == str(place)
+    assert resolved.job.perturb[BODY].uses() == ("deformation",)
+    config = tmp_path / "config.yaml"
+    config.write_text(resolved.to_yaml())
+    assert resolve(config) == resolved
+    place.write_text(place.read_text().replace("e-", "e-0", 1) + "# changed\n")
+    with pytest.raises(InputError, match="checksum is another"):
+        resolve(config)
