@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
 from scenes.yaml.units import Kind, parse_quantity, unit_ratio
+from scenes.yaml.yaml_file import read_text
 
 LARGEST_TABLE = 1 << 30
 """Bytes."""
@@ -143,33 +143,7 @@ def table_text(path: str | Path, what: str = "a CSV file") -> str:
     Raises:
         InputError: there is none, it cannot be read, is too large or holds other than UTF-8 text.
     """
-    file = str(path)
-    try:
-        if not stat.S_ISREG(Path(path).stat().st_mode):
-            raise InputError(Issue("is not a regular file", file, allowed=what))
-        with Path(path).open("rb") as stream:
-            content = stream.read(LARGEST_TABLE + 1)
-    except FileNotFoundError:
-        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path)))) from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
-    if len(content) > LARGEST_TABLE:
-        raise InputError(Issue("too large", file, allowed="at most 1 GB"))
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(Issue(f"not UTF-8 text: byte 0x{content[error.start]:02x}", file, line)) from None
-
-
-def _file_beside(path: Path) -> str | None:
-    """The table in the same folder that was probably meant."""
-    try:
-        meant = nearest(path.name, [place.name for place in path.parent.iterdir() if place.suffix == path.suffix])
-    except (OSError, ValueError):
-        return None
-    return None if meant is None else str(path.parent / meant)
+    return read_text(path, what, LARGEST_TABLE, (Path(path).suffix,))
 
 
 def _rows(file: str, text: str) -> tuple[list[int], list[list[str]]]:

@@ -9,6 +9,7 @@ parser's events, so a refusal comes before anything is unfolded.
 import io
 import re
 import stat
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -130,25 +131,41 @@ def _styled(value: Any) -> Any:
     return value
 
 
-def read_text(path: str | Path) -> str:
-    """The text of a file that nobody has vetted. Raises InputError as `read_yaml` does before anything is parsed."""
+_YAML_ENDS = (".yaml", ".yml")
+
+
+def read_text(
+    path: str | Path, what: str = "a YAML file", most: int = LARGEST_BYTES, ends: Sequence[str] = _YAML_ENDS
+) -> str:
+    """The text of a file that nobody has vetted.
+
+    Args:
+        path: of the file, UTF-8 text.
+        what: it should be, for messages.
+        most: bytes that it may have.
+        ends: of names of the files beside it that may have been meant where there is none.
+
+    Raises:
+        InputError: there is none, it cannot be read, is too large or holds other than UTF-8 text.
+    """
     file = str(path)
     try:
         mode = Path(path).stat().st_mode
         if stat.S_ISDIR(mode):
-            raise InputError(Issue("is a directory", file, allowed="a YAML file"))
+            raise InputError(Issue("is a directory, not a regular file", file, allowed=what))
         # A device or a pipe could be endless or block.
         if not stat.S_ISREG(mode):
-            raise InputError(Issue("is not a regular file", file, allowed="a YAML file"))
+            raise InputError(Issue("is not a regular file", file, allowed=what))
         with Path(path).open("rb") as stream:
-            content = stream.read(LARGEST_BYTES + 1)
+            content = stream.read(most + 1)
     except FileNotFoundError:
-        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path)))) from None
+        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path), ends))) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
-    if len(content) > LARGEST_BYTES:
-        raise InputError(Issue("too large", file, allowed="at most 1 MB"))
+    if len(content) > most:
+        size = f"{most >> 30} GB" if most >> 30 else f"{most // 10**6} MB"
+        raise InputError(Issue("too large", file, allowed=f"at most {size}"))
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -164,10 +181,10 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def _file_beside(path: Path) -> str | None:
-    """The YAML file in the same folder that was probably meant."""
+def _file_beside(path: Path, ends: Sequence[str]) -> str | None:
+    """The file with one of these ends in the same folder that was probably meant."""
     try:
-        names = [place.name for place in path.parent.iterdir() if place.suffix in (".yaml", ".yml")]
+        names = [place.name for place in path.parent.iterdir() if place.suffix in ends]
     except (OSError, ValueError):
         return None
     meant = nearest(path.name, names)
