@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from twin.orbit.flight.earth import EQUATORIAL_RADIUS, FLATTENING, tai_of
+from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.sensor import Sensor
 
 Array = NDArray[np.float64]
@@ -268,10 +269,7 @@ def _lagrange(times: Array, values: Array, at: Array) -> Array:
 
 def _joined(rotation: Rotation) -> Array:
     """Quaternions (N, 4) x, y, z, w of the way from the ITRS to the camera; neighbours on one side."""
-    quaternion = rotation.inv().as_quat(canonical=False)
-    flip = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=-1) < 0.0, -1.0, 1.0))
-    quaternion[1:] *= flip[:, None]
-    return np.asarray(quaternion)
+    return joined_quaternions(rotation.inv().as_quat(canonical=False))
 
 
 def _smooth(camera: EffectiveCamera) -> bool:
@@ -279,7 +277,8 @@ def _smooth(camera: EffectiveCamera) -> bool:
     coarse, between = camera.seconds[::2], camera.seconds[1:-1:2]
     inner = slice(_SPARE, -_SPARE) if len(between) > 4 * _SPARE else slice(None)
     station = _lagrange(coarse, camera.station[::2], between) - camera.station[1:-1:2]
-    turned = _lagrange(coarse, _joined(camera.rotation)[::2], between) - _joined(camera.rotation)[1:-1:2]
+    quaternion = _joined(camera.rotation)
+    turned = _lagrange(coarse, quaternion[::2], between) - quaternion[1:-1:2]
     angle = 2.0 * np.max(np.linalg.norm(turned[inner], axis=-1))
     shift = np.max(np.linalg.norm(station[inner], axis=-1)) / _NEAREST
     return bool(angle + shift < _FOLLOWED * camera.pitch / camera.focal_length)

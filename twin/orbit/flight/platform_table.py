@@ -92,10 +92,7 @@ class PlatformTable:
         norm = np.linalg.norm(turn, axis=1)
         if np.any(np.abs(norm - 1.0) > _UNIT_TOLERANCE):
             raise ValueError("platform: a quaternion is not of unit length")
-        turn /= norm[:, None]
-        flip = np.cumprod(np.where(np.sum(turn[1:] * turn[:-1], axis=1) < 0.0, -1.0, 1.0))
-        turn[1:] *= flip[:, None]
-        return cls(epoch, times, place, speed, looks, turn)
+        return cls(epoch, times, place, speed, looks, joined_quaternions(turn / norm[:, None]))
 
     @classmethod
     def sampled(cls, trajectory: Trajectory, orbit_interval: float, attitude_interval: float) -> PlatformTable:
@@ -104,6 +101,19 @@ class PlatformTable:
         turn = Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False)
         place, speed = trajectory.position(fixes), trajectory.velocity(fixes)
         return cls.of(str(trajectory.orbit.epoch), fixes, place, speed, looks, turn)
+
+
+def joined_quaternions(quaternion: Array) -> Array:
+    """The same rotations with neighbours on one side of the sphere, so that they can be interpolated.
+
+    Args:
+        quaternion: (N, 4), of which q and -q are one rotation.
+
+    Returns:
+        (N, 4); the first keeps its sign.
+    """
+    flip = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
+    return np.concatenate([quaternion[:1], quaternion[1:] * flip[:, None]])
 
 
 def _moments(trajectory: Trajectory, step: float) -> Array:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import about_axis, rotation_matrix
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.images.image_points import MatchedPoints
 from twin.orbit.images.patch import Patch
@@ -83,9 +84,7 @@ class TrajectoryReadings:
     def of(cls, trajectory: Trajectory, gps: float, star: float) -> Self:
         """Every ``gps`` and ``star`` seconds."""
         fixes, looks = (_inside(readings(trajectory.first, trajectory.last, step), trajectory) for step in (gps, star))
-        turn = Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False)
-        flip = np.cumprod(np.where(np.sum(turn[1:] * turn[:-1], axis=-1) < 0.0, -1.0, 1.0))
-        turn[1:] *= flip[:, None]
+        turn = joined_quaternions(Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False))
         return cls(
             epoch_utc=str(trajectory.orbit.epoch),
             orbit_s=fixes,
